@@ -1,0 +1,137 @@
+"""Everything that can go wrong, as one tree; every leaf tells the operator what to do.
+
+DiffuscopeError
+├── InputError (ValueError)      something that was handed to us is wrong
+│   ├── SpecError                a head or scene file
+│   ├── FrameError               a raw frame
+│   ├── PsfError                 a point spread function
+│   └── SettingError             a method, budget or option
+├── HardwareError (OSError)      something that we hold is wrong
+│   ├── CameraMissing            the camera does not answer
+│   ├── CameraStalled            the camera answered, and then stopped
+│   ├── LightFault               the lamp does not do what it was told
+│   └── LightLimit               the guard refuses more light
+├── Busy                         the instrument is doing something else
+└── StoreError                   the shelf
+    ├── StoreFull                no room left
+    ├── StoreDamaged             a kept file is not what was kept
+    └── NotKept                  no such capture
+"""
+
+from typing import ClassVar
+
+
+class DiffuscopeError(Exception):
+    """Something went wrong; `code` names it for the log, `remedy` says in plain words what to do."""
+
+    code: ClassVar[str] = "fault"
+    default_remedy: ClassVar[str] = "Turn the device off and on. If it happens again, call the technician."
+
+    def __init__(self, message: str, remedy: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.remedy = remedy if remedy is not None else self.default_remedy
+
+
+class InputError(DiffuscopeError, ValueError):
+    """Something that was handed to the instrument cannot be used."""
+
+    code = "input"
+    default_remedy = "Check the input and try again."
+
+
+class SpecError(InputError):
+    """A head, recording or scene file says something that cannot be."""
+
+    code = "input.spec"
+    default_remedy = "Correct the named line of the file and start again."
+
+
+class FrameError(InputError):
+    """A raw frame is not an image that can be reconstructed."""
+
+    code = "input.frame"
+    default_remedy = "Give an uncompressed raw image (tiff, png or npy) with rows and columns of counts."
+
+
+class PsfError(InputError):
+    """A point spread function cannot be one."""
+
+    code = "input.psf"
+    default_remedy = "Measure the point spread function again, or give the file that belongs to this head."
+
+
+class SettingError(InputError):
+    """A method, budget or option is out of its range."""
+
+    code = "input.setting"
+    default_remedy = "See `diffuscope methods` and `diffuscope reconstruct --help` for what can be chosen."
+
+
+class HardwareError(DiffuscopeError, OSError):
+    """A part of the head does not do its work."""
+
+    code = "hardware"
+
+
+class CameraMissing(HardwareError):
+    """The camera does not answer."""
+
+    code = "camera.missing"
+    default_remedy = "The camera is not answering. Turn the device off and on."
+
+
+class CameraStalled(HardwareError):
+    """The camera answered once and then stopped giving frames."""
+
+    code = "camera.stalled"
+    default_remedy = "The live picture has stopped. Wait a moment; if it stays, turn the device off and on."
+
+
+class LightFault(HardwareError):
+    """The lamp does not do what it was told."""
+
+    code = "light.fault"
+    default_remedy = "One light is not working. Do not take pictures; call the technician."
+
+
+class LightLimit(HardwareError):
+    """The guard refuses more light."""
+
+    code = "light.limit"
+    default_remedy = "This eye has had enough light for now. Let it rest before the next picture."
+
+
+class Busy(DiffuscopeError):
+    """The instrument is taking another picture."""
+
+    code = "busy"
+    default_remedy = "A picture is being taken. Wait until it is done, then press again."
+
+
+class StoreError(DiffuscopeError):
+    """The shelf cannot do what was asked."""
+
+    code = "store"
+    default_remedy = "The picture could not be kept. Call the technician."
+
+
+class StoreFull(StoreError):
+    """There is no room for another capture."""
+
+    code = "store.full"
+    default_remedy = "No space left. Nothing that was kept is lost. Copy pictures to a USB stick and remove old ones."
+
+
+class StoreDamaged(StoreError):
+    """A kept file is missing or is not what was kept."""
+
+    code = "store.damaged"
+    default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+
+
+class NotKept(StoreError, LookupError):
+    """There is no capture with this name."""
+
+    code = "store.unknown"
+    default_remedy = "Choose a picture from the list."

@@ -1,0 +1,55 @@
+"""What the instrument asks of its parts, in physical units: Protocols of a few verbs.
+
+Real drivers and simulated parts fulfil the same contract, and the same tests run over both (`tests/ports/`).
+"""
+
+from types import TracebackType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.values import Frame, Glow, Shot
+
+
+class Camera(Protocol):
+    """A sensor that turns light into counts."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of every frame."""
+
+    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
+        """Take one frame whose exposure began after this call; `into` (rows, cols) is filled if it is given.
+
+        Raises CameraMissing or CameraStalled; never returns an old frame.
+        """
+
+    def close(self) -> None:
+        """Release the sensor; closing twice is harmless."""
+
+
+class Lit(Protocol):
+    """A lamp that shines until this context ends."""
+
+    def __enter__(self) -> "Lit":
+        """The lamp is on."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """The lamp is off, whatever happened."""
+
+
+class Light(Protocol):
+    """The ring of LEDs around the light path; dark unless someone holds it on."""
+
+    @property
+    def glow(self) -> Glow | None:
+        """What it shines now; None when it is dark."""
+
+    def on(self, glow: Glow) -> Lit:
+        """Shine until the returned context ends. Raises LightFault or LightLimit, and is then dark."""
+
+    def off(self) -> None:
+        """Be dark; always allowed, harmless when it is dark already."""
