@@ -49,7 +49,10 @@ class Light(Protocol):
         """What it shines now; None when it is dark."""
 
     def on(self, glow: Glow) -> Lit:
-        """Shine until the returned context ends. Raises LightFault or LightLimit, and is then dark."""
+        """Shine from the entry of the returned context to its end; one that is never entered stays dark.
+
+        Raises LightFault or LightLimit, here or on entry, and is then dark.
+        """
 
     def off(self) -> None:
         """Be dark; always allowed, harmless when it is dark already."""

@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from device.errors import SpecError
+from device.values import Geometry
 
 
 class Table(BaseModel):
@@ -65,6 +66,10 @@ class OpticsSpec(Table):
     bandwidth_um: float = Field(default=0.04, ge=0, lt=0.2)
     slope_fwhm_deg: float = Field(default=0.5, gt=0, lt=20)
     correlation_um: float = Field(default=70.0, gt=0)
+
+    def geometry(self, pitch_um: float) -> Geometry:
+        """How degrees become pixels on a sensor with that pitch."""
+        return Geometry(pitch_um, self.diffuser_to_sensor_um, self.angular_magnification)
 
 
 class SimSpec(Table):

@@ -80,7 +80,9 @@ def check_image_shape(shape: tuple[int, ...]) -> None:
 
 @dataclass(frozen=True)
 class Psf:
-    """The point spread function: what one retinal point becomes on the sensor; float32, sum 1, centre at (rows//2, cols//2).
+    """The point spread function: what one retinal point becomes on the sensor.
+
+    float32 (rows, cols), sum 1, centre at (rows//2, cols//2).
 
     Paper, section "Algorithm": the h of y = h * x. A shift of it shifts the picture and changes nothing else.
     """
@@ -142,8 +144,8 @@ class Geometry:
 class Calibration:
     """What the factory measured about one head, once.
 
-    `psfs` has one entry, or a stack over depth; `dark_dn` and `flat` are (rows, cols) or None; `bad` marks pixels not to
-    be believed; `field_deg` is the illuminated disc around the centre (None: not known).
+    `psfs` has one entry, or a stack over depth; `dark_dn` and `flat` are (rows, cols) or None; `bad` marks pixels
+    not to be believed; `field_deg` is the illuminated disc around the centre (None: not known).
     """
 
     psfs: tuple[Psf, ...]

@@ -1,0 +1,145 @@
+"""Image files in and out: tiff, png and npy, with a clear word about every file that is not an image."""
+
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import UnidentifiedImageError
+
+from device.errors import FrameError, PsfError, SettingError
+from device.values import Image, Mask, Psf, check_image_shape
+
+SUFFIXES = (".tif", ".tiff", ".png", ".npy")
+MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
+
+
+def read_image(path: Path) -> NDArray[Any]:
+    """The numbers of an image file, (rows, cols) or (rows, cols, 3), uint8, uint16 or float as stored.
+
+    An alpha channel is dropped. Raises FrameError for what is missing, empty, truncated, or not an image.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FrameError(
+            f"{path} cannot be read: {error.strerror}", "Give the path of a readable image file."
+        ) from error
+    if not data:
+        raise FrameError(f"{path} is empty", "Copy the file again; the copy was interrupted.")
+    array = np.asarray(_decode(path, data))
+    if array.ndim == 3 and array.shape[2] == 4:
+        array = array[..., :3]
+    try:
+        check_image_shape(array.shape)
+    except FrameError as error:
+        raise FrameError(f"{path}: {error.message}") from error
+    if array.dtype.kind not in "ufi" or array.size > 3 * MOST_PIXELS:
+        raise FrameError(f"{path} holds {array.size} values of type {array.dtype}, which is no raw image")
+    return array
+
+
+def _decode(path: Path, data: bytes) -> NDArray[Any]:
+    try:
+        match path.suffix.lower():
+            case ".npy":
+                return np.asarray(np.load(BytesIO(data), allow_pickle=False))
+            case ".tif" | ".tiff":
+                return np.asarray(tifffile.imread(BytesIO(data)))
+            case ".png":
+                with Pillow.open(BytesIO(data)) as picture:
+                    picture.load()
+                    return np.asarray(picture.convert("RGB") if picture.mode in ("P", "LA") else picture)
+    except (ValueError, EOFError, OSError, UnidentifiedImageError, tifffile.TiffFileError, SyntaxError) as error:
+        raise FrameError(f"{path} is not a whole {path.suffix[1:]} image: {error}") from error
+    raise FrameError(f"{path}: the ending '{path.suffix}' is not one of {', '.join(SUFFIXES)}")
+
+
+def write_linear(path: Path, picture: Image) -> None:
+    """Write linear float32 as `.npy` or `.tiff`, as the ending says."""
+    match path.suffix.lower():
+        case ".npy":
+            np.save(path, picture)
+        case ".tif" | ".tiff":
+            tifffile.imwrite(path, picture)
+        case other:
+            raise SettingError(f"{path}: linear pictures are written as .npy or .tiff, not '{other}'")
+
+
+@dataclass(frozen=True)
+class Raw:
+    """A raw file as the solver wants it: uint16 counts or float32, (rows, cols) or (rows, cols, 3).
+
+    `white_dn` is where it saturates (infinite for float), `bad` the pixels that hold no image, `shift` how many bits a
+    left-justified converter was moved back.
+    """
+
+    pixels: NDArray[np.uint16] | NDArray[np.float32]
+    white_dn: float
+    bad: Mask
+    shift: int
+
+
+def as_raw(array: NDArray[Any]) -> Raw:
+    """Bring counts of any kind to one kind.
+
+    12-bit data in 16-bit words are often moved left by 4 bits: then every count is a multiple of 16, and the few that
+    are not hold no image (the DiffuserCam tutorial's first two). NaN and infinite values are bad pixels too.
+    """
+    if array.dtype.kind == "f":
+        finite = np.isfinite(array)
+        bad = ~finite if array.ndim == 2 else ~finite.all(axis=2)
+        return Raw(np.where(finite, array, 0).astype(np.float32), float("inf"), bad, 0)
+    if array.dtype.kind == "i" and array.size and array.min() < 0:
+        raise FrameError("this image holds negative whole numbers, which no sensor counts")
+    if array.max() > 65535:
+        raise FrameError(f"this image counts up to {array.max()}, more than 16 bits", "Give counts of at most 16 bits.")
+    counts = array.astype(np.uint16)
+    shift, stray = _justification(counts)
+    counts = counts >> np.uint16(shift)
+    bad = stray if array.ndim == 2 else stray.any(axis=2)
+    top = int(counts[~bad].max()) if not bad.all() else 0
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if top < 2**bits)
+    return Raw(counts, float(2**bits - 1), bad, shift)
+
+
+def _justification(counts: NDArray[np.uint16]) -> tuple[int, Mask]:
+    for shift in (8, 6, 4, 2):
+        stray = (counts & np.uint16(2**shift - 1)) != 0
+        if counts.any() and stray.sum() <= 1e-4 * stray.size and (counts[~stray] >> shift).max(initial=0) > 255:
+            return shift, stray
+    return 0, np.zeros(counts.shape, np.bool_)
+
+
+def as_psf(array: NDArray[Any], name: str) -> Psf:
+    """A measured PSF image as a Psf: bit justification undone, non-image pixels and the border's pedestal removed.
+
+    A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (optics.md 5.4, 6), so the
+    median of the outermost pixels is taken off, and what is left below zero stays: clipping would add mass again.
+    Colour PSFs are averaged. Raises PsfError for NaN, infinite values, or a sum that is not positive.
+    """
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise PsfError(f"{name} holds values that are not numbers (NaN or infinite)")
+    raw = as_raw(array)
+    pixels = raw.pixels.astype(np.float32)
+    if pixels.ndim == 3:
+        pixels = pixels.mean(axis=2)
+    good = ~raw.bad
+    edge = max(1, min(pixels.shape) // 50)
+    border = np.ones(pixels.shape, np.bool_)
+    border[edge:-edge, edge:-edge] = False
+    pedestal = float(np.median(pixels[border & good])) if (border & good).any() and min(pixels.shape) > 8 else 0.0
+    pixels = np.where(good, pixels - np.float32(pedestal), np.float32(0))
+    return Psf(pixels, name)
+
+
+def read_psf(path: Path) -> Psf:
+    """The PSF in an image file, cleaned as `as_psf` does."""
+    try:
+        return as_psf(read_image(path), path.name)
+    except FrameError as error:
+        raise PsfError(error.message, error.remedy) from error

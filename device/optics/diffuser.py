@@ -1,0 +1,196 @@
+"""The diffuser: a smooth random surface at the iris, and the caustic that one retinal point becomes behind it.
+
+    opd_sigma_um   how rough the surface is, from the scattering angle on its data sheet
+    surface        one realisation of it
+    caustic        the wave-optics point spread function on the sensor (paper, section "Algorithm": h)
+
+x runs with the columns and y with the rows; the axis of the eye meets the sensor in the middle of pixel (n//2, n//2).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from device.errors import SpecError
+from device.optics.propagation import Field, propagate, require_sampling
+from device.spec import OpticsSpec
+from device.values import Image
+
+FWHM_PER_SIGMA = 2.3548
+STEEPEST = 5  # slopes beyond five sigma carry nothing that a count could show (optics.md 2.1: f_max ~ 5 sigma/lambda)
+FINENESS = 0.4  # of the coarsest permitted sampling: the PSF is then within 1 % of one on half that pitch (2.2)
+ROOM = 1.2  # window / extent of the light, so that what diffracts at the iris does not come round again
+IRIS_EDGE_UM = 10.0  # a cut edge is not sharper than this
+MAX_SAMPLES = 4096
+
+
+class Refraction(NamedTuple):
+    """The refraction of an eye as its wavefront: mean sphere, and the two axes of the cylinder, in dioptres.
+
+    Positive mean: the beam leaving the eye converges (myopia). The spectacle correction has the opposite sign.
+    """
+
+    m_dpt: float = 0.0
+    j0_dpt: float = 0.0
+    j45_dpt: float = 0.0
+
+    def warp(self, optics: OpticsSpec) -> NDArray[np.float64]:
+        """The matrix T by which the caustic of a relaxed, perfect eye is stretched, on (x, y); optics.md 2.4."""
+        m, j0, j45 = self
+        lever = optics.diffuser_to_sensor_um * 1e-6 * optics.angular_magnification**2
+        return np.eye(2) - lever * np.array([[m + j0, j45], [j45, m - j0]])
+
+
+EMMETROPIA = Refraction()
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A square wave-optics grid whose samples fall `step` to a sensor pixel: `pixels` x `pixels` of `pitch_um`."""
+
+    pixels: int
+    step: int
+    pitch_um: float
+
+    @property
+    def samples(self) -> int:
+        """Samples along one side."""
+        return self.pixels * self.step
+
+    @property
+    def dx_um(self) -> float:
+        """Distance between samples."""
+        return self.pitch_um / self.step
+
+    @property
+    def x_um(self) -> NDArray[np.float64]:
+        """Positions of the samples; zero is the middle of pixel `pixels // 2`."""
+        middle = self.pixels // 2 * self.step + (self.step - 1) / 2
+        return (np.arange(self.samples, dtype=np.float64) - middle) * self.dx_um
+
+
+def slope_sigma(optics: OpticsSpec) -> float:
+    """Standard deviation of the optical slope along one axis, in radians."""
+    return math.radians(optics.slope_fwhm_deg) / FWHM_PER_SIGMA
+
+
+def opd_sigma_um(optics: OpticsSpec) -> float:
+    """Standard deviation of the optical path difference; optics.md 2.1: sigma_th * ell / sqrt(2)."""
+    return slope_sigma(optics) * optics.correlation_um / math.sqrt(2)
+
+
+def steepest_rad(optics: OpticsSpec, refraction: Refraction = EMMETROPIA) -> float:
+    """The steepest ray behind the diffuser: five sigma of its slope, and the eye's own slope at the iris edge."""
+    m, j0, j45 = refraction
+    eye = optics.angular_magnification**2 * (abs(m) + math.hypot(j0, j45)) * optics.iris_um / 2 * 1e-6
+    return STEEPEST * slope_sigma(optics) + eye
+
+
+def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA) -> Grid:
+    """The smallest grid at the sensor's pitch, or a whole fraction of it, that samples the caustic honestly.
+
+    Raises SpecError when no grid of at most 4096 samples does.
+    """
+    angle = steepest_rad(optics, refraction)
+    coarsest_um = min(FINENESS * optics.wavelength_um / (2 * angle), optics.correlation_um / 4)
+    step = math.ceil(pitch_um / coarsest_um)
+    extent_um = ROOM * (optics.iris_um + 2 * optics.diffuser_to_sensor_um * angle)
+    fringes_um = optics.wavelength_um * optics.diffuser_to_sensor_um * step / pitch_um
+    needed = math.ceil(max(extent_um, fringes_um) / pitch_um)
+    if needed * step > MAX_SAMPLES:
+        raise SpecError(
+            f"the caustic of this diffuser needs {needed * step} samples a side, more than {MAX_SAMPLES}",
+            "Choose a smaller slope, iris or distance, or a longer correlation of the diffuser.",
+        )
+    grid = Grid(fft.next_fast_len(needed, real=True), step, pitch_um)
+    if optics.correlation_um > grid.pixels * pitch_um / 4:
+        raise SpecError(f"a surface that is correlated over {optics.correlation_um:g} um is no diffuser in this iris")
+    return grid
+
+
+def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
+    """The optical path difference of one diffuser, in um: Gaussian, zero mean, autocorrelation exp(-r^2 / ell^2).
+
+    Returns (samples, samples) float32. The same seed and window size give the same surface however finely sampled:
+    only the waves that the surface holds are drawn, not the samples.
+    """
+    window_um = grid.samples * grid.dx_um
+    ell_um = optics.correlation_um
+    waves = min(math.ceil(window_um * 1.7 / ell_um), (grid.samples - 1) // 2)  # beyond: below 1e-6 of the longest
+    order = np.arange(-waves, waves + 1)
+    f_squared = (order[:, None] ** 2 + order[None, :] ** 2) / window_um**2
+    draw = np.random.default_rng(seed).standard_normal((2, order.size, order.size))
+    spectrum = np.zeros((grid.samples, grid.samples), np.complex64)
+    spectrum[np.ix_(order, order)] = (draw[0] + 1j * draw[1]) * np.exp(-((np.pi * ell_um) ** 2) * f_squared / 2)
+    spectrum[0, 0] = 0
+    opd: Image = fft.ifft2(spectrum, overwrite_x=True).real.astype(np.float32)
+    opd *= opd_sigma_um(optics) / float(opd.std())
+    return opd
+
+
+def caustic(
+    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3
+) -> Image:
+    """The intensity on the sensor from one retinal point on the axis: float32 (n, n), sum 1, wave optics.
+
+    `seed` names the diffuser; `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light
+    of its whole area. Raises SpecError where no honest grid exists. optics.md 2.1.
+    """
+    grid = grid_for(optics, pitch_um, refraction)
+    require_sampling(
+        grid.samples,
+        grid.dx_um,
+        wavelength_um=optics.wavelength_um,
+        distance_um=optics.diffuser_to_sensor_um,
+        aperture_um=optics.iris_um,
+        angle_rad=steepest_rad(optics, refraction),
+    )
+    path_um = surface(optics, grid, seed) + eye_wavefront_um(optics, grid, refraction)
+    amplitude = iris(optics, grid)
+    intensity = np.zeros_like(amplitude)
+    for wavelength_um in spectral_lines_um(optics, lines):
+        field: Field = amplitude * np.exp(np.complex64(2j * np.pi / wavelength_um) * path_um)
+        carried = propagate(field, grid.dx_um, wavelength_um, optics.diffuser_to_sensor_um)
+        intensity += carried.real**2 + carried.imag**2
+    return _onto_pixels(intensity, grid)
+
+
+def spectral_lines_um(optics: OpticsSpec, lines: int) -> list[float]:
+    """Wavelengths in the middle of `lines` equal slices of the bandwidth."""
+    return [optics.wavelength_um + optics.bandwidth_um * ((i + 0.5) / lines - 0.5) for i in range(lines)]
+
+
+def iris(optics: OpticsSpec, grid: Grid) -> Image:
+    """The amplitude that the round iris lets through, with an edge 10 um soft; float32 (samples, samples)."""
+    x_um = grid.x_um.astype(np.float32)
+    radius_um = np.hypot(x_um[:, None], x_um[None, :])
+    amplitude: Image = np.clip((optics.iris_um / 2 - radius_um) / IRIS_EDGE_UM + 0.5, 0, 1)
+    return amplitude
+
+
+def eye_wavefront_um(optics: OpticsSpec, grid: Grid, refraction: Refraction) -> Image:
+    """The path difference that a refractive error lays over the iris, in um; optics.md 2.1, W."""
+    m, j0, j45 = refraction
+    x_um = grid.x_um[None, :]
+    y_um = grid.x_um[:, None]
+    form = m * (x_um**2 + y_um**2) + j0 * (x_um**2 - y_um**2) + 2 * j45 * x_um * y_um
+    wavefront: Image = (-0.5e-6 * optics.angular_magnification**2 * form).astype(np.float32)
+    return wavefront
+
+
+def _onto_pixels(intensity: Image, grid: Grid) -> Image:
+    """The light of each whole pixel: the exact average over a sample's area, then a block sum; sum 1."""
+    f_rows = fft.fftfreq(grid.samples)
+    f_cols = fft.rfftfreq(grid.samples)
+    spectrum = fft.rfft2(intensity)
+    spectrum *= np.sinc(f_rows)[:, None].astype(np.float32)
+    spectrum *= np.sinc(f_cols)[None, :].astype(np.float32)
+    smooth = fft.irfft2(spectrum, s=intensity.shape, overwrite_x=True)
+    blocks = smooth.reshape(grid.pixels, grid.step, grid.pixels, grid.step).sum((1, 3))
+    np.maximum(blocks, 0, out=blocks)
+    psf: Image = (blocks / blocks.sum(dtype=np.float64)).astype(np.float32)
+    return psf

@@ -1,0 +1,208 @@
+"""A retina that nobody has: vessels, disc, macula, choroid and lesions, drawn from a seed.
+
+    fundus      the picture, colour by colour, as reflectance
+    Fundus      what it returns: reflectances, vessels, field, where disc and fovea are
+
+Drawn as a right eye in degrees from the fovea; the left eye is its mirror image. Colours follow optics.md 3.7.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import expit
+
+from device.sim.lesions import Lesions, scatter
+from device.sim.strokes import draw
+from device.sim.vessels import DISC, Vessel, grow
+from device.values import Colour, Eye, Image, Mask
+
+LOOK = (5.2, -0.4)  # the middle of the picture, in degrees from the fovea: between macula and disc
+LEVEL: dict[Colour, float] = {"red": 0.049, "green": 0.0141, "blue": 0.0081}  # Delori & Pflibsen 1989, perifovea
+BLOOD: dict[Colour, float] = {"red": 0.08, "green": 0.55, "blue": 0.45}  # contrast of the widest vein
+ARTERY = 0.70  # of a vein's contrast: brighter blood
+MACULA: dict[Colour, float] = {"red": 0.16, "green": 0.30, "blue": 0.45}
+DISC_GAIN: dict[Colour, float] = {"red": 1.45, "green": 2.1, "blue": 2.6}
+EXUDATE: dict[Colour, float] = {"red": 0.25, "green": 0.6, "blue": 0.35}
+CUP: dict[Colour, float] = {"red": 0.08, "green": 0.26, "blue": 0.34}
+CHOROID: dict[Colour, float] = {"red": 0.10, "green": 0.05, "blue": 0.02}
+COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class Fundus:
+    """A retina as an object: reflectance per colour, float32 (rows, cols), zero outside the round field.
+
+    `vessels` (None: not known) and `field` are masks; `disc` and `fovea` are (row, col), None where not known.
+    """
+
+    reflectance: dict[Colour, Image]
+    field: Mask
+    vessels: Mask | None = None
+    disc: tuple[float, float] | None = None
+    fovea: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The pixels that hold the field, and where each of them is in degrees from the fovea."""
+
+    shape: tuple[int, int]
+    px_per_deg: float
+    x: Image = field(repr=False)
+    y: Image = field(repr=False)
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], px_per_deg: float) -> "Canvas":
+        """A canvas whose middle looks at LOOK."""
+        down, right = (((np.arange(n) - (n - 1) / 2) / px_per_deg).astype(np.float32) for n in shape)
+        return cls(shape, px_per_deg, (right + LOOK[0])[None, :], (down + LOOK[1])[:, None])
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """The (row, col) of a place."""
+        row, col = ((n - 1) / 2 for n in self.shape)
+        return row + (y - LOOK[1]) * self.px_per_deg, col + (x - LOOK[0]) * self.px_per_deg
+
+    def distance(self, x: float, y: float) -> Image:
+        """How far every pixel is from a place, in degrees."""
+        away: Image = np.hypot(self.x - np.float32(x), self.y - np.float32(y))
+        return away
+
+    def noise(self, rng: np.random.Generator, scale_deg: float) -> Image:
+        """Smooth noise of unit variance, correlated over `scale_deg`."""
+        raw = rng.standard_normal(self.shape, dtype=np.float32)
+        return smooth(raw, scale_deg * self.px_per_deg)
+
+
+def smooth(raw: Image, sigma_px: float) -> Image:
+    """Noise smoothed by a Gaussian and brought back to unit variance; coarse noise is drawn small and enlarged."""
+    shrink = max(1, int(sigma_px / 3))
+    few = raw[: -(-raw.shape[0] // shrink) + 3, : -(-raw.shape[1] // shrink) + 3]
+    soft = ndimage.gaussian_filter(few, sigma_px / shrink, mode="wrap")
+    if shrink > 1:
+        soft = ndimage.zoom(soft, shrink, order=1)[: raw.shape[0], : raw.shape[1]]
+    grown: Image = (soft - soft.mean()) / max(float(soft.std()), 1e-9)
+    return grown
+
+
+def field_mask(shape: tuple[int, int], radius_px: float) -> Mask:
+    """The round field in the middle of `shape`."""
+    return _radius(shape) <= radius_px
+
+
+def fundus(
+    shape: tuple[int, int],
+    px_per_deg: float,
+    field_deg: float,
+    seed: int,
+    *,
+    eye: Eye = "OD",
+    haemorrhages: int = 0,
+    microaneurysms: int = 0,
+    exudates: int = 0,
+) -> Fundus:
+    """Draw one retina in the middle of `shape` (rows, cols): the same for the same arguments.
+
+    The field is a disc of radius px_per_deg * field_deg / 2 (small angle, as in values.Geometry); what does not fit
+    into `shape` is left out. Reflectances are fractions of the light, about 0.01 in green.
+    """
+    radius_px = px_per_deg * field_deg / 2
+    wide = int(np.ceil(2 * radius_px)) + 2
+    size = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # middles of canvas and shape fall together
+    canvas = Canvas.of(size, px_per_deg)
+    rng = np.random.default_rng((seed, 2))
+    vessels = grow(seed, field_deg / 2 + 1, LOOK)
+    lesions = scatter(canvas.x, canvas.y, rng, field_deg / 2, LOOK, haemorrhages, microaneurysms, exudates)
+    planes, mask = _paint(canvas, vessels, lesions, rng)
+    edge = np.clip(radius_px + 0.5 - _radius(size), 0, 1)
+    for colour in COLOURS:
+        planes[colour] = _placed(planes[colour] * edge, shape, eye)
+    field_px = field_mask(shape, radius_px)
+    where = [_moved(canvas.at(*place), size, shape, eye) for place in (DISC, (0.0, 0.0))]
+    return Fundus(planes, field_px, _placed(mask, shape, eye) & field_px, where[0], where[1])
+
+
+def _paint(
+    canvas: Canvas, vessels: list[Vessel], lesions: Lesions, rng: np.random.Generator
+) -> tuple[dict[Colour, Image], Mask]:
+    """The reflectances on the canvas before the field's edge, and the mask of the vessels."""
+    veins = draw([v for v in vessels if v.kind == "vein"], canvas.shape, canvas.px_per_deg, canvas.at)
+    arteries = draw([v for v in vessels if v.kind == "artery"], canvas.shape, canvas.px_per_deg, canvas.at, reflex=0.4)
+    ground = _ground(canvas, rng)
+    disc, cup = _disc(canvas, rng)
+    planes: dict[Colour, Image] = {}
+    for colour in COLOURS:
+        tissue = ground[colour] * (1 + (DISC_GAIN[colour] - 1) * disc) * (1 + CUP[colour] * cup)
+        tissue *= 1 + EXUDATE[colour] * lesions.bright * (1 - disc)
+        blood = BLOOD[colour] * (1 - 0.25 * disc)
+        through = (1 - blood * veins.blood) * (1 - ARTERY * blood * arteries.blood) * (1 - blood * lesions.dark)
+        planes[colour] = np.float32(LEVEL[colour]) * tissue * through
+    return planes, veins.mask | arteries.mask
+
+
+def _ground(canvas: Canvas, rng: np.random.Generator) -> dict[Colour, Image]:
+    """The tissue without vessels and disc, about 1: shading, choroid, grain, macula and fovea."""
+    fovea = canvas.distance(0, 0)
+    shade = 1 + 0.04 * canvas.noise(rng, 4.5) - 0.0006 * canvas.distance(*LOOK) ** 2
+    web = _choroid(canvas, rng)
+    grain = 0.5 * canvas.noise(rng, 0.07) + 0.5 * canvas.noise(rng, 0.25)
+    nerve = 0.16 * np.exp(-((canvas.distance(DISC[0] - 0.5, DISC[1]) / 5.5) ** 2))
+    planes: dict[Colour, Image] = {}
+    for colour in COLOURS:
+        depth = MACULA[colour]
+        macula = 1 - depth * np.exp(-((fovea / 2.7) ** 2)) - 0.45 * depth * np.exp(-((fovea / 0.8) ** 2))
+        fibres = 1 + (0.3 if colour == "red" else 1.0) * nerve
+        planes[colour] = shade * macula * fibres * (1 + CHOROID[colour] * web + 0.018 * grain)
+    return planes
+
+
+def _choroid(canvas: Canvas, rng: np.random.Generator) -> Image:
+    """The web of choroidal vessels that shines through: ridges of smooth noise, weaker under the macula."""
+    ridges = (
+        np.exp(-((canvas.noise(rng, 0.8) / 0.55) ** 2)) + 0.6 * np.exp(-((canvas.noise(rng, 0.45) / 0.5) ** 2)) - 0.7
+    )
+    web: Image = ridges * (1 - 0.7 * np.exp(-((canvas.distance(0, 0) / 4.5) ** 2)))
+    return web
+
+
+def _disc(canvas: Canvas, rng: np.random.Generator) -> tuple[Image, Image]:
+    """How much of a pixel is optic disc, and how much cup, 0 to 1; the rim is paler on the temporal side."""
+    x, y = canvas.x - np.float32(DISC[0]), canvas.y - np.float32(DISC[1])
+    angle = np.arctan2(y, x)
+    wobble = 1 + 0.025 * np.cos(2 * angle + rng.uniform(0, 6)) + 0.015 * np.cos(3 * angle + rng.uniform(0, 6))
+    radius = np.hypot(x / np.float32(2.65), y / np.float32(2.95)) * wobble
+    soft = 0.05 + 0.02 * np.cos(angle)
+    disc = expit((1 - radius) / soft)
+    disc *= 0.80 - 0.14 * np.clip(x / np.float32(2.65), -1, 1)
+    cup_size = rng.uniform(0.34, 0.48)
+    cup = expit((cup_size - np.hypot((x + 0.25) / 2.65, y / 2.95)) / 0.06)
+    return disc.astype(np.float32), cup.astype(np.float32)
+
+
+def _radius(shape: tuple[int, int]) -> Image:
+    rows, cols = (np.arange(size, dtype=np.float32) - np.float32((size - 1) / 2) for size in shape)
+    radius: Image = np.hypot(rows[:, None], cols[None, :])
+    return radius
+
+
+def _placed(plane: NDArray[Any], shape: tuple[int, int], eye: Eye) -> NDArray[Any]:
+    """The plane in the middle of `shape`, mirrored for a left eye; what does not fit is cut off."""
+    out = np.zeros(shape, plane.dtype)
+    rows, cols = (_overlap(*sizes) for sizes in zip(plane.shape, shape, strict=True))
+    out[rows[1], cols[1]] = (plane if eye == "OD" else plane[:, ::-1])[rows[0], cols[0]]
+    return out
+
+
+def _overlap(size: int, wanted: int) -> tuple[slice, slice]:
+    """Which part of `size` lies in `wanted`, and where, when their middles agree."""
+    first = (wanted - size) // 2
+    kept = min(size, wanted)
+    return slice(max(-first, 0), max(-first, 0) + kept), slice(max(first, 0), max(first, 0) + kept)
+
+
+def _moved(place: tuple[float, float], size: tuple[int, int], shape: tuple[int, int], eye: Eye) -> tuple[float, float]:
+    """The (row, col) on `shape` of a place on the canvas."""
+    row, col = (p + (wanted - n) // 2 for p, n, wanted in zip(place, size, shape, strict=True))
+    return row, col if eye == "OD" else shape[1] - 1 - col

@@ -1,0 +1,228 @@
+"""The shelf: a capture is on it whole or not at all, whatever happens in between.
+
+    shelf.sqlite                  what was kept: rows
+    captures/<id>/<name>          and their files
+    captures/.<id>.part/          being written; no row yet
+    torn/<id>/                    found half-kept at an opening: never listed, for the technician
+
+The row is the promise: it is written last, when every file it names is on the disk.
+"""
+
+import hashlib
+import re
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sqlalchemy import distinct, func, select, tuple_
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import Session
+
+from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
+from device.values import Capture
+from services.records import disk, schema
+from services.records.schema import CaptureRow, FileRow
+
+RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
+ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+class Store:
+    """Captures kept in one folder; opening it brings the tables up to date and moves half-kept captures aside.
+
+    `swept` names what was moved, as found in `torn/`. Any thread may read while one keeps; keepers wait for each other.
+    """
+
+    swept: tuple[str, ...]
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        reserve_bytes: int = RESERVE_BYTES,
+        free_bytes: Callable[[Path], int] = disk.free_bytes,
+    ) -> None:
+        self.folder = folder
+        self._captures, self._torn, self._lock = folder / "captures", folder / "torn", folder / ".lock"
+        self._reserve_bytes, self._free_bytes = reserve_bytes, free_bytes
+        with _told(), ExitStack() as undo:
+            disk.make_folder(self._captures)
+            disk.make_folder(self._torn)
+            self._engine = schema.open_engine(folder / "shelf.sqlite")
+            undo.callback(self._engine.dispose)
+            with disk.alone(self._lock):  # a capture that another process is keeping is not a torn one
+                self._refuse_to_begin_anew()
+                schema.migrate(self._engine)
+                self.swept = self._sweep()
+            undo.pop_all()
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._engine.dispose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def keep(self, capture: Capture, files: Mapping[str, bytes]) -> Capture:
+        """Keep a capture and its files by name, and return it with their SHA-256 once no power cut can undo it.
+
+        Errors: StoreFull (nothing is left of it), StoreError (what was written goes to `torn/` at the next opening),
+        SettingError (a name or report that cannot be kept).
+        """
+        _refuse_names(capture.id, files)
+        capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
+        row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
+        part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
+        with _told(), disk.alone(self._lock):
+            self._refuse_twice(part, kept)
+            self._refuse_without_room(sum(map(len, files.values())))
+            with _nothing_left_when_full(part, kept):
+                disk.write_folder(part, files)
+                part.rename(kept)
+                disk.settle(self._captures)
+                with Session(schema.for_writing(self._engine)) as session, session.begin():
+                    session.add(row)
+        return capture
+
+    def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
+        """The newest captures, newest first; with `before`, those older than the capture of that name (NotKept)."""
+        if limit < 1:
+            raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
+        when = (CaptureRow.taken_at, CaptureRow.id)
+        query = select(CaptureRow).order_by(*(column.desc() for column in when)).limit(limit)
+        with self._reading() as session:
+            if before is not None:
+                row = _row(session, before)
+                query = query.where(tuple_(*when) < tuple_(row.taken_at, row.id))
+            return [schema.capture_of(row) for row in session.scalars(query)]
+
+    def get(self, id: str) -> Capture:
+        """The capture of that name; NotKept if there is none, StoreDamaged if its folder is gone."""
+        with self._reading() as session:
+            capture = schema.capture_of(_row(session, id))
+        if not (self._captures / capture.id).is_dir():
+            raise StoreDamaged(f"the folder of {capture.id} is gone")
+        return capture
+
+    def read(self, id: str, name: str) -> bytes:
+        """One file of a capture, exactly as it was kept; NotKept if there is none, StoreDamaged if it changed."""
+        with self._reading() as session:
+            files = {file.name: file for file in _row(session, id).files}
+        if name not in files:
+            raise NotKept(f"{id} has no file named {name!r}")
+        file = files[name]  # the path is built from the row alone: a name from outside never touches the disk
+        try:
+            content = (self._captures / file.capture_id / file.name).read_bytes()
+        except OSError as error:
+            raise StoreDamaged(f"{file.name} of {id} cannot be read: {error}") from error
+        if hashlib.sha256(content).hexdigest() != file.sha256:
+            raise StoreDamaged(f"{file.name} of {id} is not what was kept: its SHA-256 differs")
+        return content
+
+    def space_left(self) -> int:
+        """How many more captures will fit, judged by the mean size so far."""
+        with self._reading() as session:
+            total_bytes, number = session.execute(
+                select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(FileRow.capture_id)))
+            ).one()
+            mean_bytes = max(1, total_bytes // number) if number else ESTIMATE_BYTES
+            return max(0, self._free_bytes(self.folder) - self._reserve_bytes) // mean_bytes
+
+    @contextmanager
+    def _reading(self) -> Iterator[Session]:
+        with _told(), Session(self._engine) as session:
+            yield session
+
+    def _refuse_to_begin_anew(self) -> None:
+        """Refuse to open without the database that the captures belong to: a new one would call all of them torn."""
+        database = self.folder / "shelf.sqlite"
+        missing = not database.exists() or database.stat().st_size == 0
+        if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
+            raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
+
+    def _sweep(self) -> tuple[str, ...]:
+        """Move every folder without a row aside."""
+        with Session(self._engine) as session:
+            kept = set(session.scalars(select(CaptureRow.id)))
+        strays = sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
+        swept = tuple(disk.move_aside(stray, self._torn) for stray in strays)
+        if swept:
+            disk.settle(self._torn)
+            disk.settle(self._captures)
+        return swept
+
+    def _refuse_without_room(self, need_bytes: int) -> None:
+        free = self._free_bytes(self.folder)
+        if free < need_bytes + self._reserve_bytes:
+            raise StoreFull(f"{free} bytes are free; {need_bytes} and a reserve of {self._reserve_bytes} are needed")
+
+    def _refuse_twice(self, *folders: Path) -> None:
+        for folder in folders:
+            if folder.exists():
+                raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+
+
+def _row(session: Session, id: str) -> CaptureRow:
+    row = session.get(CaptureRow, id) if _NAME.fullmatch(id) else None
+    if row is None:
+        raise NotKept(f"there is no capture named {id!r}")
+    return row
+
+
+def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
+    for name in (id, *files):
+        if not _NAME.fullmatch(name):
+            raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
+    if not files:
+        raise SettingError(f"{id} has no files, so there is nothing to keep")
+
+
+@contextmanager
+def _nothing_left_when_full(*folders: Path) -> Iterator[None]:
+    """When the disk is full, make room again by removing what was begun.
+
+    After any other failure the folders stay for the next opening to judge by the row: only then is it known whether a
+    commit that failed in its last step reached the disk.
+    """
+    try:
+        yield
+    except (OSError, DBAPIError) as error:
+        if _never_committed_for_want_of_room(error):
+            for folder in folders:
+                shutil.rmtree(folder, ignore_errors=True)  # what stays has no row, and is swept
+        raise
+
+
+def _never_committed_for_want_of_room(error: OSError | DBAPIError) -> bool:
+    return disk.is_full(error) if isinstance(error, OSError) else _sqlite_name(error) == "SQLITE_FULL"
+
+
+def _sqlite_name(error: DBAPIError) -> str:
+    return getattr(error.orig, "sqlite_errorname", "")
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Tell errors of the operating system and of SQLite as errors of the shelf."""
+    try:
+        yield
+    except OSError as error:
+        kind = StoreFull if disk.is_full(error) else StoreError
+        raise kind(f"the disk refused: {error}") from error
+    except DBAPIError as error:
+        raise _KINDS.get(_sqlite_name(error), StoreError)(f"the database refused: {error.orig}") from error
+
+
+_KINDS: dict[str, type[StoreError]] = {
+    "SQLITE_FULL": StoreFull,
+    "SQLITE_IOERR_SHMSIZE": StoreFull,  # no room for the index of the write-ahead log
+    "SQLITE_CORRUPT": StoreDamaged,
+    "SQLITE_NOTADB": StoreDamaged,
+}

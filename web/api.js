@@ -1,0 +1,121 @@
+// Everything that crosses the network: plain JSON, the event stream, and the preview.
+// Works on plain http: no service worker, no crypto.randomUUID, no web locks (knowledge/page.md 3.4).
+
+import { t } from "./words.js";
+
+/** The instrument's own words about why something was not done. */
+export class Refusal extends Error {
+  constructor({ code, message, remedy }) {
+    super(message);
+    this.code = code;
+    this.remedy = remedy;
+  }
+}
+
+async function json(path, options) {
+  let answer;
+  try {
+    answer = await fetch(path, { cache: "no-store", ...options });
+  } catch {
+    throw new Refusal({ code: "link.cut", message: t("link.cut"), remedy: t("link.cut.remedy") });
+  }
+  const body = await answer.json().catch(() => null);
+  if (answer.ok && body) return body;
+  if (body?.message) throw new Refusal(body);
+  throw new Refusal({ code: `http.${answer.status}`, message: t("fault.unknown"), remedy: t("fault.unknown.remedy") });
+}
+
+export const getStatus = () => json("/api/status");
+export const getCaptures = async (limit = 20) => (await json(`/api/captures?limit=${limit}`)).captures;
+
+/** Ask for one picture. Never repeated by itself: light goes on only because somebody pressed. */
+export function takePicture(eye) {
+  return json("/api/captures", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ eye, key: pressKey() }),
+  });
+}
+
+// Sixteen hex digits per press, so that a request that the network doubles still makes one picture.
+function pressKey() {
+  return Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+/** The next preview frame after number `after`, or null when none came; throws when the link is broken. */
+export async function getPreview(after, signal) {
+  const answer = await fetch(`/api/preview?after=${after}`, { cache: "no-store", signal });
+  if (answer.status === 204) return null;
+  if (!answer.ok) throw new Error(`preview ${answer.status}`);
+  return {
+    number: Number(answer.headers.get("X-Frame")),
+    ageMs: Number(answer.headers.get("X-Age-Ms")),
+    bitmap: await createImageBitmap(await answer.blob()),
+  };
+}
+
+export async function getBitmap(url, signal) {
+  const answer = await fetch(url, { signal });
+  if (!answer.ok) throw new Error(`picture ${answer.status}`);
+  return createImageBitmap(await answer.blob());
+}
+
+const SILENCE_MS = 3500; // the server's heart beats every second; three missed beats are a lost link
+const RETRY_MS = 2500; // a half-open connection can look alive for minutes, so we open a fresh one
+const EVENTS = ["beat", "state", "stage", "kept", "failed"];
+
+/**
+ * One event stream per visible page: six open ones freeze the whole origin, so a hidden page closes its own.
+ * Calls `on[type](data)` for each event, and `on.link("live" | "lost")` when data begins or stops to arrive;
+ * freshness is judged by data alone, because navigator.onLine knows nothing about this device.
+ */
+export function listen(on) {
+  let source = null;
+  let heardAt = 0;
+  let openedAt = 0;
+  let link = "opening";
+
+  const say = (now) => {
+    if (now === link) return;
+    link = now;
+    on.link(now);
+  };
+
+  const close = () => {
+    source?.close();
+    source = null;
+  };
+
+  const open = () => {
+    close();
+    openedAt = performance.now();
+    source = new EventSource("/api/events");
+    for (const type of EVENTS) {
+      source.addEventListener(type, (event) => {
+        heardAt = performance.now();
+        say("live");
+        on[type]?.(event.data ? JSON.parse(event.data) : {});
+      });
+    }
+  };
+
+  const look = () => {
+    if (!source) return;
+    const now = performance.now();
+    if (now - heardAt < SILENCE_MS) return;
+    say("lost");
+    if (now - openedAt > RETRY_MS || source.readyState === EventSource.CLOSED) open();
+  };
+
+  const wake = () => {
+    if (document.hidden) return close();
+    heardAt = performance.now(); // a page that comes back gets its three seconds before it complains
+    return open();
+  };
+
+  document.addEventListener("visibilitychange", wake);
+  addEventListener("pagehide", close);
+  addEventListener("pageshow", (event) => event.persisted && wake());
+  setInterval(look, 250);
+  wake();
+}

@@ -1,0 +1,282 @@
+// What the page looks like for a given state: pure templates, no fetches, no decisions about the instrument.
+// Never bind the `style` attribute (the CSP forbids it) and never build HTML from strings (Trusted Types forbid it).
+
+import { icon } from "./icons.js";
+import { html, nothing } from "./vendor/lit-html.js";
+import { calendarDay, clockTime, isToday, number, t } from "./words.js";
+
+const EYES = ["OD", "OS"];
+
+export function page(state, act) {
+  return html`
+    <div class="page" data-screen=${state.screen} data-link=${state.link}>
+      ${header(state, act)}
+      <main class="stage-area" aria-label=${t("part.live")}>
+        <div class="stage" data-mark=${state.picture}>
+          <eye-live
+            class=${state.picture === "none" ? "" : "behind"}
+            .head=${state.status}
+            .link=${state.link}
+            .active=${state.screen === "aim"}
+          ></eye-live>
+          <eye-pic
+            class=${state.picture === "none" ? "behind" : ""}
+            tabindex=${state.picture === "none" ? "-1" : "0"}
+            aria-label=${pictureName(state)}
+            .head=${state.status}
+            .subject=${state.subject}
+            .redfree=${state.redfree}
+            .contrast=${state.contrast}
+            .src=${state.src}
+            @drawn=${act.drawn}
+            @fault=${act.pictureFault}
+            @zoomed=${act.zoomed}
+          ></eye-pic>
+          ${cornerChip(state)}
+        </div>
+        ${prompt(state)}
+      </main>
+      <section class="panel" aria-label=${t("part.controls")}>
+        ${alertCard(state, act)} ${state.screen === "aim" ? eyes(state, act) : card(state)}
+        ${state.picture === "none" ? nothing : tools(state, act)} ${strip(state, act)} ${actions(state, act)}
+      </section>
+      ${menu(state, act)}
+    </div>
+  `;
+}
+
+// ---- header
+
+function header(state, act) {
+  const { status, link, busy } = state;
+  const word = link === "live" ? (busy ? "busy" : "aim") : link;
+  return html`
+    <header>
+      <h1>${t("app.name")}</h1>
+      <p class="head-name">
+        ${status?.name ?? ""} <span class="state" data-state=${word}>${t(`state.${word}`)}</span>
+      </p>
+      ${kindChip(status?.kind)}
+      <button class="quiet" type="button" @click=${act.openMenu}>${icon("menu")} ${t("menu")}</button>
+      ${link === "lost" ? html`<div class="banner" role="alert">${icon("nolink")} <p>${t("link.lost")}</p></div>` : nothing}
+    </header>
+  `;
+}
+
+// What is not a real eye must be unmistakable on every screen: in the header, and in the corner of the picture, because
+// the mark in the picture's own pixels lies outside the part that the viewer shows first.
+function kindChip(kind) {
+  if (kind !== "simulated" && kind !== "recording") return nothing;
+  return html`<p class="chip" title=${t(`chip.${kind}.why`)}>${t(`chip.${kind}`)}</p>`;
+}
+
+function cornerChip({ shown, status }) {
+  const kind = shown?.simulated ? "simulated" : status?.kind;
+  return html`<div class="corner" data-extra=${kind !== status?.kind}>${kindChip(kind)}</div>`;
+}
+
+// ---- the line under the picture: what to do now, or what this picture is
+
+function prompt(state) {
+  const [tone, name, text] = promptOf(state);
+  return html`<p class="prompt" role="status" data-tone=${tone}>${icon(name)} <span>${text}</span></p>`;
+}
+
+function promptOf({ screen, busy, stage, picture, shown, note }) {
+  if (note) return ["wait", "wait", note];
+  if (screen === "aim") {
+    return busy ? ["wait", "wait", t("aim.busy")] : ["plain", "ring", t("aim.prompt")];
+  }
+  if (screen === "making") {
+    if (picture === "quick") return ["quick", "wait", t("mark.quick")];
+    return stage.name === "expose" ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
+  }
+  if (picture === "quick") return ["quick", "wait", t("mark.quick")];
+  if (picture === "none" || !shown) return ["wait", "wait", t("mark.opening")];
+  return ["done", "check", t("mark.final")];
+}
+
+function pictureName({ picture, shown, eye }) {
+  if (picture === "none") return t("pic.none");
+  const when = shown ? clockTime(shown.taken_at) : "";
+  return t("pic.name", { mark: t(`mark.${picture}`), eye: t(`eye.${shown?.eye ?? eye}`), time: when });
+}
+
+// ---- panel
+
+function alertCard({ alert }, act) {
+  if (!alert) return nothing;
+  return html`
+    <div class="alert" role="alert" data-code=${alert.code}>
+      ${icon("warn")}
+      <p><strong>${alert.message}</strong> ${alert.remedy}</p>
+      <button type="button" @click=${act.closeAlert}>${t("alert.close")}</button>
+    </div>
+  `;
+}
+
+function eyes({ eye }, act) {
+  return html`
+    <div class="eyes" role="group" aria-label=${t("eye.choose")}>
+      ${EYES.map(
+        (one) => html`
+          <button type="button" data-eye=${one} aria-pressed=${one === eye} @click=${() => act.chooseEye(one)}>
+            ${icon("check")} <span>${t(`eye.${one}`)}</span>
+          </button>
+        `,
+      )}
+    </div>
+  `;
+}
+
+function card(state) {
+  return state.screen === "making" ? makingCard(state) : resultCard(state);
+}
+
+function makingCard({ stage }) {
+  const left = Math.round(stage.left);
+  const words = { expose: "make.expose", quick: "make.refine", refine: "make.refine", keep: "make.keep" };
+  return html`
+    <div class="card making">
+      <h2>${t(words[stage.name] ?? "make.refine")}</h2>
+      <p class="muted">${left >= 1 ? t("make.left", { n: left }) : t("make.soon")}</p>
+      <progress max="1" .value=${stage.fraction} aria-label=${t("make.progress")}></progress>
+    </div>
+  `;
+}
+
+function resultCard({ shown, eye, grey }) {
+  const time = shown && clockTime(shown.taken_at);
+  return html`
+    <div class="card">
+      <h2 tabindex="-1" id="result-title">${t("result.title", { eye: t(`eye.${shown?.eye ?? eye}`) })}</h2>
+      ${shown ? html`<p class="muted">${isToday(shown.taken_at) ? time : `${calendarDay(shown.taken_at)}, ${time}`}</p>` : nothing}
+      ${(shown?.report?.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
+      ${grey ? html`<p class="muted">${t("result.green")}</p>` : nothing} ${shown ? details(shown) : nothing}
+    </div>
+  `;
+}
+
+// For the technician: how the picture was made, and the files to take away.
+function details({ id, report, calibration_id: calibration, links }) {
+  const total = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
+  const rows = [
+    ["method", report.method],
+    ["rounds", report.rounds],
+    ["stopped", report.stopped],
+    ["seconds", t("detail.seconds.value", { s: number(total, 2) })],
+    ["calibration", calibration],
+    ["id", id],
+  ];
+  return html`
+    <details>
+      <summary>${t("result.details")}</summary>
+      <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
+      <p class="links">
+        ${["picture", "raw", "report"].map((key) => html`<a href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
+      </p>
+    </details>
+  `;
+}
+
+function tools({ redfree, contrast, zoom }, act) {
+  const step = (less, more, label, lessName, moreName) => html`
+    <div class="step" role="group" aria-label=${label}>
+      <button type="button" aria-label=${lessName} @click=${less}>−</button>
+      <span aria-hidden="true">${label}</span>
+      <button type="button" aria-label=${moreName} @click=${more}>+</button>
+    </div>
+  `;
+  const contrastWord = contrast === 0 ? t("tool.contrast") : `${t("tool.contrast")} ${contrast > 0 ? "+" : "−"}${Math.abs(contrast)}`;
+  return html`
+    <div class="tools" role="group" aria-label=${t("part.tools")}>
+      <div class="pair">
+        <button type="button" aria-pressed=${!redfree} @click=${() => act.setRedfree(false)}>${t("tool.colour")}</button>
+        <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(true)}>${t("tool.redfree")}</button>
+      </div>
+      ${step(() => act.contrastBy(-1), () => act.contrastBy(1), contrastWord, t("tool.contrast.less"), t("tool.contrast.more"))}
+      ${step(act.zoomOut, act.zoomIn, t("tool.zoom", { z: number(zoom) }), t("tool.zoom.less"), t("tool.zoom.more"))}
+      <button class="reset" type="button" @click=${act.reset}>${t("tool.reset")}</button>
+    </div>
+  `;
+}
+
+function strip({ captures, screen, shown }, act) {
+  if (!captures.length) return html`<p class="strip muted">${t("strip.empty")}</p>`;
+  return html`
+    <nav class="strip" aria-label=${t("part.strip")}>
+      <ul>
+        ${captures.map((capture) => {
+          const time = clockTime(capture.taken_at);
+          const current = screen === "result" && shown?.id === capture.id;
+          return html`
+            <li>
+              <button
+                type="button"
+                data-id=${capture.id}
+                aria-current=${current ? "true" : "false"}
+                aria-disabled=${screen === "making"}
+                aria-label=${t("strip.open", { eye: t(`eye.${capture.eye}`), time })}
+                @click=${() => act.open(capture)}
+              >
+                <span class="thumb"><img src=${capture.links.quick} alt="" loading="lazy" /></span>
+                <span>${t(`eye.${capture.eye}.short`)}<br />${time}</span>
+              </button>
+            </li>
+          `;
+        })}
+      </ul>
+    </nav>
+  `;
+}
+
+function actions(state, act) {
+  const { screen, eye, fresh, stage, picture } = state;
+  if (screen === "result" && !fresh) {
+    return html`<div class="actions">
+      <button class="primary" type="button" id="back" @click=${act.back}>${icon("next")} ${t("result.back")}</button>
+    </div>`;
+  }
+  if (screen === "result") {
+    return html`<div class="actions">
+      <button type="button" id="again" @click=${act.again}>${icon("again")} ${t("result.again")}</button>
+      <button class="primary" type="button" id="next" @click=${act.next}>
+        ${icon("next")} <span>${t("result.next")}<small>${t(`eye.${otherEye(eye)}`)}</small></span>
+      </button>
+    </div>`;
+  }
+  const making = screen === "making";
+  const word = !making ? "take" : stage.name === "expose" && picture === "none" ? "take.hold" : "take.making";
+  return html`<div class="actions">
+    <button class="primary shutter" type="button" id="shutter" aria-disabled=${making} @click=${act.take}>
+      ${icon(making ? (word === "take.hold" ? "hand" : "wait") : "camera")} <span>${t(word)}<small>${t(`eye.${eye}`)}</small></span>
+    </button>
+  </div>`;
+}
+
+export const otherEye = (eye) => (eye === "OD" ? "OS" : "OD");
+
+// ---- menu
+
+function menu({ theme, letters, status }, act) {
+  return html`
+    <dialog id="menu" aria-labelledby="menu-title">
+      <h2 id="menu-title">${t("menu")}</h2>
+      <h3 id="menu-theme">${t("menu.theme")}</h3>
+      <div class="pair" role="group" aria-labelledby="menu-theme">
+        ${["dim", "daylight"].map(
+          (one) => html`<button type="button" aria-pressed=${one === theme} @click=${() => act.setTheme(one)}>
+            ${t(`theme.${one}`)}
+          </button>`,
+        )}
+      </div>
+      <h3>${t("menu.keys")}</h3>
+      <label><input type="checkbox" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
+      <dl>
+        ${["take", "g", "contrast", "zero", "rn"].map((key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`)}
+      </dl>
+      <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
+      <button class="primary" type="button" @click=${act.closeMenu}>${t("menu.close")}</button>
+    </dialog>
+  `;
+}
