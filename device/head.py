@@ -42,6 +42,8 @@ def open_head(spec: InstrumentSpec, clock: Clock) -> Head:
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     if spec.camera.backend == "sim":
         world = World(spec, clock)
+        for colour in {spec.light.colour, spec.light.preview_colour}:
+            world.electrons_per_s(colour)  # now, not while a lamp is lit
         light = GuardedLight(SimLight(world), clock, spec.light.max_on_s)
         return Head(spec, SimCamera(world), light, simulated_calibration(world))
     assert spec.replay is not None

@@ -91,9 +91,8 @@ def as_raw(array: NDArray[Any]) -> Raw:
     are not hold no image (the DiffuserCam tutorial's first two). NaN and infinite values are bad pixels too.
     """
     if array.dtype.kind == "f":
-        finite = np.isfinite(array)
-        bad = ~finite if array.ndim == 2 else ~finite.all(axis=2)
-        return Raw(np.where(finite, array, 0).astype(np.float32), float("inf"), bad, 0)
+        strange = ~np.isfinite(array)
+        return Raw(np.where(strange, 0, array).astype(np.float32), float("inf"), _any_channel(strange), 0)
     if array.dtype.kind == "i" and array.size and array.min() < 0:
         raise FrameError("this image holds negative whole numbers, which no sensor counts")
     if array.max() > 65535:
@@ -101,10 +100,14 @@ def as_raw(array: NDArray[Any]) -> Raw:
     counts = array.astype(np.uint16)
     shift, stray = _justification(counts)
     counts = counts >> np.uint16(shift)
-    bad = stray if array.ndim == 2 else stray.any(axis=2)
+    bad = _any_channel(stray)
     top = int(counts[~bad].max()) if not bad.all() else 0
     bits = next(bits for bits in (8, 10, 12, 14, 16) if top < 2**bits)
     return Raw(counts, float(2**bits - 1), bad, shift)
+
+
+def _any_channel(mask: Mask) -> Mask:
+    return mask if mask.ndim == 2 else np.logical_or.reduce(mask, axis=2)
 
 
 def _justification(counts: NDArray[np.uint16]) -> tuple[int, Mask]:
@@ -118,8 +121,8 @@ def _justification(counts: NDArray[np.uint16]) -> tuple[int, Mask]:
 def as_psf(array: NDArray[Any], name: str) -> Psf:
     """A measured PSF image as a Psf: bit justification undone, non-image pixels and the border's pedestal removed.
 
-    A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (optics.md 5.4, 6), so the
-    median of the outermost pixels is taken off, and what is left below zero stays: clipping would add mass again.
+    A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (optics.md 5.4, 6), so
+    the median of the outermost pixels is taken off; what is left below zero stays: clipping would add mass again.
     Colour PSFs are averaged. Raises PsfError for NaN, infinite values, or a sum that is not positive.
     """
     if array.dtype.kind == "f" and not np.isfinite(array).all():

@@ -52,6 +52,8 @@ const act = {
   take() {
     if (performance.now() < lockedUntil) return;
     lock();
+    // A press into a dead link could arrive later, and light nobody expects would go on: it is not sent.
+    if (get().link === "lost") return;
     // Our own second press costs the eye nothing: it is not even sent. Everything else the instrument decides.
     if (get().screen === "making") sayAlready();
     else if (get().screen === "aim") makePicture(get().eye);

@@ -6,6 +6,7 @@ import { html, svg } from "./vendor/lit-html.js";
 const PATHS = {
   ring: svg`<circle cx="12" cy="12" r="9" stroke-dasharray="4 2.6"></circle><circle cx="12" cy="12" r="1.5"></circle>`,
   hand: svg`<path d="M8 13V5.5a1.5 1.5 0 0 1 3 0V11M11 11V4a1.5 1.5 0 0 1 3 0v7M14 11V5.5a1.5 1.5 0 0 1 3 0V14c0 4-2.5 7-6 7-3 0-4.5-1.5-6-4l-1.7-3a1.5 1.5 0 0 1 2.5-1.6L8 15"></path>`,
+  circle: svg`<circle cx="12" cy="12" r="9"></circle>`,
   check: svg`<path d="M4 12.5 9.5 18 20 6.5"></path>`,
   again: svg`<path d="M4 12a8 8 0 1 0 2.5-5.8M4 4v4.5h4.5"></path>`,
   next: svg`<path d="M5 12h14M13 6l6 6-6 6"></path>`,

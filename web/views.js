@@ -121,7 +121,7 @@ function eyes({ eye }, act) {
       ${EYES.map(
         (one) => html`
           <button type="button" data-eye=${one} aria-pressed=${one === eye} @click=${() => act.chooseEye(one)}>
-            ${icon("check")} <span>${t(`eye.${one}`)}</span>
+            ${icon(one === eye ? "check" : "circle")} <span>${t(`eye.${one}`)}</span>
           </button>
         `,
       )}
@@ -231,7 +231,7 @@ function strip({ captures, screen, shown }, act) {
 }
 
 function actions(state, act) {
-  const { screen, eye, fresh, stage, picture } = state;
+  const { screen, eye, fresh, stage, picture, link } = state;
   if (screen === "result" && !fresh) {
     return html`<div class="actions">
       <button class="primary" type="button" id="back" @click=${act.back}>${icon("next")} ${t("result.back")}</button>
@@ -245,13 +245,18 @@ function actions(state, act) {
       </button>
     </div>`;
   }
-  const making = screen === "making";
-  const word = !making ? "take" : stage.name === "expose" && picture === "none" ? "take.hold" : "take.making";
+  const [name, word] = shutterFace(screen === "making", link, stage, picture);
   return html`<div class="actions">
-    <button class="primary shutter" type="button" id="shutter" aria-disabled=${making} @click=${act.take}>
-      ${icon(making ? (word === "take.hold" ? "hand" : "wait") : "camera")} <span>${t(word)}<small>${t(`eye.${eye}`)}</small></span>
+    <button class="primary shutter" type="button" id="shutter" aria-disabled=${name !== "camera"} @click=${act.take}>
+      ${icon(name)} <span>${t(word)}<small>${t(`eye.${eye}`)}</small></span>
     </button>
   </div>`;
+}
+
+// A shutter that cannot be pressed says why, in itself.
+function shutterFace(making, link, stage, picture) {
+  if (making) return stage.name === "expose" && picture === "none" ? ["hand", "take.hold"] : ["wait", "take.making"];
+  return link === "lost" ? ["nolink", "take.lost"] : ["camera", "take"];
 }
 
 export const otherEye = (eye) => (eye === "OD" ? "OS" : "OD");

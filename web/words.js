@@ -33,6 +33,7 @@ const ENGLISH = {
   "take": "Take picture",
   "take.hold": "Hold still",
   "take.making": "Please wait",
+  "take.lost": "No link",
   "take.already": "This picture is still being made. Please wait.",
 
   "make.expose": "Hold still",

@@ -125,7 +125,9 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
     f_squared = (order[:, None] ** 2 + order[None, :] ** 2) / window_um**2
     draw = np.random.default_rng(seed).standard_normal((2, order.size, order.size))
     spectrum = np.zeros((grid.samples, grid.samples), np.complex64)
-    spectrum[np.ix_(order, order)] = (draw[0] + 1j * draw[1]) * np.exp(-((np.pi * ell_um) ** 2) * f_squared / 2)
+    waves_there = (draw[0] + 1j * draw[1]) * np.exp(-((np.pi * ell_um) ** 2) * f_squared / 2)
+    start = np.exp(2j * np.pi * order * grid.x_um[0] / window_um)  # the surface is tied to the axis, not to a corner
+    spectrum[np.ix_(order, order)] = waves_there * start[:, None] * start[None, :]
     spectrum[0, 0] = 0
     opd: Image = fft.ifft2(spectrum, overwrite_x=True).real.astype(np.float32)
     opd *= opd_sigma_um(optics) / float(opd.std())
@@ -140,7 +142,11 @@ def caustic(
     `seed` names the diffuser; `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light
     of its whole area. Raises SpecError where no honest grid exists. optics.md 2.1.
     """
-    grid = grid_for(optics, pitch_um, refraction)
+    return caustic_on(grid_for(optics, pitch_um, refraction), optics, seed, refraction, lines)
+
+
+def caustic_on(grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3) -> Image:
+    """The caustic on a grid of one's own choice; SpecError if it cannot carry the light."""
     require_sampling(
         grid.samples,
         grid.dx_um,

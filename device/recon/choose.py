@@ -1,4 +1,4 @@
-"""Parameters chosen by the frame itself, never by eye: noise from where the optics is silent, mu by cross-validation."""
+"""Parameters chosen by the frame, never by eye: noise from where the optics is silent, mu by cross-validation."""
 
 from dataclasses import dataclass
 
@@ -48,7 +48,7 @@ class Sample:
         return float(np.sqrt((phi**2 * energies).mean() / size))
 
     def noise_variance(self, energies: Energies, size: int) -> float:
-        """Variance per pixel, from the quarter of frequencies that the optics passes least; the median resists stars."""
+        """Variance per pixel, from the quarter of frequencies that the optics passes least."""
         silent = self.power <= np.quantile(self.power, 0.25)
         return float(
             np.median(energies[silent]) / np.log(2) / size

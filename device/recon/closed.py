@@ -1,6 +1,6 @@
 """The closed form: one FFT there, one filter, one FFT back. Paper, section "Algorithm", and its better prior.
 
-    x = a mask + F^-1[ conj(H) F(y - a flat - b) / (|H|^2 + mu R + delta) ]
+    x = mask (a + F^-1[ conj(H) F(y - a flat - b) / (|H|^2 + mu R + delta) ])
 
 With R = 1 and a = b = delta = 0 this is the paper's Tikhonov solution. With R = |D|^2 + floor it prefers smooth
 pictures, as real ones are (power ~ 1/f^2). delta says how wrong the stored PSF may be: a relative error of the OTF acts

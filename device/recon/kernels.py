@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from device.values import Image
 
+Sums = tuple[float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
 
@@ -43,9 +44,9 @@ def linearise(counts: Pixels, dark: Image, gain: Image, white: float, n: int, ou
 
 
 @_jit
-def dots(y: Image, flat: Image, good: Image) -> tuple[float, float, float, float, float]:
+def dots(y: Image, flat: Image, good: Image) -> Sums:
     """Sums over the frame that fit y = a flat + b: <y,f>, <y,1>, <f,f>, <f,1>, <1,1>, each weighted by `good`."""
-    yf = y1 = ff = f1 = n = 0.0
+    yf = y1 = ff = f1 = n = np.float64(0)
     rows, cols = y.shape
     for i in range(rows):
         ryf = ry1 = rff = rf1 = rn = np.float32(0)  # a row in float32, the rows in float64: exact enough, and fast
@@ -93,9 +94,41 @@ def wiener(spectrum: Spectrum, otf: Spectrum, row_g: Image, col_g: Image, floor:
 
 @_jit
 def add_flat(x: Image, mask: Image, a: float, out: Image) -> None:
-    """out = x + a mask: the flat model goes back into the picture."""
+    """out = (x + a) mask: the flat model goes back into the picture, which is dark outside the field."""
     a32 = np.float32(a)
     rows, cols = out.shape
     for i in range(rows):
         for j in range(cols):
-            out[i, j] = x[i, j] + a32 * mask[i, j]
+            out[i, j] = (x[i, j] + a32) * mask[i, j]
+
+
+@_jit
+def stretch_cols(image: Image, first: NDArray[np.int64], weights: Image, out: Image) -> None:
+    """Each column of `out` from four of `image`: column j is pixel j % n of block j // n."""
+    n = first.size
+    rows, cols = out.shape
+    last = image.shape[1] - 1
+    for i in range(rows):
+        for j in range(cols):
+            p = j % n
+            k = j // n + first[p]
+            total = np.float32(0)
+            for tap in range(4):
+                total += weights[p, tap] * image[i, min(max(k + tap, 0), last)]
+            out[i, j] = total
+
+
+@_jit
+def stretch_rows(image: Image, first: NDArray[np.int64], weights: Image, out: Image) -> None:
+    """Each row of `out` from four of `image`: row i is pixel i % n of block i // n."""
+    n = first.size
+    rows, cols = out.shape
+    last = image.shape[0] - 1
+    for i in range(rows):
+        p = i % n
+        k = i // n + first[p]
+        a, b = min(max(k, 0), last), min(max(k + 1, 0), last)
+        c, d = min(max(k + 2, 0), last), min(max(k + 3, 0), last)
+        wa, wb, wc, wd = weights[p]
+        for j in range(cols):
+            out[i, j] = wa * image[a, j] + wb * image[b, j] + wc * image[c, j] + wd * image[d, j]

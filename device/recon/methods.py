@@ -17,7 +17,7 @@ class Method:
     prior: Prior
 
     def memory_bytes(self, shape: tuple[int, int], n: int = 1) -> int:
-        """What its arrays take for a (rows, cols) sensor at bin n: sensor-sized dark, gain and picture, the plan, the model."""
+        """What its arrays take for a (rows, cols) sensor at bin n: dark, gain, picture, the plan and the model."""
         rows, cols = shape
         grid = (rows // n, cols // n)
         plan = RealFft.memory_bytes(grid)

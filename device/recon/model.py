@@ -67,14 +67,26 @@ class Model:
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= self.otf
-        return self.fft.inverse() / np.float32(self.size)
+        image: Image = self.fft.inverse() / np.float32(self.size)
+        return image
 
     def blur_adjoint(self, image: Image) -> Image:
         """The adjoint of `blur`: correlation with h, as a new array."""
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= np.conj(self.otf)
-        return self.fft.inverse() / np.float32(self.size)
+        image: Image = self.fft.inverse() / np.float32(self.size)
+        return image
+
+
+def field_box(calibration: Calibration, shape: tuple[int, int], n: int = 1) -> tuple[slice, slice]:
+    """The rows and columns, in n x n bins, that hold the illuminated disc; the whole sensor where it is not known."""
+    radius_px = field_radius_px(calibration) + 4
+    if radius_px == float("inf"):
+        return slice(None), slice(None)
+    spans = [(max(0.0, (size - 1) / 2 - radius_px), min(size, (size + 1) / 2 + radius_px)) for size in shape]
+    rows, cols = (slice(round(low / n), max(round(high / n), round(low / n) + 1)) for low, high in spans)
+    return rows, cols
 
 
 def field_radius_px(calibration: Calibration) -> float:
@@ -101,7 +113,7 @@ def _runs_past_the_edge(flat: Image) -> bool:
 
 
 def gradient_symbol(grid: tuple[int, int]) -> tuple[Image, Image]:
-    """|D|^2 of the periodic first difference, 4 - 2 cos - 2 cos, as a row part (rows,) and a column part (cols//2+1,)."""
+    """|D|^2 of the periodic first difference, 4 - 2 cos - 2 cos: a row part (rows,) and a column part (cols//2+1,)."""
     rows = 2 - 2 * np.cos(2 * np.pi * np.fft.fftfreq(grid[0]))
     cols = 2 - 2 * np.cos(2 * np.pi * np.fft.rfftfreq(grid[1]))
     return rows.astype(np.float32), cols.astype(np.float32)

@@ -110,8 +110,7 @@ class Reconstructor:
             rung.picture = np.zeros((3, *rung.model.grid), np.float32)
         facts = {}
         for c in range(3):  # one plan serves all three channels; the last one's facts are reported
-            channel = None if dark is None else np.ascontiguousarray(dark[..., c])
-            facts = self._solve(rung, np.ascontiguousarray(counts[..., c]), channel, rung.picture[c])
+            facts = self._solve(rung, _channel(counts, c), None if dark is None else _channel(dark, c), rung.picture[c])
         return facts
 
     @staticmethod
@@ -137,3 +136,9 @@ class Reconstructor:
             psf_index=self.psf_index, regularisation=chosen, noise_dn=facts["noise_dn"] * rung.recipe.bin,
             residual=facts["residual"], quality=quality, warnings=tuple(warnings),
         )  # fmt: skip
+
+
+def _channel(image: Pixels, c: int) -> Pixels:
+    if image.dtype == np.uint16:
+        return np.ascontiguousarray(image[..., c], np.uint16)
+    return np.ascontiguousarray(image[..., c], np.float32)

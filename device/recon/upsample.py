@@ -1,23 +1,41 @@
 """From a binned grid back to the sensor's, every sample where it belongs."""
 
 import numpy as np
-from scipy import ndimage
 
+from device.recon import kernels
 from device.values import Image
 
 
-def upsample(picture: Image, n: int, shape: tuple[int, int]) -> Image:
-    """A picture on blocks of n x n pixels as (rows, cols) = `shape` pixels: cubic, block centres kept in place.
+def cubic_weights(n: int) -> tuple[np.ndarray, Image]:
+    """For each of n pixels of a block: the offset of its first of four taps, and the taps' weights (n, 4).
 
-    Sample I stands at pixel n I + (n - 1)/2. Rows and columns beyond the last whole block repeat its edge.
+    Keys' cubic with a = -1/2; sample I stands at pixel n I + (n - 1)/2, so pixel p of block I lies
+    (p - (n - 1)/2)/n blocks from it.
     """
-    if n == 1:
-        return np.array(picture, np.float32)
+    place = (np.arange(n) - (n - 1) / 2) / n
+    first = np.floor(place).astype(np.int64)
+    t = place - first
+    weights = np.stack(
+        [
+            ((-0.5 * t + 1) * t - 0.5) * t,
+            (1.5 * t - 2.5) * t * t + 1,
+            ((-1.5 * t + 2) * t + 0.5) * t,
+            (0.5 * t - 0.5) * t * t,
+        ],
+        axis=1,
+    )
+    return first - 1, weights.astype(np.float32)
+
+
+def upsample(picture: Image, n: int, shape: tuple[int, int]) -> Image:
+    """A picture on blocks of n x n pixels as (rows, cols) = `shape` pixels; beyond the last whole block it repeats."""
     if picture.ndim == 3:
         return np.stack([upsample(picture[..., c], n, shape) for c in range(picture.shape[2])], axis=-1)
+    if n == 1:
+        return np.array(picture, np.float32)
+    first, weights = cubic_weights(n)
+    wide = np.empty((picture.shape[0], shape[1]), np.float32)
+    kernels.stretch_cols(np.ascontiguousarray(picture), first, weights, wide)
     out = np.empty(shape, np.float32)
-    offset = -(n - 1) / 2 / n
-    ndimage.affine_transform(
-        picture, np.full(2, 1 / n), offset=offset, output_shape=shape, output=out, order=3, mode="nearest"
-    )
+    kernels.stretch_rows(wide, first, weights, out)
     return out

@@ -33,7 +33,7 @@ class SimCamera:
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
         world = self._world
         world.clock.sleep(shot.exposure_s)
-        if "camera.stalled" in world.faults:
+        if world.broken("camera.stalled"):
             world.clock.sleep(STALL_S)
             raise CameraStalled(f"the simulated camera gave no frame within {shot.exposure_s + STALL_S:.2g} s")
         world.frames += 1
@@ -48,5 +48,5 @@ class SimCamera:
     def _check(self) -> None:
         if not self._open:
             raise CameraMissing("the simulated camera has been closed")
-        if "camera.missing" in self._world.faults:
+        if self._world.broken("camera.missing"):
             raise CameraMissing("the simulated camera does not answer")

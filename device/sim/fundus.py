@@ -114,7 +114,8 @@ def fundus(
     canvas = Canvas.of(size, px_per_deg)
     rng = np.random.default_rng((seed, 2))
     vessels = grow(seed, field_deg / 2 + 1, LOOK)
-    lesions = scatter(canvas.x, canvas.y, rng, field_deg / 2, LOOK, haemorrhages, microaneurysms, exudates)
+    ill = np.random.default_rng((seed, 3))  # lesions change nothing but themselves
+    lesions = scatter(canvas.x, canvas.y, ill, field_deg / 2, LOOK, haemorrhages, microaneurysms, exudates)
     planes, mask = _paint(canvas, vessels, lesions, rng)
     edge = np.clip(radius_px + 0.5 - _radius(size), 0, 1)
     for colour in COLOURS:

@@ -37,7 +37,7 @@ class SimLight:
 
     def check(self) -> None:
         """Raise LightFault, dark, if the ring is broken."""
-        if "light.fault" in self._world.faults:
+        if self._world.broken("light.fault"):
             self.off()
             raise LightFault("the simulated lamp does not answer")
 

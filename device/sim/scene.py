@@ -84,7 +84,7 @@ def left_out(world: World) -> dict[str, Effect]:
     drift_deg = DRIFT_DEG_PER_S * world.spec.camera.exposure_s
     return {
         "motion": _effect(
-            False, "drift in one exposure, degrees; the picture changes by less than its noise to 0.15", drift_deg
+            False, "drift in one exposure, degrees; up to 0.15 it changes the picture by 0.05 of its noise", drift_deg
         ),
         "pixel_response": _effect(
             False, "not modelled; 0.1 % uncorrected changes the picture by 0.23 of its noise (optics.md 3.1)", 0.23

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import fft
 
 from device.clock import Clock
-from device.errors import SpecError
+from device.errors import SettingError, SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction, caustic
 from device.sim.fundus import Fundus, fundus
 from device.sim.photo import photograph
@@ -26,7 +26,8 @@ LED_UM: dict[Colour, float] = {"red": 0.622, "green": 0.522, "blue": 0.467}  # o
 class World:
     """A retina behind an eye behind the diffuser, and the state of the lamp.
 
-    `eye` and `refraction` are those of the eye being looked at (a photograph is shown as it is); `ambient_e_per_s` is light that comes without the lamp.
+    `eye` and `refraction` are those of the eye being looked at (a photograph is shown as it is);
+    `ambient_e_per_s` is light that comes without the lamp.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "light.fault".
     """
 
@@ -55,6 +56,14 @@ class World:
         self.frames = 0
         self._psfs: dict[tuple[Colour, Refraction], Image] = {}
         self._rates: dict[Colour, Image] = {}
+
+    def broken(self, part: str) -> bool:
+        """Whether a part has its fault now; SettingError if `faults` names one that does not exist."""
+        if strange := self.faults - FAULTS:
+            raise SettingError(
+                f"no fault is called {sorted(strange)[0]!r}", f"Choose from {', '.join(sorted(FAULTS))}."
+            )
+        return part in self.faults
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -118,9 +127,10 @@ class World:
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
         ambient_e = np.float32(self.ambient_e_per_s * exposure_s)
-        if self.glow is None:
+        glow = self.glow  # once: a guard may darken the lamp at any moment
+        if glow is None:
             return np.full(self.shape, ambient_e, np.float32)
-        return self.electrons_per_s(self.glow.colour) * np.float32(self.glow.level * exposure_s) + ambient_e
+        return self.electrons_per_s(glow.colour) * np.float32(glow.level * exposure_s) + ambient_e
 
 
 def blurred(scene: Image, psf: Image, shape: tuple[int, int]) -> Image:

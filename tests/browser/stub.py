@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import uvicorn
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from PIL import Image
@@ -64,6 +64,7 @@ class Stub:
     busy: bool = False
     preview_age_ms: int = 40
     silent: bool = False
+    closing: bool = False
     presses: int = 0
     captures: list[dict[str, Any]] = field(default_factory=list)
     events: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
@@ -101,15 +102,9 @@ def build(stub: Stub) -> FastAPI:
     final = encoded(drawn_retina(1), "png")
     frames = [encoded(drawn_retina(4, 3 * np.sin(i)), "jpeg") for i in range(4)]
 
-    @app.middleware("http")
-    async def guard(request: Request, call_next: Any) -> Response:
-        answer = await call_next(request)
-        answer.headers["Content-Security-Policy"] = CSP
-        return answer
-
     @app.get("/")
     def index() -> FileResponse:
-        return FileResponse(WEB / "index.html")
+        return FileResponse(WEB / "index.html", headers={"Content-Security-Policy": CSP})
 
     @app.get("/api/status")
     def status() -> dict[str, Any]:
@@ -153,7 +148,7 @@ def build(stub: Stub) -> FastAPI:
     async def stream() -> AsyncIterator[str]:
         told = len(stub.events)
         beat = 0.0
-        while True:
+        while not stub.closing:
             while told < len(stub.events):
                 kind, data = stub.events[told]
                 told += 1
@@ -177,7 +172,7 @@ class Stubbed:
     def __init__(self, stub: Stub, port: int) -> None:
         self.stub = stub
         self.url = f"http://127.0.0.1:{port}"
-        config = uvicorn.Config(build(stub), port=port, log_level="error", ws="none", timeout_graceful_shutdown=0)
+        config = uvicorn.Config(build(stub), port=port, log_level="error", ws="none", timeout_graceful_shutdown=3)
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run)
 
@@ -188,6 +183,6 @@ class Stubbed:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stub.closing = True  # ends the event streams, which would otherwise hold up the shutdown
         self._server.should_exit = True
-        self._server.force_exit = True
         self._thread.join(10)

@@ -10,20 +10,31 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
+
+import pytest
 
 from device.values import Capture
 from services.records import store as product
 from services.records.store import Store
 
 ROOM = str(Path(product.__file__).parent)
-FILES = {"raw.tiff": bytes(range(256)) * 80, "picture.png": b"png" * 300, "report.json": b"{}"}
+FILES = {"raw.tiff": bytes(range(256)) * 40, "picture.png": b"png" * 300, "report.json": b"{}"}
 ROUNDS = 8
+MEMORY = Path("/dev/shm")
+
+
+@pytest.fixture
+def shelves() -> Iterator[Path]:
+    """A folder in memory where there is one: a kill cannot tell, and a hundred shelves take seconds, not a minute."""
+    with TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
+        yield Path(folder)
 
 
 def capture(name: str, second: int = 0) -> Capture:
@@ -48,9 +59,9 @@ def run_victim(mode: str, folder: Path) -> str:
     return done.stdout
 
 
-def test_a_kill_at_any_line_leaves_a_capture_kept_or_torn_and_nothing_between(tmp_path: Path) -> None:
-    where = run_victim("lines", tmp_path).split()
-    outcomes = [judge(tmp_path / f"{number:03}", line) for number, line in enumerate(where)]
+def test_a_kill_at_any_line_leaves_a_capture_kept_or_torn_and_nothing_between(shelves: Path) -> None:
+    where = run_victim("lines", shelves).split()
+    outcomes = [judge(shelves / f"{number:03}", line) for number, line in enumerate(where)]
     assert len(where) > 40
     assert where[-1] == "survived"
     assert outcomes == sorted(outcomes, key=["untouched", "torn", "torn whole", "kept"].index)  # and never back
@@ -75,10 +86,10 @@ def judge(folder: Path, line: str) -> str:
     return ("torn whole" if torn == FILES else "torn") if store.swept else "untouched"
 
 
-def test_what_was_said_to_be_kept_survives_kills_at_random_moments(tmp_path: Path) -> None:
-    said = run_victim("moments", tmp_path).split()
+def test_what_was_said_to_be_kept_survives_kills_at_random_moments(shelves: Path) -> None:
+    said = run_victim("moments", shelves).split()
     assert len(said) > ROUNDS
-    with Store(tmp_path / "shelf") as store:
+    with Store(shelves / "shelf") as store:
         listed = [kept.id for kept in store.captures(limit=100_000)]
         assert set(said) <= set(listed)
         assert len(listed) <= len(said) + ROUNDS  # at most one per kill was kept and not yet said

@@ -1,0 +1,119 @@
+"""The `diffuscope` command: every word of it starts one capability, and every mistake is answered with a remedy."""
+
+import json
+import os
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from device.errors import DiffuscopeError
+from device.head import recording
+from device.recon.methods import DEFAULT, METHODS
+from device.spec import InstrumentSpec, load_head
+from services.instrument.once import Order, reconstruct_file
+
+app = typer.Typer(
+    name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
+    add_completion=False, pretty_exceptions_enable=False,
+)  # fmt: skip
+
+SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
+
+
+def _default_data() -> Path:
+    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "diffuscope"
+
+
+@app.command()
+def run(
+    head: Annotated[Path | None, typer.Option(help="Head file; the simulated head if nothing is given.")] = None,
+    replay: Annotated[Path | None, typer.Option(help="Folder with a recording, played instead of a head.")] = None,
+    raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
+    psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording, or a stack of them.")] = None,
+    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
+) -> None:
+    """Serve the page: one button, one true picture."""
+    from services.instrument.serve import serve  # opens the web stack, which the other commands do not need
+
+    spec = _chosen(head, replay, tuple(raw or ()), tuple(psf or ()))
+    typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
+    serve(spec, host, port, data or _default_data(), lambda: typer.echo(f"Open http://{host}:{port} in a browser"))
+
+
+def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:
+    if replay is not None or raws or psfs:
+        if head is not None:
+            raise typer.BadParameter("choose --head or a recording (--replay, --raw with --psf), not both")
+        return recording(replay or raws[0].parent if raws else replay or Path(), raws, psfs)
+    return load_head(head or SIM_HEAD)
+
+
+@app.command()
+def reconstruct(
+    raw: Annotated[Path, typer.Argument(help="Raw frame: tiff, png or npy; 2-D or three channels.")],
+    psf: Annotated[list[Path], typer.Option(help="Measured PSF; several are a stack, the best is chosen.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
+    method: Annotated[str, typer.Option(help="A name of `diffuscope methods`.")] = DEFAULT,
+    budget_s: Annotated[float | None, typer.Option(help="Seconds from the loaded frame to the result.")] = None,
+    dark: Annotated[Path | None, typer.Option(help="Dark frame of the same exposure.")] = None,
+    flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
+    head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
+    field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
+    even: Annotated[
+        bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
+    ] = False,
+    report: Annotated[Path | None, typer.Option(help="Where to write the report as JSON.")] = None,
+) -> None:
+    """Turn one raw frame into a picture, without a head and without a page."""
+    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache())
+    made = reconstruct_file(order)
+    text = json.dumps(asdict(made.report), indent=1)
+    if report is not None:
+        report.write_text(text + "\n", encoding="utf-8")
+    seconds = sum(made.report.seconds.values())
+    typer.echo(f"{output}: {made.report.method}, bin {made.report.bin}, {seconds:.3f} s")
+    for warning in made.report.warnings:
+        typer.echo(f"note: {warning}", err=True)
+
+
+def _cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
+
+
+@app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")],
+) -> None:
+    """Write what the camera would give for a scene: raw.tiff, truth.npy, psf.tiff, plan.json."""
+    from device.sim.scene import simulate as simulate_scene
+
+    simulate_scene(load_head(scene), output)
+    typer.echo(f"{output}: raw.tiff, truth.npy, psf.tiff, plan.json")
+
+
+@app.command()
+def methods(
+    rows: Annotated[int, typer.Option(min=1, help="Rows of the frame.")] = 1080,
+    cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,
+) -> None:
+    """List the solvers with their cost in FFT pairs and their memory for a frame size."""
+    typer.echo(f"{'method':<12} {'FFT pairs':>9} {'memory':>8}   for {rows} x {cols}")
+    for method in METHODS.values():
+        memory = f"{method.memory_bytes((rows, cols)) / 1e6:.0f} MB"
+        mark = " (default)" if method.name == DEFAULT else ""
+        typer.echo(f"{method.name:<12} {method.fft_pairs:>9g} {memory:>8}   {method.sentence}{mark}")
+
+
+def main() -> None:
+    """Run the command; an error of ours is one sentence and one remedy, never a traceback."""
+    try:
+        app()
+    except DiffuscopeError as error:
+        typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
+        sys.exit(2)

@@ -1,0 +1,112 @@
+"""One raw file to one picture file: the same solver as the instrument's, without head, page or shelf."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from device.clock import Deadline, SystemClock
+from device.errors import FrameError, SettingError, SpecError
+from device.images import Raw, as_raw, read_image, read_psf, write_linear
+from device.recon.evenness import even_out
+from device.recon.focus import sharpest
+from device.recon.methods import method_named
+from device.recon.model import disc, field_radius_px
+from device.recon.plan import Planner
+from device.recon.reconstructor import Recipe, Reconstructor
+from device.spec import InstrumentSpec, load_head
+from device.values import Calibration, Geometry, Image, Reconstruction, Sensor
+from services.records.picture import to_png
+
+
+@dataclass(frozen=True)
+class Order:
+    """What was asked for on the command line."""
+
+    raw: Path
+    psfs: tuple[Path, ...]
+    output: Path
+    method: str
+    budget_s: float | None
+    dark: Path | None
+    flat: Path | None
+    head: Path | None
+    field_deg: float | None
+    even: bool
+    plans: Path
+
+
+def reconstruct_file(order: Order) -> Reconstruction:
+    """Read, reconstruct, write; everything that can be refused is refused before anything is computed."""
+    if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
+        raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png")
+    method_named(order.method)
+    clock = SystemClock()
+    if order.budget_s is not None:
+        Deadline.after(clock, order.budget_s)  # refuses what is not a time
+    raw = as_raw(read_image(order.raw))
+    calibration = calibrated(order, raw)
+    planner = Planner(order.plans)
+    index, _ = sharpest(calibration, raw.pixels, planner)
+    shape = (raw.pixels.shape[0], raw.pixels.shape[1])
+    quick = (Recipe(order.method, 4),) if order.budget_s is not None and min(shape) >= 16 else ()
+    reconstructor = Reconstructor(calibration, shape, planner, clock, (*quick, Recipe(order.method, 1)), index)
+    deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
+    made = reconstructor(raw.pixels, deadline=deadline)
+    picture = made.picture
+    if order.even:
+        picture = even_out(picture, field_mask(calibration, shape), evenness_px(calibration, shape))
+    _write(order.output, picture)
+    return made
+
+
+def calibrated(order: Order, raw: Raw) -> Calibration:
+    """A calibration from the files of an order; what a head file does not say stays unknown."""
+    spec: InstrumentSpec | None = None if order.head is None else load_head(order.head)
+    geometry: Geometry | None = None
+    sensor = Sensor(white_dn=raw.white_dn)
+    field_deg = order.field_deg
+    if spec is not None:
+        if spec.optics is None:
+            raise SpecError(f"{order.head} has no [optics], so it gives no geometry")
+        geometry = spec.optics.geometry(spec.camera.pitch_um)
+        camera = spec.camera
+        sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, min(camera.white_dn, raw.white_dn))
+        field_deg = field_deg if field_deg is not None else spec.optics.field_deg
+    elif field_deg is not None:
+        raise SettingError(
+            "a field in degrees needs a head to become pixels", "Give --head HEAD.toml with --field-deg."
+        )
+    dark = None if order.dark is None else _companion(order.dark, raw)
+    flat = None if order.flat is None else _companion(order.flat, raw)
+    return Calibration(
+        psfs=tuple(read_psf(path) for path in order.psfs), sensor=sensor, geometry=geometry, field_deg=field_deg,
+        dark_dn=dark, flat=flat, bad=raw.bad,
+    )  # fmt: skip
+
+
+def _companion(path: Path, raw: Raw) -> Image:
+    """A dark or flat frame in the counts of its raw: moved right by the same bits, colour averaged."""
+    array = read_image(path)
+    pixels = array.astype(np.float32) / np.float32(2**raw.shift)
+    pixels = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
+    if pixels.shape != raw.pixels.shape[:2]:
+        raise FrameError(f"{path} has {pixels.shape} pixels, the raw {raw.pixels.shape[:2]}")
+    return np.asarray(pixels, np.float32)
+
+
+def field_mask(calibration: Calibration, shape: tuple[int, int]) -> Image:
+    """The illuminated disc on the sensor; everything where it is not known."""
+    return disc(shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), field_radius_px(calibration))
+
+
+def evenness_px(calibration: Calibration, shape: tuple[int, int]) -> float:
+    """How wide illumination changes: 4 degrees where the geometry is known, else an eighth of the frame."""
+    return 4 * calibration.geometry.px_per_deg if calibration.geometry else min(shape) / 8
+
+
+def _write(path: Path, picture: Image) -> None:
+    if path.suffix.lower() == ".png":
+        path.write_bytes(to_png(picture, simulated=False))
+    else:
+        write_linear(path, picture)

@@ -1,0 +1,226 @@
+"""The one world behind camera and lamp."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.signal import convolve2d
+
+from device.clock import VirtualClock
+from device.errors import CameraMissing, CameraStalled, LightFault, SettingError, SpecError
+from device.optics.diffuser import Refraction
+from device.sim.calibrate import simulated_calibration
+from device.sim.camera import SimCamera
+from device.sim.light import SimLight
+from device.sim.world import World, blurred, fitted
+from device.spec import load_head
+from device.values import Glow, Shot
+
+HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
+
+
+def small_head(**sim):
+    """The simulated head with larger pixels; `sim` replaces keys of its [sim] table."""
+    spec = load_head(HEAD)
+    camera = spec.camera.model_copy(update={"rows": 270, "cols": 480, "pitch_um": 4 * spec.camera.pitch_um})
+    return spec.model_copy(update={"camera": camera, "sim": spec.sim.model_copy(update=sim)})
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(small_head(), VirtualClock())
+
+
+def test_green_at_full_drive_reaches_the_peak_that_was_asked(world):
+    exposure_s = world.spec.camera.exposure_s
+    assert world.electrons_per_s("green").max() * exposure_s == pytest.approx(15000, rel=1e-5)
+    assert world.electrons_per_s("red").max() > 1.2 * world.electrons_per_s("green").max()
+
+
+def test_a_preview_in_red_is_bright_and_not_saturated(world):
+    camera, light = SimCamera(world), SimLight(world)
+    with light.on(Glow(world.spec.light.preview_colour)):
+        counts = camera.expose(Shot(world.spec.camera.preview_exposure_s)).counts
+    assert 0.2 * 4095 < counts.max() < 0.9 * 4095
+
+
+def test_a_dark_frame_holds_black_level_and_read_noise_only(world):
+    counts = SimCamera(world).expose(Shot(0.1)).counts.astype(np.float64)
+    camera = world.spec.camera
+    assert counts.mean() == pytest.approx(camera.black_dn, abs=0.01)
+    assert counts.max() <= camera.black_dn + 2
+
+
+def test_light_of_the_room_comes_without_the_lamp():
+    lit = World(small_head(), VirtualClock(), ambient_e_per_s=5000.0)
+    counts = SimCamera(lit).expose(Shot(0.1)).counts
+    assert counts.mean() == pytest.approx(64 + 500 / lit.spec.camera.gain_e_per_dn, rel=0.01)
+
+
+@pytest.mark.parametrize("scene_shape", [(5, 6), (8, 7), (31, 40)])
+@pytest.mark.parametrize("psf_shape", [(7, 7), (6, 6), (40, 40)])
+def test_the_blur_is_the_linear_convolution_cropped_about_the_middle(scene_shape, psf_shape):
+    rng = np.random.default_rng(0)
+    scene, psf = (rng.random(shape).astype(np.float32) for shape in (scene_shape, psf_shape))
+    whole = convolve2d(scene, psf)
+    shape = (24, 21)
+    expected = np.zeros(shape)
+    for (row, col), value in np.ndenumerate(whole):
+        there = (
+            row - scene_shape[0] // 2 - psf_shape[0] // 2 + shape[0] // 2,
+            col - scene_shape[1] // 2 - psf_shape[1] // 2 + shape[1] // 2,
+        )
+        if 0 <= there[0] < shape[0] and 0 <= there[1] < shape[1]:
+            expected[there] = value
+    assert blurred(scene, psf, shape) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_a_point_in_the_scene_shows_the_caustic_around_its_own_pixel():
+    psf = np.zeros((9, 9), np.float32)
+    psf[4, 4], psf[4, 6] = 0.75, 0.25
+    scene = np.zeros((20, 20), np.float32)
+    scene[10 + 3, 10 - 2] = 1
+    seen = blurred(scene, psf, (40, 50))
+    assert seen[20 + 3, 25 - 2] == pytest.approx(0.75, abs=1e-5)
+    assert seen[20 + 3, 25] == pytest.approx(0.25, abs=1e-5)
+    assert fitted(scene, (40, 50))[23, 23] == 1
+
+
+def test_the_truth_lies_on_the_sensor_grid_around_its_middle(world):
+    truth = world.truth("green")
+    assert truth.shape == world.shape
+    assert truth.dtype == np.float32
+    rows, cols = np.nonzero(truth)
+    assert rows.mean() == pytest.approx((270 - 1) / 2, abs=0.2)
+    assert cols.mean() == pytest.approx((480 - 1) / 2, abs=0.2)
+    assert np.ptp(cols) + 1 == pytest.approx(world.geometry.px_per_deg * 33.4, abs=2)
+
+
+def test_a_scene_that_runs_past_the_sensor_still_lights_it():
+    spec = small_head()
+    narrow = spec.model_copy(update={"camera": spec.camera.model_copy(update={"rows": 100, "cols": 110})})
+    wide, cut = World(spec, VirtualClock()), World(narrow, VirtualClock())
+    assert cut.retina.field.sum() > cut.truth("green").astype(bool).sum()
+    middle = wide.electrons_per_s("green")[85:185, 185:295]
+    part = cut.electrons_per_s("green")
+    assert part / part.mean() == pytest.approx(middle / middle.mean(), rel=1e-3)
+
+
+def test_the_wrong_lamp_looks_wrong(world):
+    green, red = world.electrons_per_s("green"), world.electrons_per_s("red")
+    assert np.corrcoef(world.truth("green").ravel(), world.truth("red").ravel())[0, 1] < 0.99
+    assert np.abs(green / green.max() - red / red.max()).max() > 0.02
+
+
+def test_the_eyes_refraction_changes_the_caustic_and_not_the_calibration(world):
+    myope = World(small_head(), VirtualClock(), refraction=Refraction(4.0))
+    assert not np.allclose(myope.psf("green"), world.psf("green"), atol=1e-6)
+    assert simulated_calibration(myope).id == simulated_calibration(world).id
+
+
+def test_the_irradiance_is_computed_once(world):
+    assert world.electrons_per_s("green") is world.electrons_per_s("green")
+
+
+def test_the_left_eye_is_another_picture():
+    left = World(small_head(), VirtualClock(), eye="OS")
+    assert left.retina.disc[1] < left.retina.fovea[1]
+
+
+def test_the_calibration_is_what_a_factory_would_measure(world):
+    calibration = simulated_calibration(world)
+    psf = calibration.psfs[0].pixels
+    true = fitted(world.psf("green"), world.shape)
+    assert psf.shape == world.shape
+    assert psf.sum(dtype=np.float64) == pytest.approx(1, abs=1e-4)
+    assert 0.999 < np.corrcoef(psf.ravel(), true.ravel())[0, 1] < 1 - 1e-9  # close, and not the truth itself
+    assert calibration.simulated
+    assert calibration.sensor.gain_e_per_dn == world.spec.camera.gain_e_per_dn
+    assert calibration.field_deg == 33.4
+    assert abs(psf[:20].sum()) < 1e-5  # no pedestal
+
+
+def test_a_sensor_smaller_than_the_caustic_can_be_calibrated():
+    spec = small_head()
+    tiny = spec.model_copy(update={"camera": spec.camera.model_copy(update={"rows": 60, "cols": 75})})
+    world = World(tiny, VirtualClock())
+    psf = simulated_calibration(world).psfs[0].pixels
+    assert np.corrcoef(psf.ravel(), fitted(world.psf("green"), (60, 75)).ravel())[0, 1] > 0.999
+
+
+def test_a_photograph_can_be_the_retina(tmp_path):
+    picture = np.zeros((60, 90, 3), np.uint8)
+    picture[:, 45:] = (200, 100, 50)
+    Image.fromarray(picture).save(tmp_path / "eye.png")
+    world = World(small_head(image=tmp_path / "eye.png"), VirtualClock())
+    for colour, level in {"red": 200, "green": 100, "blue": 50}.items():
+        truth = world.truth(colour)
+        assert truth[135, 290] == pytest.approx(level / 255, abs=0.01)
+        assert truth[135, 190] < 0.01
+    assert world.retina.vessels is None
+
+
+def test_a_photograph_that_is_none_is_refused(tmp_path):
+    (tmp_path / "eye.png").write_text("not a picture")
+    for path in (tmp_path / "eye.png", tmp_path / "missing.png"):
+        with pytest.raises(SpecError, match="cannot be read"):
+            World(small_head(image=path), VirtualClock()).truth("green")
+
+
+@pytest.mark.parametrize("missing", ["optics", "sim"])
+def test_a_head_without_its_tables_is_refused(missing):
+    with pytest.raises(SpecError, match="needs the tables"):
+        World(small_head().model_copy(update={missing: None}), VirtualClock())
+
+
+def test_a_negative_seed_is_a_seed():
+    assert World(small_head(seed=-3), VirtualClock()).truth("green").any()
+
+
+def test_faults_become_the_errors_that_name_them():
+    world = World(small_head(), VirtualClock())
+    camera, light = SimCamera(world), SimLight(world)
+    world.faults.add("camera.stalled")
+    before = world.clock.now_s()
+    with pytest.raises(CameraStalled):
+        camera.expose(Shot(0.1))
+    assert world.clock.now_s() - before > 0.1
+    world.faults = {"camera.missing"}
+    with pytest.raises(CameraMissing):
+        camera.expose(Shot(0.1))
+    with pytest.raises(CameraMissing):
+        SimCamera(world)
+    world.faults = {"light.fault"}
+    with pytest.raises(LightFault):
+        light.on(Glow("green"))
+    assert light.glow is None
+    world.faults.clear()
+    assert camera.expose(Shot(0.1)).number == 1
+
+
+def test_a_lamp_that_breaks_before_the_context_begins_stays_dark():
+    world = World(small_head(), VirtualClock())
+    light = SimLight(world)
+    lit = light.on(Glow("green"))
+    world.faults.add("light.fault")
+    with pytest.raises(LightFault):
+        lit.__enter__()
+    assert light.glow is None
+
+
+def test_a_fault_that_does_not_exist_is_refused():
+    world = World(small_head(), VirtualClock())
+    world.faults.add("camera.stolen")
+    with pytest.raises(SettingError, match=r"camera\.stolen"):
+        SimCamera(world)
+
+
+def test_frames_are_marked_as_simulated_and_repeat_with_the_seed():
+    frames = []
+    for _ in range(2):
+        world = World(small_head(), VirtualClock())
+        with SimLight(world).on(Glow("green")):
+            frames.append(SimCamera(world).expose(Shot(0.1)))
+    assert all(frame.simulated for frame in frames)
+    assert np.array_equal(frames[0].counts, frames[1].counts)
