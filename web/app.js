@@ -4,7 +4,7 @@ import { getCaptures, getStatus, listen, Refusal, takePicture } from "./api.js";
 import "./live.js";
 import { createStore } from "./store.js";
 import { render } from "./vendor/lit-html.js";
-import { EyePic } from "./viewer.js";
+import { EyePic, homeBox } from "./viewer.js";
 import { otherEye, page } from "./views.js";
 import { t } from "./words.js";
 
@@ -99,6 +99,13 @@ const act = {
   reset() {
     set({ contrast: 0 });
     $("eye-pic").showAll();
+  },
+
+  // A thumbnail shows the illuminated disc, not the dark frame around it.
+  thumbLoaded({ target }) {
+    const { naturalWidth: width, naturalHeight: height } = target;
+    const home = homeBox(get().status, width, height);
+    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
   },
 
   closeAlert: () => set({ alert: null }),
@@ -215,6 +222,11 @@ listen({
     if (url) set({ src: { url, mark: "quick" } });
   },
 
+  failed() {
+    // Our own press hears of its failure by its answer; anything else is a problem of the instrument that stands now.
+    if (get().screen !== "making") refreshStatus();
+  },
+
   kept(capture) {
     if (get().screen === "making" && capture.id === makingId) pictureKept(capture);
     else addToStrip(capture);
@@ -307,15 +319,8 @@ function remembered(key, otherwise) {
 // ---- draw
 
 function draw(state) {
-  const root = document.documentElement;
-  root.dataset.theme = state.theme;
-  root.style.setProperty("--thumb-zoom", thumbZoom(state.status));
+  document.documentElement.dataset.theme = state.theme;
   render(page(state, act), $("#app"));
-}
-
-// The list shows the illuminated disc, not the dark frame around it.
-function thumbZoom(status) {
-  return status?.field_px ? Math.max(1, (Math.min(...status.shape) / status.field_px) * 0.94) : 1;
 }
 
 store.subscribe(draw);

@@ -56,7 +56,10 @@ export class EyeLive extends HTMLElement {
 
   /** "opening", "live" or "lost": when the link comes back, a request that hangs on the old one is given up at once. */
   set link(link) {
-    if (link === "live" && this.#link === "lost") this.#abort.abort();
+    if (link === "live" && this.#link === "lost") {
+      this.#number = 0;
+      this.#abort.abort();
+    }
     this.#link = link;
   }
 
@@ -73,6 +76,7 @@ export class EyeLive extends HTMLElement {
     this.#abort = abort;
     try {
       const frame = await getPreview(this.#number, abort.signal);
+      if (!frame) this.#number = 0; // perhaps the server started anew while nobody looked, with small numbers
       if (!frame || !this.#active) return;
       this.#bitmap?.close();
       this.#bitmap = frame.bitmap;
@@ -83,7 +87,7 @@ export class EyeLive extends HTMLElement {
       this.#draw();
       this.#tellAge();
     } catch {
-      this.#number = 0; // the server may have started anew, with small numbers
+      this.#number = 0;
       if (!abort.signal.aborted) await pause(RETRY_MS);
     } finally {
       clearTimeout(patience);

@@ -134,12 +134,12 @@ function card(state) {
 }
 
 function makingCard({ stage }) {
-  const left = Math.round(stage.left);
+  const left = Math.round(stage.left); // 0: not known, and then nothing is promised
   const words = { expose: "make.expose", quick: "make.refine", refine: "make.refine", keep: "make.keep" };
   return html`
     <div class="card making">
       <h2>${t(words[stage.name] ?? "make.refine")}</h2>
-      <p class="muted">${left >= 1 ? t("make.left", { n: left }) : t("make.soon")}</p>
+      <p class="muted">${left >= 1 ? t("make.left", { n: left }) : stage.fraction >= 0.9 ? t("make.soon") : "\u00a0"}</p>
       <progress max="1" .value=${stage.fraction} aria-label=${t("make.progress")}></progress>
     </div>
   `;
@@ -219,7 +219,7 @@ function strip({ captures, screen, shown }, act) {
                 aria-label=${t("strip.open", { eye: t(`eye.${capture.eye}`), time })}
                 @click=${() => act.open(capture)}
               >
-                <span class="thumb"><img src=${capture.links.quick} alt="" loading="lazy" /></span>
+                <span class="thumb"><img src=${capture.links.quick} alt="" loading="lazy" @load=${act.thumbLoaded} /></span>
                 <span>${t(`eye.${capture.eye}.short`)}<br />${time}</span>
               </button>
             </li>

@@ -67,16 +67,20 @@ class Model:
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= self.otf
-        image: Image = self.fft.inverse() / np.float32(self.size)
-        return image
+        return normalised(self.fft)
 
     def blur_adjoint(self, image: Image) -> Image:
         """The adjoint of `blur`: correlation with h, as a new array."""
         self.fft.space[:] = image
         spectrum = self.fft.forward()
         spectrum *= np.conj(self.otf)
-        image: Image = self.fft.inverse() / np.float32(self.size)
-        return image
+        return normalised(self.fft)
+
+
+def normalised(fft: RealFft) -> Image:
+    """The inverse transform of what is in the spectrum, divided by the number of samples, as a new array."""
+    image: Image = fft.inverse() / np.float32(fft.shape[0] * fft.shape[1])
+    return image
 
 
 def field_box(calibration: Calibration, shape: tuple[int, int], n: int = 1) -> tuple[slice, slice]:
@@ -103,7 +107,8 @@ def taper(grid: tuple[int, int], share: float = 0.15) -> Image:
     for size in grid:
         inward = np.minimum(np.arange(size) + 0.5, size - np.arange(size) - 0.5)
         sides.append(0.5 - 0.5 * np.cos(np.pi * np.minimum(1, inward / width)))
-    return np.outer(*sides).astype(np.float32)
+    window: Image = np.outer(*sides).astype(np.float32)
+    return window
 
 
 def _runs_past_the_edge(flat: Image) -> bool:

@@ -88,7 +88,8 @@ class Complaints:
 
     def watch(self, page: Page) -> None:
         def console(message: ConsoleMessage) -> None:
-            if message.type in ("error", "warning"):
+            # The tests read pixels back more often than a page would; the browser's advice about that is not for us.
+            if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
                 self.heard.append(f"console {message.type}: {message.text} ({message.location.get('url')})")
 
         def failed(request: Request) -> None:

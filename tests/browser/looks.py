@@ -80,6 +80,16 @@ _MEASURE = r"""
 
 
 def look_for_faults(page: Page, *in_view: str) -> list[str]:
-    """Every fault in what is shown now; `in_view` must be wholly inside the viewport and uncovered."""
-    faults: list[str] = page.evaluate(_MEASURE, list(in_view))
+    """Every fault in what is shown now, in both themes; `in_view` must be wholly inside the viewport and uncovered."""
+    both = f"""(inView) => {{
+      const root = document.documentElement;
+      const chosen = root.dataset.theme;
+      const faults = ["dim", "daylight"].flatMap((theme) => {{
+        root.dataset.theme = theme;
+        return ({_MEASURE})(inView).map((fault) => `${{theme}}: ${{fault}}`);
+      }});
+      root.dataset.theme = chosen;
+      return faults;
+    }}"""
+    faults: list[str] = page.evaluate(both, list(in_view))
     return faults

@@ -42,15 +42,10 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
-@pytest.mark.parametrize("theme", ["dim", "daylight"])
-def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int], theme: str) -> None:
-    stub.stub.expose_s = stub.stub.refine_s = 0.3
+def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int]) -> None:
+    stub.stub.refine_s = 1.5
     stub.stub.problem = {"code": "light.fault", "message": "One light is not working.", "remedy": "Call the technician."}
     page = live(open_page(stub.url, size))
-    page.evaluate("theme => localStorage.setItem('diffuscope.theme', theme)", theme)
-    page.reload()
-    live(page)
-    expect(page.locator("html")).to_have_attribute("data-theme", theme)
     faults = {"problem": look_for_faults(page, SHUTTER)}
     stub.stub.problem = None
     page.get_by_role("button", name="OK").tap()
@@ -243,6 +238,16 @@ def test_silence_is_a_lost_link_and_the_shutter_says_so(open_page: Open, stub: S
     assert stub.stub.presses == 0, "a press into a dead link must not fire later"
     stub.stub.silent = False
     expect(page.locator(".banner")).to_have_count(0, timeout=3000)
+
+
+def test_the_theme_is_chosen_in_the_menu_and_remembered(open_page: Open, stub: Stubbed) -> None:
+    page = live(open_page(stub.url))
+    expect(page.locator("html")).to_have_attribute("data-theme", "dim")
+    page.get_by_role("button", name="Menu").tap()
+    page.get_by_role("button", name="Daylight").tap()
+    page.get_by_role("button", name="Close").tap()
+    page.reload()
+    expect(page.locator("html")).to_have_attribute("data-theme", "daylight")
 
 
 def test_letter_keys_can_be_switched_off(open_page: Open, stub: Stubbed) -> None:

@@ -165,7 +165,7 @@ def test_a_preview_frame_takes_less_than_ten_milliseconds(shape: tuple[int, ...]
 
 
 @given(frames, st.dictionaries(st.text(), json_values, max_size=4))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 def test_a_raw_frame_comes_back_exactly(counts: np.ndarray, description: dict[str, object]) -> None:
     back, said = read_raw_tiff(raw_tiff(counts, description))
     assert back.dtype == np.uint16

@@ -75,7 +75,7 @@ moments = st.datetimes(datetime(2020, 1, 1), datetime(2020, 1, 1, 0, 0, 3), time
 
 
 @given(st.lists(moments, max_size=7), st.integers(1, 3))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_the_list_is_newest_first_and_pages_meet_without_a_gap(taken: list[datetime], page: int) -> None:
     with (
         TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder,

@@ -1,0 +1,119 @@
+"""The closed form against its textbook twin, and against what linear algebra says of any such filter."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests import scenes
+from tests.textbook import deconvolution as textbook
+
+from device.recon.closed import GRADIENT, TIKHONOV, ClosedForm, Prior
+from device.recon.model import Model, wrapped
+from device.recon.prepare import Preparer
+from device.values import Image, Psf
+
+SIZES = st.sampled_from([7, 8, 13, 16, 31, 48])
+SEEDS = st.integers(0, 2**16)
+
+
+def solved(psf: Image, y: Image, prior: Prior, mu: float, **changes: object) -> Image:
+    cal = scenes.calibration(psf, **changes)
+    model = Model(cal, y.shape, 1, scenes.PLANNER, 0)
+    model.window = None
+    out = np.empty(y.shape, np.float32)
+    ClosedForm(model, prior, mu).solve(Preparer(cal, y.shape, 1)(y), out)
+    return out
+
+
+def scene(rows: int, cols: int, seed: int) -> tuple[Image, Image]:
+    y = np.random.default_rng(seed).uniform(0, 1000, (rows, cols)).astype(np.float32)
+    return scenes.speckle((rows, cols), seed), y
+
+
+@given(SIZES, SIZES, SEEDS, st.floats(-6, 1))
+@settings(max_examples=40, deadline=None)
+def test_the_papers_form_is_the_textbooks(rows: int, cols: int, seed: int, log_mu: float) -> None:
+    psf, y = scene(rows, cols, seed)
+    mu = 10.0**log_mu
+    fast = solved(psf, y, TIKHONOV, mu)
+    slow = textbook.tikhonov(y.astype(float), textbook.otf(psf.astype(float), y.shape), mu)
+    # float32 loses at most about 1.4 unit roundoffs times the largest gain (optics.md 5.4, 10); four leaves room
+    bound = 4 * 2**-24 / (2 * np.sqrt(mu)) * np.linalg.norm(y) + 4 * 2**-24 * np.linalg.norm(slow)
+    assert np.linalg.norm(fast - slow) <= bound
+
+
+@given(SIZES, SIZES, SEEDS)
+@settings(max_examples=25, deadline=None)
+def test_the_gradient_form_is_the_textbooks(rows: int, cols: int, seed: int) -> None:
+    psf, y = scene(rows, cols, seed)
+    H = textbook.otf(psf.astype(float), y.shape)
+    cal = scenes.calibration(psf)
+    model = Model(cal, y.shape, 1, scenes.PLANNER, 0)
+    delta = ClosedForm(model, GRADIENT, 1e-2).delta
+    reg = 1e-2 * (textbook.gradient_power(y.shape) + GRADIENT.floor) + delta
+    slow = textbook.flat_subtracted(y.astype(float), H, np.ones(y.shape), reg, fit_background=False)
+    assert solved(psf, y, GRADIENT, 1e-2) == pytest.approx(slow, abs=2e-4 * float(y.max()))
+
+
+@given(SIZES, SIZES, SEEDS)
+@settings(max_examples=25, deadline=None)
+def test_blur_and_its_adjoint_pass_the_dot_test(rows: int, cols: int, seed: int) -> None:
+    psf, u = scene(rows, cols, seed)
+    v = np.random.default_rng(seed + 1).standard_normal((rows, cols)).astype(np.float32)
+    model = Model(scenes.calibration(psf), (rows, cols), 1, scenes.PLANNER, 0)
+    left = float((model.blur(u).astype(float) * v).sum())
+    right = float((u.astype(float) * model.blur_adjoint(v)).sum())
+    assert left == pytest.approx(right, rel=1e-4, abs=1e-5 * np.linalg.norm(u) * np.linalg.norm(v))
+
+
+@given(SEEDS, st.floats(0.01, 100))
+@settings(max_examples=20, deadline=None)
+def test_twice_the_light_is_twice_the_picture(seed: int, factor: float) -> None:
+    psf, y = scene(24, 31, seed)
+    once = solved(psf, y, GRADIENT, 1e-3)
+    more = solved(psf, (y * np.float32(factor)).astype(np.float32), GRADIENT, 1e-3)
+    assert more == pytest.approx(once * factor, rel=1e-3, abs=1e-3 * factor * float(np.abs(once).max()))
+
+
+@given(SEEDS, st.integers(-20, 20), st.integers(-20, 20))
+@settings(max_examples=20, deadline=None)
+def test_a_shifted_psf_shifts_the_picture_and_nothing_else(seed: int, down: int, right: int) -> None:
+    psf, y = scene(32, 40, seed)
+    straight = solved(psf, y, TIKHONOV, 1e-2)
+    shifted = solved(np.roll(psf, (down, right), (0, 1)), y, TIKHONOV, 1e-2)
+    assert np.roll(shifted, (down, right), (0, 1)) == pytest.approx(straight, abs=1e-3 * float(np.abs(straight).max()))
+
+
+@pytest.mark.parametrize("log_mu", range(-8, 2))
+def test_no_picture_is_larger_than_theory_allows(log_mu: int) -> None:
+    psf, y = scene(48, 31, 5)
+    mu = 10.0**log_mu
+    assert np.linalg.norm(solved(psf, y, TIKHONOV, mu)) <= np.linalg.norm(y) / (2 * np.sqrt(mu)) * 1.001
+
+
+def test_white_noise_comes_out_as_strong_as_the_filter_says() -> None:
+    psf, mu, sigma = scenes.speckle((96, 128)), 1e-3, 7.0
+    noise = np.random.default_rng(3).normal(0, sigma, psf.shape).astype(np.float32)
+    H = textbook.otf(psf.astype(float), psf.shape)
+    gain = np.sqrt(np.mean((np.abs(H) / (np.abs(H) ** 2 + mu)) ** 2))
+    assert solved(psf, noise, TIKHONOV, mu).std() == pytest.approx(sigma * gain, rel=0.05)  # 12288 pixels, few modes
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5])
+def test_a_binned_psf_keeps_its_centre_and_its_light(n: int) -> None:
+    dot = Psf(scenes.delta((60, 60)))
+    small = wrapped(dot, n, (60 // n, 60 // n))
+    assert small.sum() == pytest.approx(1, rel=1e-6)
+    rows = np.fft.fftfreq(small.shape[0]) * small.shape[0]
+    assert float((small.sum(axis=1) * rows).sum()) == pytest.approx(0, abs=1e-6)
+    assert float((small.sum(axis=0) * rows).sum()) == pytest.approx(0, abs=1e-6)
+
+
+@given(st.integers(1, 40), st.integers(1, 40), SIZES, SIZES)
+@settings(max_examples=40, deadline=None)
+def test_psfs_of_any_size_land_on_any_torus(rows: int, cols: int, grid_rows: int, grid_cols: int) -> None:
+    psf = np.zeros((rows, cols), np.float32)
+    psf[rows // 2, cols // 2] = 1
+    torus = wrapped(Psf(psf), 1, (grid_rows, grid_cols))
+    assert torus[0, 0] == pytest.approx(1)
+    assert torus.sum() == pytest.approx(1)
