@@ -1,10 +1,14 @@
-# make run | test | lint | bench | clean. Each sets up .venv by itself, and is quiet when it is there.
+# Every word sets up .venv by itself when requirements.lock or pyproject.toml is newer, and is quiet when it is there.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 PORT ?= 8000
 
-.PHONY: run test lint bench lock clean browser
+.DEFAULT_GOAL := help
+.PHONY: help run test browser lint bench lock clean
+
+help: ## List the words that make knows.
+	@sed -nE 's/^([a-z]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
 
 .venv/ready: requirements.lock pyproject.toml
 	@echo "Setting up .venv (a minute, once)"
@@ -14,30 +18,30 @@ PORT ?= 8000
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
-run: .venv/ready
+run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
-test: .venv/ready browser
+test: .venv/ready browser ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -m "not bench and not rig"
 
-browser:
+browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
 
-lint: .venv/ready
-	@$(BIN)/ruff check .
-	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy
-	@$(BIN)/lint-imports
+lint: .venv/ready ## Check style, types, and who imports whom.
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/ruff format --diff --quiet .
+	@$(BIN)/mypy --no-error-summary
+	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
-bench: .venv/ready
+bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready
-	@$(BIN)/pip install --quiet uv
+lock: .venv/ready ## Write requirements.lock anew.
+	@$(BIN)/pip install --quiet --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra test --group lock pyproject.toml -o requirements.lock
 
-clean:
-	@rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis out
+clean: ## Remove all that was made here; captures live elsewhere and stay.
+	@rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -25,6 +25,7 @@ class GuardedLight:
         self._lit_at_s = 0.0
         self._debt_s = 0.0  # seconds of light that have not yet been matched by darkness
         self._dark_at_s = clock.now_s()
+        self._cut_at_s: float | None = None  # when the timer ended this stretch, if it did
         light.off()
 
     @property
@@ -44,12 +45,19 @@ class GuardedLight:
         self._debt_s = max(0.0, self._debt_s - (now_s - self._dark_at_s))
         if self._debt_s >= self.max_on_s:
             raise LightLimit(f"{self._debt_s:.1f} s of light have not yet been followed by darkness")
-        self._lit_at_s = now_s
-        self._timer = Timer(self.max_on_s, self._light.off)
+        self._lit_at_s, self._cut_at_s = now_s, None
+        self._timer = Timer(self.max_on_s, self._cut)
         self._timer.daemon = True
         self._timer.start()
         self._held = self._light.on(glow)
         self._held.__enter__()
+        if self._cut_at_s is not None:  # the timer came before the light, and nothing else would end it
+            raise LightLimit(f"the lamp took longer to light up than the {self.max_on_s:g} s it may shine")
+
+    def _cut(self) -> None:
+        """The timer's own: be dark, whatever the holder does."""
+        self._cut_at_s = self._clock.now_s()
+        self._light.off()
 
     def off(self) -> None:
         """Be dark now."""
@@ -58,7 +66,7 @@ class GuardedLight:
         self._light.off()
         if self._held is not None:
             self._held = None
-            self._dark_at_s = self._clock.now_s()
+            self._dark_at_s = self._clock.now_s() if self._cut_at_s is None else self._cut_at_s
             self._debt_s += self._dark_at_s - self._lit_at_s
 
 

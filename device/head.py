@@ -58,16 +58,21 @@ def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] 
     if raws or psfs:
         if not (raws and psfs):
             raise SpecError("a recording needs both its raws and its PSFs", "Give --raw and --psf together.")
-        return recorded_head(ReplaySpec(raws=raws, psfs=psfs), folder.name)
+        return recorded_head(ReplaySpec(raws=raws, psfs=psfs), _name(folder))
     if not folder.is_dir():
         raise SpecError(f"{folder} is not a folder", "Give the folder that holds a raw frame and its PSF.")
     toml = folder / "recording.toml"
     if not toml.is_file():
-        return recorded_head(find_recording(folder), folder.name)
+        return recorded_head(find_recording(folder), _name(folder))
     spec = load_head(toml)
     if spec.replay is None:
         raise SpecError(f"{toml}: a recording needs the table [replay]")
     return spec.model_copy(update={"replay": _beside(spec.replay, folder)})
+
+
+def _name(folder: Path) -> str:
+    """What to call a recording: its folder, also when that was given as `.`"""
+    return folder.resolve().name or "recording"
 
 
 def _beside(replay: ReplaySpec, folder: Path) -> ReplaySpec:

@@ -1,5 +1,9 @@
 """Image files in and out: tiff, png and npy, with a clear word about every file that is not an image."""
 
+import json
+import struct
+import zipfile
+import zlib
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -16,6 +20,10 @@ from device.values import Image, Mask, Psf, check_image_shape
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
+_BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
+    ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError,
+    UnidentifiedImageError, tifffile.TiffFileError, Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
 
 
 def read_image(path: Path) -> NDArray[Any]:
@@ -51,12 +59,30 @@ def _decode(path: Path, data: bytes) -> NDArray[Any]:
             case ".tif" | ".tiff":
                 return np.asarray(tifffile.imread(BytesIO(data)))
             case ".png":
+                _refuse_what_would_lose_bits(path, data)
                 with Pillow.open(BytesIO(data)) as picture:
                     picture.load()
                     return np.asarray(picture.convert("RGB") if picture.mode in ("P", "LA") else picture)
-    except (ValueError, EOFError, OSError, UnidentifiedImageError, tifffile.TiffFileError, SyntaxError) as error:
-        raise FrameError(f"{path} is not a whole {path.suffix[1:]} image: {error}") from error
+    except _BROKEN as error:
+        raise FrameError(f"{path} is not a whole {path.suffix[1:]} image: {error or 'too large'}") from error
     raise FrameError(f"{path}: the ending '{path.suffix}' is not one of {', '.join(SUFFIXES)}")
+
+
+def _refuse_what_would_lose_bits(path: Path, data: bytes) -> None:
+    """A png of 16-bit colour: our decoder would keep 8 bits of each, and say nothing."""
+    depth, colour = data[24:25], data[25:26]  # of the header, which the format fixes
+    if data[1:4] == b"PNG" and depth == b"\x10" and colour in b"\x02\x04\x06":
+        raise FrameError(f"{path} holds 16-bit colour, which a png here cannot bring whole", "Save it as tiff or npy.")
+
+
+def says_simulated(path: Path) -> bool:
+    """Whether a raw tiff says in its description that no retina was there, as those that we keep do."""
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            facts = json.loads(tiff.pages.first.description)
+    except (*_BROKEN, AttributeError):  # not a tiff, or one without such a description
+        return False
+    return isinstance(facts, dict) and facts.get("simulated") is True
 
 
 def write_linear(path: Path, picture: Image) -> None:
@@ -111,9 +137,10 @@ def _any_channel(mask: Mask) -> Mask:
 
 
 def _justification(counts: NDArray[np.uint16]) -> tuple[int, Mask]:
+    lit = int(np.count_nonzero(counts))  # zeros fit every justification, and prove none
     for shift in (8, 6, 4, 2):
         stray = (counts & np.uint16(2**shift - 1)) != 0
-        if counts.any() and stray.sum() <= 1e-4 * stray.size and (counts[~stray] >> shift).max(initial=0) > 255:
+        if stray.sum() <= 1e-4 * lit and (counts[~stray] >> shift).max(initial=0) > 255:
             return shift, stray
     return 0, np.zeros(counts.shape, np.bool_)
 
@@ -138,6 +165,16 @@ def as_psf(array: NDArray[Any], name: str) -> Psf:
     pedestal = float(np.median(pixels[border & good])) if (border & good).any() and min(pixels.shape) > 8 else 0.0
     pixels = np.where(good, pixels - np.float32(pedestal), np.float32(0))
     return Psf(pixels, name)
+
+
+def refuse_other_sizes(psfs: tuple[Psf, ...], shape: tuple[int, int]) -> None:
+    """Refuse PSFs that were not measured on the raw's own pixels: of another camera mode, they are of another scale."""
+    for psf in psfs:
+        if psf.shape != shape:
+            raise PsfError(
+                f"{psf.name} has {psf.shape[0]} x {psf.shape[1]} pixels, the raw {shape[0]} x {shape[1]}",
+                "Give the PSF that was measured in the same camera mode as the raw.",
+            )
 
 
 def read_psf(path: Path) -> Psf:

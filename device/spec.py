@@ -115,7 +115,13 @@ def load_toml(path: Path, kind: type[T]) -> T:
     except tomllib.TOMLDecodeError as error:
         raise SpecError(f"{path} is not TOML: {error}") from error
     except ValidationError as error:
-        raise SpecError(_sentence(path, text, error.errors()[0], kind)) from error
+        raise SpecError(_sentence(path, text, _most_telling(error), kind)) from error
+
+
+def _most_telling(error: ValidationError) -> Any:
+    """The mistake to name: a key that is not known comes first, because it is why another one is missing."""
+    mistakes = error.errors()
+    return next((mistake for mistake in mistakes if mistake["type"] == "extra_forbidden"), mistakes[0])
 
 
 def load_head(path: Path) -> InstrumentSpec:
@@ -125,12 +131,20 @@ def load_head(path: Path) -> InstrumentSpec:
         raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
     if spec.camera.backend == "replay" and spec.replay is None:
         raise SpecError(f"{path}: a replayed head needs the table [replay]")
+    for key in ("exposure_s", "preview_exposure_s"):
+        if getattr(spec.camera, key) >= spec.light.max_on_s:
+            raise SpecError(
+                f"{path}: camera.{key} = {getattr(spec.camera, key):g} is not shorter than "
+                f"light.max_on_s = {spec.light.max_on_s:g}, so the guard would end every exposure"
+            )
     return spec
 
 
 def _sentence(path: Path, text: str, error: Any, kind: type[Table]) -> str:
     keys = [str(part) for part in error["loc"]]
-    where = f"{path}, line {line}" if (line := line_of(text, keys)) else str(path)
+    lines = (line_of(text, keys[:length]) for length in range(len(keys), 0, -1))  # of the key, or what it stands in
+    line = next((line for line in lines if line), None)
+    where = f"{path}, line {line}" if line else str(path)
     if error["type"] != "extra_forbidden":
         return f"{where}: {'.'.join(keys)}: {error['msg']}"
     near = difflib.get_close_matches(keys[-1], _known_keys(kind, keys[:-1]), n=1)
@@ -154,7 +168,7 @@ def line_of(text: str, keys: list[str]) -> int | None:
             table = header[1]
             if table == ".".join(keys) or table == ".".join(keys[:-1]):
                 found = found or number
-        elif (entry := re.match(r"\s*['\"]?([\w-]+)['\"]?\s*=", line)) and (
+        elif (entry := re.match(r"\s*['\"]?([\w.-]+)['\"]?\s*=", line)) and (
             f"{table}.{entry[1]}".lstrip(".") == ".".join(keys)
         ):
             return number

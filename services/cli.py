@@ -13,7 +13,7 @@ from device.errors import DiffuscopeError
 from device.head import recording
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
-from services.instrument.once import Order, reconstruct_file
+from services.instrument.once import Order, reconstruct_file, written
 
 app = typer.Typer(
     name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
@@ -70,11 +70,11 @@ def reconstruct(
     report: Annotated[Path | None, typer.Option(help="Where to write the report as JSON.")] = None,
 ) -> None:
     """Turn one raw frame into a picture, without a head and without a page."""
-    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache())
+    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report)
     made = reconstruct_file(order)
     text = json.dumps(asdict(made.report), indent=1)
     if report is not None:
-        report.write_text(text + "\n", encoding="utf-8")
+        written(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
     seconds = sum(made.report.seconds.values())
     typer.echo(f"{output}: {made.report.method}, bin {made.report.bin}, {seconds:.3f} s")
     for warning in made.report.warnings:
@@ -110,10 +110,10 @@ def methods(
         typer.echo(f"{method.name:<12} {method.fft_pairs:>9g} {memory:>8}   {method.sentence}{mark}")
 
 
-def main() -> None:
-    """Run the command; an error of ours is one sentence and one remedy, never a traceback."""
+def main(words: list[str] | None = None) -> None:
+    """Run the command line (or the given words); an error of ours is a sentence and a remedy, never a traceback."""
     try:
-        app()
+        app(words)
     except DiffuscopeError as error:
         typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
         sys.exit(2)

@@ -206,7 +206,7 @@ listen({
 
   beat() {
     beats += 1;
-    if (beats % STATUS_BEATS === 0) refreshStatus();
+    if (beats % STATUS_BEATS === 0 || get().status?.problem) refreshStatus(); // a problem that is over must go at once
   },
 
   state({ state }) {

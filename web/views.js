@@ -32,13 +32,12 @@ export function page(state, act) {
             @fault=${act.pictureFault}
             @zoomed=${act.zoomed}
           ></eye-pic>
-          ${cornerChip(state)}
         </div>
         ${prompt(state)}
       </main>
       <section class="panel" aria-label=${t("part.controls")}>
         ${alertCard(state, act)} ${state.screen === "aim" ? eyes(state, act) : card(state)}
-        ${state.picture === "none" ? nothing : tools(state, act)} ${strip(state, act)} ${actions(state, act)}
+        ${state.picture === "none" ? nothing : tools(state, act)} ${actions(state, act)} ${strip(state, act)}
       </section>
       ${menu(state, act)}
     </div>
@@ -47,8 +46,8 @@ export function page(state, act) {
 
 // ---- header
 
-function header(state, act) {
-  const { status, link, busy } = state;
+function header({ status, link, busy, shown }, act) {
+  const kind = shown?.simulated ? "simulated" : status?.kind;
   const word = link === "live" ? (busy ? "busy" : "aim") : link;
   return html`
     <header>
@@ -56,23 +55,18 @@ function header(state, act) {
       <p class="head-name">
         ${status?.name ?? ""} <span class="state" data-state=${word}>${t(`state.${word}`)}</span>
       </p>
-      ${kindChip(status?.kind)}
+      ${kindChip(kind)}
       <button class="quiet" type="button" @click=${act.openMenu}>${icon("menu")} ${t("menu")}</button>
-      ${link === "lost" ? html`<div class="banner" role="alert">${icon("nolink")} <p>${t("link.lost")}</p></div>` : nothing}
+      ${link === "lost" ? html`<div class="banner">${icon("nolink")} <p role="alert">${t("link.lost")}</p> ${kindChip(kind)}</div>` : nothing}
     </header>
   `;
 }
 
-// What is not a real eye must be unmistakable on every screen: in the header, and in the corner of the picture, because
-// the mark in the picture's own pixels lies outside the part that the viewer shows first.
+// What is not a real eye must be unmistakable on every screen, also when a picture's own mark is zoomed out of view.
+// A kept picture answers for itself: it may come from another head than today's.
 function kindChip(kind) {
   if (kind !== "simulated" && kind !== "recording") return nothing;
   return html`<p class="chip" title=${t(`chip.${kind}.why`)}>${t(`chip.${kind}`)}</p>`;
-}
-
-function cornerChip({ shown, status }) {
-  const kind = shown?.simulated ? "simulated" : status?.kind;
-  return html`<div class="corner" data-extra=${kind !== status?.kind}>${kindChip(kind)}</div>`;
 }
 
 // ---- the line under the picture: what to do now, or what this picture is
@@ -152,7 +146,7 @@ function resultCard({ shown, eye, grey }) {
       <h2 tabindex="-1" id="result-title">${t("result.title", { eye: t(`eye.${shown?.eye ?? eye}`) })}</h2>
       ${shown ? html`<p class="muted">${isToday(shown.taken_at) ? time : `${calendarDay(shown.taken_at)}, ${time}`}</p>` : nothing}
       ${(shown?.report?.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
-      ${grey ? html`<p class="muted">${t("result.green")}</p>` : nothing} ${shown ? details(shown) : nothing}
+      ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing} ${shown ? details(shown) : nothing}
     </div>
   `;
 }

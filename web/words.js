@@ -52,7 +52,7 @@ const ENGLISH = {
   "result.again": "Take again",
   "result.next": "Next",
   "result.back": "Back to the live picture",
-  "result.green": "Taken in green light: already red-free.",
+  "result.grey": "Taken in one colour of light: red-free looks the same.",
   "result.details": "Details",
   "detail.method": "Method",
   "detail.rounds": "Rounds",

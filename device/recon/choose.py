@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon import kernels
 from device.recon.model import Model
 from device.recon.plan import Spectrum
 
-SAMPLES = 20_000  # frequencies that decide; sixty thousand would move mu by less than a tenth of a rung
+SAMPLES = 10_000  # frequencies that decide: a hundred thousand would choose the same rung of the ladder
 Energies = NDArray[np.float64]
 LADDER = 10.0 ** np.arange(-8, 1.01, 0.25)
 
@@ -20,6 +21,7 @@ class Sample:
     where: NDArray[np.intp]
     power: Energies
     gradient: Energies
+    silent: NDArray[np.bool_]
 
     @classmethod
     def of(cls, model: Model) -> "Sample":
@@ -27,10 +29,10 @@ class Sample:
         rows, cols = model.otf.shape
         stride = max(1, (rows * cols) // SAMPLES)
         stride += 1 - stride % 2 if cols % 2 == 0 else 0  # an even stride over even rows would see columns only
-        where = np.arange(1, rows * cols, stride)
+        where = np.arange(min(1, rows * cols - 1), rows * cols, stride)
         gradient = model.row_gradient[where // cols] + model.col_gradient[where % cols]
         power = np.abs(model.otf.ravel()[where].astype(np.complex128)) ** 2
-        return cls(where, power, gradient.astype(np.float64))
+        return cls(where, power, gradient.astype(np.float64), power <= np.quantile(power, 0.25))
 
     def energies(self, spectrum: Spectrum) -> Energies:
         """|Y|^2 at the sampled frequencies."""
@@ -49,9 +51,8 @@ class Sample:
 
     def noise_variance(self, energies: Energies, size: int) -> float:
         """Variance per pixel, from the quarter of frequencies that the optics passes least."""
-        silent = self.power <= np.quantile(self.power, 0.25)
         return float(
-            np.median(energies[silent]) / np.log(2) / size
+            np.median(energies[self.silent]) / np.log(2) / size
         )  # |Y|^2 of noise is exponential: median = ln 2 mean
 
 
@@ -61,9 +62,8 @@ def cross_validated(power: Energies, prior: Energies, delta: float, energies: En
     GCV(mu) = n sum(phi^2 |Y|^2) / (sum phi)^2, phi = reg / (|H|^2 + reg), reg = mu R + delta: the noise need not be
     known (optics.md 5.3).
     """
-    reg = LADDER[:, None] * prior + delta
-    phi = reg / (power + reg)
-    scores = energies.size * (phi**2 @ energies) / phi.sum(axis=1) ** 2
+    scores = np.empty(LADDER.size)
+    kernels.cross_validation(power, prior, delta, energies, LADDER, scores)
     best = int(np.argmin(scores))
     return float(LADDER[best]), float(scores[best])
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from device.errors import SettingError
 from device.recon import kernels
 from device.recon.choose import Energies, Sample, cross_validated, flat_fit
 from device.recon.model import Model
@@ -41,6 +42,8 @@ class ClosedForm:
     """One planned closed-form solver; `solve` allocates nothing that grows with the image."""
 
     def __init__(self, model: Model, prior: Prior, mu: float | None = None) -> None:
+        if mu is not None and not 0 < mu < float("inf"):
+            raise SettingError(f"a weight mu of {mu} is not a positive number", "Leave mu out: the frame chooses it.")
         self.model, self.prior, self.mu = model, prior, mu
         self.sample = Sample.of(model)
         self.delta = prior.psf_error * self.sample.passband_power(model.bin)
@@ -67,7 +70,7 @@ class ClosedForm:
         floor = mu * prior.floor + self.delta
         rows, cols = model.row_gradient * slope, model.col_gradient * slope
         kernels.wiener(spectrum, model.otf, rows, cols, floor, 1 / model.size)
-        kernels.add_flat(model.fft.inverse(), model.mask, level, out)
+        kernels.add_flat(model.fft.inverse(), model.mask, level, model.box, out)
         return {
             "mu": mu, "gcv": score, "psf_error": prior.psf_error, "flat_dn": level, "background_dn": background,
             "noise_dn": noise, "residual": misfit / noise if noise > 0 else 0.0,

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from device.values import Image
 
+Single = np.float32
+Series = NDArray[np.float64]
+Box = tuple[int, int, int, int]
 Sums = tuple[float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
@@ -18,29 +21,59 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 
 
 @_jit
-def linearise(counts: Pixels, dark: Image, gain: Image, white: float, n: int, out: Image, good: Image) -> int:
+def linearise(
+    counts: Pixels, dark: Pixels, gain: Image, white: float, n: int, out: Image, good: Image
+) -> tuple[int, int]:
     """Counts to linear DN, n x n pixels to one: out = mean of (counts - dark) * gain over the good pixels.
 
-    `gain` is 1/flat, and 0 where a pixel is not to be believed; `good` becomes the good share of each block, 0 to 1;
-    a block without a good pixel becomes 0. Values from `white` up are saturated; their number is returned.
+    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white`.
+    `good` becomes the good share of each block, 0 to 1; a block without a good pixel becomes 0. Returns the numbers of
+    saturated and of good pixels.
     """
     rows, cols = out.shape
-    saturated = 0
+    wide = cols * n
+    total, used = np.empty(wide, np.float32), np.empty(wide, np.float32)
+    saturated = believed = np.float64(0)
     for i in range(rows):
-        for j in range(cols):
-            total = np.float32(0)
-            used = 0
-            for a in range(i * n, i * n + n):
-                for b in range(j * n, j * n + n):
-                    value = np.float32(counts[a, b])
-                    if value >= white:
-                        saturated += 1
-                    elif gain[a, b] > 0:
-                        total += (value - dark[a, b]) * gain[a, b]
-                        used += 1
-            out[i, j] = total / used if used else np.float32(0)
-            good[i, j] = used / np.float32(n * n)
+        if n == 1:
+            total, used = out[i], good[i]
+        total[:], used[:] = 0, 0
+        for a in range(i * n, i * n + n):
+            saturated += _add_row(counts[a], dark[a], gain[a], np.float32(white), total, used)
+        believed += _bin_row(total, used, n, out[i], good[i])
+    return int(saturated), int(believed)
+
+
+@_jit
+def _add_row(counts: Pixels, dark: Pixels, gain: Image, white: Single, total: Image, used: Image) -> Single:
+    zero, one, lowest = np.float32(0), np.float32(1), np.float32(-3e38)
+    saturated = zero
+    for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
+        value = np.float32(counts[b])
+        ok = (value < white) & (value > lowest) & (gain[b] > zero)
+        saturated += one if value >= white else zero
+        total[b] += (value - np.float32(dark[b])) * gain[b] if ok else zero
+        used[b] += one if ok else zero
     return saturated
+
+
+@_jit
+def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> Single:
+    zero, one = np.float32(0), np.float32(1)
+    believed = zero
+    if n == 1:  # `total` and `used` are `out` and `good` themselves
+        for j in range(good.size):
+            believed += good[j]
+        return believed
+    for j in range(out.size):
+        v = u = zero
+        for b in range(j * n, j * n + n):
+            v += total[b]
+            u += used[b]
+        out[j] = v / max(u, one)
+        good[j] = u / np.float32(n * n)
+        believed += u
+    return believed
 
 
 @_jit
@@ -93,13 +126,28 @@ def wiener(spectrum: Spectrum, otf: Spectrum, row_g: Image, col_g: Image, floor:
 
 
 @_jit
-def add_flat(x: Image, mask: Image, a: float, out: Image) -> None:
-    """out = (x + a) mask: the flat model goes back into the picture, which is dark outside the field."""
+def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
+    """out = (x + a) mask inside `box` (top, bottom, left, right): the flat model goes back; `out` stays outside."""
     a32 = np.float32(a)
-    rows, cols = out.shape
-    for i in range(rows):
-        for j in range(cols):
+    top, bottom, left, right = box
+    for i in range(top, bottom):
+        for j in range(left, right):
             out[i, j] = (x[i, j] + a32) * mask[i, j]
+
+
+@_jit
+def cross_validation(
+    power: Series, prior: Series, delta: float, energies: Series, ladder: Series, scores: Series
+) -> None:
+    """scores = n sum(phi^2 |Y|^2) / (sum phi)^2 for each mu; phi = reg / (|H|^2 + reg), reg = mu R + delta."""
+    for k in range(ladder.size):
+        misfit = freedom = 0.0
+        for i in range(power.size):
+            reg = ladder[k] * prior[i] + delta
+            phi = reg / (power[i] + reg)
+            misfit += phi * phi * energies[i]
+            freedom += phi
+        scores[k] = power.size * misfit / (freedom * freedom)
 
 
 @_jit

@@ -51,11 +51,17 @@ class Model:
         self.fft: RealFft = planner.plan(self.grid)
         centre = tuple(((size - 1) / 2 - (n - 1) / 2) / n for size in shape)
         self.mask = disc(self.grid, (centre[0], centre[1]), field_radius_px(calibration) / n)
+        self.box = self._box()
         self.fft.space[:] = wrapped(calibration.psfs[index], n, self.grid)
         self.otf: Spectrum = self.fft.forward().copy()
         self.flat = self.blur(self.mask)
         self.window = taper(self.grid) if _runs_past_the_edge(self.flat) else None
         self.row_gradient, self.col_gradient = gradient_symbol(self.grid)
+
+    def _box(self) -> tuple[int, int, int, int]:
+        """Top, bottom, left, right of what the mask lets through."""
+        rows, cols = np.nonzero(self.mask.any(axis=1))[0], np.nonzero(self.mask.any(axis=0))[0]
+        return int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1
 
     @property
     def size(self) -> int:

@@ -58,10 +58,10 @@ class Preparer:
         NaN counts as missing. The result lives in buffers that the next call overwrites.
         """
         _fitting("frame", counts, self.shape)
-        offset = self.dark if dark is None else _fitting("dark frame", dark, self.shape).astype(np.float32)
+        offset = self.dark if dark is None else _fitting("dark frame", dark, self.shape)
         y, good = self._out.y, self._out.good
-        saturated = kernels.linearise(counts, offset, self.gain, self.white, self.n, y, good)
-        mean_good = float(good.mean(dtype=np.float64))
+        saturated, believed = kernels.linearise(counts, offset, self.gain, self.white, self.n, y, good)
+        mean_good = believed / (good.size * self.n**2)
         if mean_good < 1 - MOST_BAD:
             raise FrameError(
                 f"{1 - mean_good:.0%} of the frame cannot be used (saturated, bad or not numbers)",

@@ -13,7 +13,7 @@ from device.recon.kernels import Pixels
 from device.recon.methods import DEFAULT, method_named
 from device.recon.model import Model
 from device.recon.plan import Planner
-from device.recon.prepare import Linear, Preparer
+from device.recon.prepare import Preparer
 from device.recon.upsample import upsample
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
@@ -47,8 +47,25 @@ class _Rung:
         self.preparer = Preparer(calibration, shape, recipe.bin)
         self.model = Model(calibration, shape, recipe.bin, planner, index)
         self.solver = ClosedForm(self.model, method_named(recipe.method).prior)
-        self.picture: Image = np.zeros(self.model.grid, np.float32)
+        self.planes: Image = np.zeros((1, *self.model.grid), np.float32)
         self.cost_s = 0.0
+
+    def solve(self, counts: Pixels, dark: Pixels | None) -> dict[str, Any]:
+        """Solve channel by channel into `planes`; one plan serves all, and the last one's facts are told."""
+        channels = 1 if counts.ndim == 2 else counts.shape[2]
+        if len(self.planes) != channels:
+            self.planes = np.zeros((channels, *self.model.grid), np.float32)
+        facts: dict[str, Any] = {}
+        for c, plane in enumerate(self.planes):
+            frame = self.preparer(_channel(counts, c), None if dark is None else _channel(dark, c))
+            seen = {"saturated": frame.saturated, "missing": frame.missing, "mean_dn": float(frame.y.mean())}
+            facts = self.solver.solve(frame, plane) | seen
+        return facts
+
+    @property
+    def picture(self) -> Image:
+        """What was solved last: (rows, cols) or (rows, cols, 3) of the grid."""
+        return self.planes[0] if len(self.planes) == 1 else np.moveaxis(self.planes, 0, -1)
 
 
 class Reconstructor:
@@ -92,36 +109,16 @@ class Reconstructor:
                 stopped = "deadline"
                 break
             start_s = self.clock.now_s()
-            report = self._run(rung, counts, dark)
+            report = rung.solve(counts, dark)
             rung.cost_s = self.clock.now_s() - start_s
             done = rung
             if watch is not None:
-                watch(Stage(rung.recipe, self._result(rung, counts.ndim), last=rung is self.rungs[-1]))
+                watch(Stage(rung.recipe, rung.picture, last=rung is self.rungs[-1]))
         assert done is not None
         solved_s = self.clock.now_s()
-        picture = upsample(self._result(done, counts.ndim), done.recipe.bin, self.shape)
+        picture = upsample(done.picture, done.recipe.bin, self.shape)
         seconds = {"solve": solved_s - begin_s, "upsample": self.clock.now_s() - solved_s}
         return Reconstruction(picture, self._report(done, report, stopped, seconds), simulated)
-
-    def _run(self, rung: _Rung, counts: Pixels, dark: Pixels | None) -> dict[str, Any]:
-        if counts.ndim == 2:
-            return self._solve(rung, counts, dark, rung.picture)
-        if rung.picture.shape != (3, *rung.model.grid):
-            rung.picture = np.zeros((3, *rung.model.grid), np.float32)
-        facts = {}
-        for c in range(3):  # one plan serves all three channels; the last one's facts are reported
-            facts = self._solve(rung, _channel(counts, c), None if dark is None else _channel(dark, c), rung.picture[c])
-        return facts
-
-    @staticmethod
-    def _solve(rung: _Rung, counts: Pixels, dark: Pixels | None, out: Image) -> dict[str, Any]:
-        frame: Linear = rung.preparer(counts, dark)
-        facts = rung.solver.solve(frame, out)
-        return facts | {"saturated": frame.saturated, "missing": frame.missing, "mean_dn": float(frame.y.mean())}
-
-    @staticmethod
-    def _result(rung: _Rung, ndim: int) -> Image:
-        return rung.picture if ndim == 2 else np.moveaxis(rung.picture, 0, -1)
 
     def _report(self, rung: _Rung, facts: dict[str, Any], stopped: str, seconds: dict[str, float]) -> Report:
         quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")}
@@ -139,6 +136,7 @@ class Reconstructor:
 
 
 def _channel(image: Pixels, c: int) -> Pixels:
+    image = image if image.ndim == 2 else image[..., c]
     if image.dtype == np.uint16:
-        return np.ascontiguousarray(image[..., c], np.uint16)
-    return np.ascontiguousarray(image[..., c], np.float32)
+        return np.ascontiguousarray(image, np.uint16)
+    return np.ascontiguousarray(image, np.float32)

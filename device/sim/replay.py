@@ -4,19 +4,22 @@ The recording's folder may say what it is in `recording.toml` (a head file whose
 files are told apart by their names, and what cannot be told apart is refused.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device.clock import Clock
-from device.errors import CameraMissing, SpecError
-from device.images import SUFFIXES, Raw, as_raw, read_image, read_psf
+from device.errors import CameraMissing, FrameError, SpecError
+from device.images import SUFFIXES, Raw, as_raw, read_image, read_psf, refuse_other_sizes, says_simulated
 from device.spec import CameraSpec, InstrumentSpec, LightSpec, ReplaySpec
 from device.values import Calibration, Counts, Frame, Glow, Image, Mask, Psf, Sensor, Shot
 
-FLOAT_PEAK_DN = 60000  # a float recording is put on counts up to here: 16 bits, and room above
+FLOAT_ZERO_DN, FLOAT_PEAK_DN = 1000.0, 60000.0  # a float recording is put on counts between these, with room outside
+LONGEST_SIDE = 8192
 
 
 def find_recording(folder: Path) -> ReplaySpec:
@@ -46,6 +49,8 @@ def find_recording(folder: Path) -> ReplaySpec:
 def recorded_head(recording: ReplaySpec, name: str) -> InstrumentSpec:
     """A head for recordings about which nothing is known but their files."""
     rows, cols = read_image(recording.raws[0]).shape[:2]
+    if max(rows, cols) > LONGEST_SIDE:
+        raise SpecError(f"{recording.raws[0]} has {rows} x {cols} pixels; no more than {LONGEST_SIDE} fit on a side")
     camera = CameraSpec(
         backend="replay", rows=rows, cols=cols, pitch_um=1.0, bit_depth=16, black_dn=recording.black_dn,
         full_well_e=65535, read_noise_e=0, exposure_s=0.02, preview_exposure_s=0.02,
@@ -90,13 +95,17 @@ class ReplayCamera:
     def __init__(self, recording: ReplaySpec, light: ReplayLight, clock: Clock) -> None:
         self._light, self._clock = light, clock
         raws = [as_raw(read_image(path)) for path in recording.raws]
-        self.black_dn, self._frames = _on_counts(raws, recording.black_dn)
-        if len({frame.shape for frame in self._frames}) > 1:
+        if len({raw.pixels.shape for raw in raws}) > 1:
             raise SpecError("the raws of one recording must all have the same rows and columns")
+        self._simulated = any(says_simulated(path) for path in recording.raws)
         self.white_dn = max(min(raw.white_dn, 65535.0) for raw in raws)
         self.bad: Mask = np.logical_or.reduce([raw.bad for raw in raws])
-        dark = None if recording.dark is None else as_raw(read_image(recording.dark)).pixels.astype(np.uint16)
-        self._dark: Counts = dark if dark is not None else self._constant(self.black_dn)
+        on_counts = _scale(raws)
+        self.black_dn = float(on_counts(np.array(recording.black_dn)))
+        self._frames = [_counted(on_counts(raw.pixels)) for raw in raws]
+        self._dark = self._constant(self.black_dn)
+        if recording.dark is not None:
+            self._dark = _counted(on_counts(_companion(recording.dark, raws[0])))
         self._number = self._shown = 0
         self._open = True
 
@@ -113,6 +122,8 @@ class ReplayCamera:
         """The next raw of the recording if the lamp is on, else its dark frame."""
         if not self._open:
             raise CameraMissing("this recording was closed")
+        if into is not None and (into.shape != self._dark.shape or into.dtype != np.uint16):
+            raise FrameError(f"the buffer is {into.dtype} {into.shape}; this recording fills uint16 {self._dark.shape}")
         self._clock.sleep(shot.exposure_s)
         glow = self._light.glow
         counts = self._dark if glow is None else self._frames[self._shown % len(self._frames)]
@@ -121,31 +132,48 @@ class ReplayCamera:
         if into is not None:
             into[...] = counts
             counts = into
-        return Frame(counts, shot.exposure_s, self._number, glow, simulated=False)
+        return Frame(counts, shot.exposure_s, self._number, glow, self._simulated)
 
     def close(self) -> None:
         """Stop playing."""
         self._open = False
 
 
-def _on_counts(raws: list[Raw], black_dn: float) -> tuple[float, list[Counts]]:
-    """Float recordings on 16-bit counts, all by one scale, their zero at 1000 DN; counts stay as they are."""
+def _scale(raws: list[Raw]) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Float recordings on 16-bit counts, all by one scale, their zero at FLOAT_ZERO_DN; counts stay as they are."""
     if all(raw.pixels.dtype == np.uint16 for raw in raws):
-        return black_dn, [raw.pixels.astype(np.uint16) for raw in raws]
-    zero_dn = 1000.0
+        return lambda pixels: pixels
     top = max(float(raw.pixels.max()) for raw in raws)
-    scale = (FLOAT_PEAK_DN - zero_dn) / top if top > 0 else 1.0
-    counts = [np.clip(np.rint(raw.pixels * scale + zero_dn), 0, 65535).astype(np.uint16) for raw in raws]
-    return zero_dn + black_dn * scale, counts
+    scale = (FLOAT_PEAK_DN - FLOAT_ZERO_DN) / top if top > 0 else 1.0
+    return lambda pixels: pixels * scale + FLOAT_ZERO_DN
+
+
+def _counted(pixels: NDArray[Any]) -> Counts:
+    return np.asarray(np.clip(np.rint(pixels), 0, 65535), np.uint16)
+
+
+def _companion(path: Path, raw: Raw) -> NDArray[Any]:
+    """A dark frame in the units of its raw, moved by the raw's bits: a dark one alone cannot tell its justification."""
+    pixels = read_image(path) / 2**raw.shift
+    if pixels.ndim < raw.pixels.ndim:
+        pixels = np.repeat(pixels[..., np.newaxis], 3, axis=2)
+    if pixels.shape != raw.pixels.shape:
+        raise SpecError(
+            f"{path} has the shape {pixels.shape}, the raw {raw.pixels.shape}",
+            "Use files of one and the same camera mode.",
+        )
+    return np.where(np.isfinite(pixels), pixels, 0)
 
 
 def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibration:
     """The calibration that belongs to a recording: its PSFs, its pedestal, and its geometry where a head gives one."""
     assert spec.replay is not None
     psfs: tuple[Psf, ...] = tuple(read_psf(path) for path in spec.replay.psfs)
+    refuse_other_sizes(psfs, camera.shape)
     flat: Image | None = None
     if spec.replay.flat is not None:
         flat = read_image(spec.replay.flat).astype(np.float32)
+        flat = flat.mean(axis=2) if flat.ndim == 3 else flat
     geometry = spec.optics.geometry(spec.camera.pitch_um) if spec.optics else None
     return Calibration(
         psfs=psfs, sensor=Sensor(black_dn=camera.black_dn, white_dn=camera.white_dn), geometry=geometry,

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import web
@@ -27,6 +29,7 @@ from device.errors import (
     LightLimit,
     NotKept,
     StoreDamaged,
+    StoreError,
     StoreFull,
 )  # fmt: skip
 from device.recon.model import field_radius_px
@@ -59,6 +62,14 @@ MEDIA = {".png": "image/png", ".jpg": "image/jpeg", ".tiff": "image/tiff", ".jso
 LARGEST_BODY_BYTES = 10_000
 
 
+class Refusal(BaseModel):
+    """Why something was not done: a code for the log, what happened, and what to do, in plain words."""
+
+    code: str
+    message: str
+    remedy: str
+
+
 class Press(BaseModel):
     """What the button sends: which eye, and a key that makes a repeated request the same press."""
 
@@ -77,7 +88,7 @@ def create_app(exam: Exam) -> FastAPI:
 
     app = FastAPI(
         title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
-        docs_url=None, redoc_url=None,
+        docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
     _words_for_errors(app)
     app.add_middleware(SafeHeaders)
@@ -109,6 +120,23 @@ def _words_for_errors(app: FastAPI) -> None:
         where = ".".join(str(part) for part in first["loc"])
         return refusal(InputError(f"{where}: {first['msg']}", "Reload the page and try again."))
 
+    @app.exception_handler(HTTPException)
+    async def _(request: Request, error: HTTPException) -> JSONResponse:
+        message = f"{request.method} {request.url.path}: {error.detail}"
+        answer = Refusal(code=f"http.{error.status_code}", message=message, remedy="Go back to the page.")
+        return JSONResponse(answer.model_dump(), error.status_code, error.headers)
+
+    @app.exception_handler(Exception)  # answered outside every middleware, and then logged by the server
+    async def _(request: Request, _: Exception) -> JSONResponse:
+        answer = refusal(DiffuscopeError("something happened that nobody foresaw"))
+        answer.headers.update(rules(request.url.path))
+        return answer
+
+
+def rules(path: str) -> dict[str, str]:
+    """The page's rules for its browser, and whether an answer may be kept."""
+    return HEADERS | {"Cache-Control": "no-store" if path.startswith("/api/") else "no-cache"}
+
 
 class SafeHeaders:
     """Puts the page's rules on every answer, and refuses bodies that no button sends; streams pass untouched."""
@@ -117,23 +145,27 @@ class SafeHeaders:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
-            return
-        if int(Headers(scope=scope).get("content-length") or 0) > LARGEST_BODY_BYTES:
-            await refusal(InputError("this request is too large", "Reload the page and try again."))(
-                scope, receive, send
-            )
             return
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                headers.update(HEADERS)
-                headers["Cache-Control"] = "no-store" if scope["path"].startswith("/api/") else "no-cache"
+                MutableHeaders(scope=message).update(rules(scope["path"]))
             await send(message)
 
-        await self.app(scope, receive, with_headers)
+        app = _TOO_LARGE if _is_too_large(Headers(scope=scope)) else self.app
+        await app(scope, receive, with_headers)
+
+
+_TOO_LARGE = refusal(InputError("this request is too large", "Reload the page and try again."))
+
+
+def _is_too_large(headers: Headers) -> bool:
+    """Whether a body is larger than a button sends, or does not say how large it is."""
+    length = headers.get("content-length") or "0"
+    return "transfer-encoding" in headers or not length.isdecimal() or int(length) > LARGEST_BODY_BYTES
 
 
 def shown(capture: Capture) -> dict[str, Any]:
@@ -212,10 +244,18 @@ def _live(app: FastAPI, exam: Exam) -> None:
         async def lines() -> AsyncIterator[str]:
             async for event in exam.bulletin.follow(last_event_id):
                 if event.kind == "kept":
-                    event = type(event)(event.number, "kept", shown(exam.store.get(event.data["id"])))
+                    event = replace(event, data=_kept(exam, event.data["id"]))
                 yield event.as_sse()
 
         return StreamingResponse(lines(), media_type="text/event-stream")
+
+
+def _kept(exam: Exam, id: str) -> dict[str, Any]:
+    """A kept capture for the page; if it has been damaged since, its name alone, so that the other news arrive."""
+    try:
+        return shown(exam.store.get(id))
+    except StoreError:
+        return {"id": id}
 
 
 def _page(app: FastAPI) -> None:

@@ -60,8 +60,12 @@ class Bulletin:
         return self._number
 
     async def follow(self, after: int | None = None) -> AsyncIterator[Event]:
-        """Events after number `after` (None: from now on), and a `beat` whenever a second brings nothing."""
-        seen = self.last_number if after is None else after
+        """Events after number `after` (None: from now on), and a `beat` whenever a second brings nothing.
+
+        A page that remembers more than was ever told was here before a restart: to it, everything is new.
+        """
+        last = self.last_number
+        seen = last if after is None else after if after <= last else 0
         ring = asyncio.Event()
         reader = (asyncio.get_running_loop(), ring)
         with self._lock:

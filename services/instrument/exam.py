@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from threading import Condition, Thread
 from typing import Any
@@ -35,6 +36,7 @@ BUDGET_S = 5.0
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
 QUICK_PX = 640
+RETRY_S = 1.0
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
@@ -64,8 +66,8 @@ class Exam:
         self.planned = planner.planned
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
-        self._press: Callable[[], None] | None = None
-        self._busy = self._closing = False
+        self._press: tuple[Future[Capture], Eye] | None = None
+        self._busy = self._closing = self._ended = False
         self._wanted_until_s = 0.0
         self._preview = Preview(0, b"", 0.0)
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
@@ -87,18 +89,21 @@ class Exam:
         return "busy" if self._busy else "aim"
 
     def press(self, eye: Eye, key: str | None = None) -> Future[Capture]:
-        """Take one picture; the future holds what was kept. Raises Busy while another is under way.
+        """Take one picture; the future holds what was kept. Raises Busy while another is under way or at the end.
 
         The same `key` again gives the same picture, however often the network repeats the request.
         """
         with self._turn:
             if key is not None and key in self._pressed:
                 return self._pressed[key]
+            if self._closing or self._ended:
+                raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
             if self._busy:
                 raise Busy("a picture is being taken")
             self._busy = True
             future: Future[Capture] = Future()
-            self._press = lambda: self._answer(future, eye)
+            future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
+            self._press = future, eye
             if key is not None:
                 self._pressed[key] = future
                 while len(self._pressed) > REMEMBERED:
@@ -135,15 +140,24 @@ class Exam:
                 act()
         finally:
             self.head.light.off()
+            self._end()
             if not self._closing:
                 self.problem = DiffuscopeError("the instrument stopped unexpectedly")
                 self._died()
+
+    def _end(self) -> None:
+        """Nobody waits for a picture that will never be taken."""
+        with self._turn:
+            self._ended = True
+            waiting, self._press = self._press, None
+        if waiting is not None:
+            waiting[0].set_exception(Busy("the instrument was switched off before the picture was taken"))
 
     def _next(self) -> Callable[[], None] | None:
         with self._turn:
             while not self._closing:
                 if self._press is not None:
-                    act, self._press = self._press, None
+                    act, self._press = partial(self._answer, *self._press), None
                     return act
                 if self.clock.now_s() < self._wanted_until_s:
                     return self._look
@@ -159,9 +173,9 @@ class Exam:
             self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
             self._free()
             future.set_exception(error)
-        except BaseException as error:
+        except BaseException:
             self._free()
-            future.set_exception(error)
+            future.set_exception(DiffuscopeError("the instrument stopped unexpectedly"))
             raise
         else:
             self._free()
@@ -234,18 +248,26 @@ class Exam:
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""
         try:
-            jpeg, exposed_s = self._live_picture()
+            jpeg, exposed_s, dark_s = self._live_picture()
         except DiffuscopeError as error:
             self.head.light.off()
             self._report_problem(error)
-            self.clock.sleep(1.0)
+            self._pause(RETRY_S)
             return
         self._report_problem(None)
         with self._turn:
             self._preview = Preview(self._preview.number + 1, jpeg, exposed_s)
             self._turn.notify_all()
+        self._pause(2 * dark_s - exposed_s - self.clock.now_s())  # as much darkness as there was light
 
-    def _live_picture(self) -> tuple[bytes, float]:
+    def _pause(self, duration_s: float) -> None:
+        """Do nothing, in the dark, but go on at once when somebody presses."""
+        until_s = self.clock.now_s() + duration_s
+        while self._press is None and not self._closing and (left_s := until_s - self.clock.now_s()) > 0:
+            self.clock.sleep(min(left_s, 0.02))
+
+    def _live_picture(self) -> tuple[bytes, float, float]:
+        """A JPEG, and the moments at which its light went on and off: aiming must not use up the picture's light."""
         spec = self.head.spec
         try:
             with self.head.light.on(Glow(spec.light.preview_colour)):
@@ -253,9 +275,10 @@ class Exam:
                 frame = _lit(self.head.camera.expose(Shot(spec.camera.preview_exposure_s)))
         finally:
             self.head.light.off()
+            dark_s = self.clock.now_s()
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
         made = self._small(frame.counts, simulated=frame.simulated, deadline=deadline)
-        return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s
+        return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s, dark_s
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:
         before = self.problem.code if self.problem else None

@@ -1,13 +1,15 @@
 """One raw file to one picture file: the same solver as the instrument's, without head, page or shelf."""
 
+import errno
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from device.clock import Deadline, SystemClock
-from device.errors import FrameError, SettingError, SpecError
-from device.images import Raw, as_raw, read_image, read_psf, write_linear
+from device.errors import FrameError, SettingError, SpecError, StoreError, StoreFull
+from device.images import Raw, as_raw, read_image, read_psf, refuse_other_sizes, says_simulated, write_linear
 from device.recon.evenness import even_out
 from device.recon.focus import sharpest
 from device.recon.methods import method_named
@@ -34,12 +36,12 @@ class Order:
     field_deg: float | None
     even: bool
     plans: Path
+    report: Path | None = None
 
 
 def reconstruct_file(order: Order) -> Reconstruction:
     """Read, reconstruct, write; everything that can be refused is refused before anything is computed."""
-    if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
-        raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png")
+    _refuse_places(order)
     method_named(order.method)
     clock = SystemClock()
     if order.budget_s is not None:
@@ -52,12 +54,31 @@ def reconstruct_file(order: Order) -> Reconstruction:
     quick = (Recipe(order.method, 4),) if order.budget_s is not None and min(shape) >= 16 else ()
     reconstructor = Reconstructor(calibration, shape, planner, clock, (*quick, Recipe(order.method, 1)), index)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
-    made = reconstructor(raw.pixels, deadline=deadline)
+    made = reconstructor(raw.pixels, simulated=calibration.simulated, deadline=deadline)
     picture = made.picture
     if order.even:
         picture = even_out(picture, field_mask(calibration, shape), evenness_px(calibration, shape))
-    _write(order.output, picture)
+    written(order.output, lambda: _write(order.output, picture, made.simulated))
     return made
+
+
+def _refuse_places(order: Order) -> None:
+    """Refuse an ending or a folder that nothing can be written to."""
+    if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
+        raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png", "Choose one of these.")
+    for place in (order.output, order.report):
+        if place is not None and (place.is_dir() or not place.parent.is_dir()):
+            what = "is a folder" if place.is_dir() else "is in a folder that does not exist"
+            raise SettingError(f"{place} {what}", "Give the name of a file in a folder that exists.")
+
+
+def written(path: Path, write: Callable[[], object]) -> None:
+    """Write a file, or say as an error of ours why that is not possible."""
+    try:
+        write()
+    except OSError as error:
+        full = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else StoreError
+        raise full(f"{path} cannot be written: {error.strerror or error}", "Choose another folder.") from error
 
 
 def calibrated(order: Order, raw: Raw) -> Calibration:
@@ -77,11 +98,16 @@ def calibrated(order: Order, raw: Raw) -> Calibration:
         raise SettingError(
             "a field in degrees needs a head to become pixels", "Give --head HEAD.toml with --field-deg."
         )
+    if field_deg is not None and not 0 < field_deg < 180:
+        raise SettingError(f"a field of {field_deg:g} degrees cannot be lit", "Give --field-deg between 0 and 180.")
     dark = None if order.dark is None else _companion(order.dark, raw)
     flat = None if order.flat is None else _companion(order.flat, raw)
+    psfs = tuple(read_psf(path) for path in order.psfs)
+    refuse_other_sizes(psfs, (raw.pixels.shape[0], raw.pixels.shape[1]))
+    simulated = says_simulated(order.raw) or (spec is not None and spec.camera.backend == "sim")
     return Calibration(
-        psfs=tuple(read_psf(path) for path in order.psfs), sensor=sensor, geometry=geometry, field_deg=field_deg,
-        dark_dn=dark, flat=flat, bad=raw.bad,
+        psfs=psfs, sensor=sensor, geometry=geometry, field_deg=field_deg,
+        dark_dn=dark, flat=flat, bad=raw.bad, simulated=simulated,
     )  # fmt: skip
 
 
@@ -91,8 +117,15 @@ def _companion(path: Path, raw: Raw) -> Image:
     pixels = array.astype(np.float32) / np.float32(2**raw.shift)
     pixels = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
     if pixels.shape != raw.pixels.shape[:2]:
-        raise FrameError(f"{path} has {pixels.shape} pixels, the raw {raw.pixels.shape[:2]}")
+        raise FrameError(
+            f"{path} has {_size(pixels.shape)} pixels, the raw {_size(raw.pixels.shape)}",
+            "Use files of one and the same camera mode.",
+        )
     return np.asarray(pixels, np.float32)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[0]} x {shape[1]}"
 
 
 def field_mask(calibration: Calibration, shape: tuple[int, int]) -> Image:
@@ -105,8 +138,8 @@ def evenness_px(calibration: Calibration, shape: tuple[int, int]) -> float:
     return 4 * calibration.geometry.px_per_deg if calibration.geometry else min(shape) / 8
 
 
-def _write(path: Path, picture: Image) -> None:
+def _write(path: Path, picture: Image, simulated: bool) -> None:
     if path.suffix.lower() == ".png":
-        path.write_bytes(to_png(picture, simulated=False))
+        path.write_bytes(to_png(picture, simulated))
     else:
         write_linear(path, picture)

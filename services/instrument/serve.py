@@ -1,9 +1,11 @@
 """Bring the parts together and serve them: socket first, so that a port in use is said before anything is opened."""
 
+import errno
 import os
 import signal
 import socket
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import uvicorn
@@ -17,20 +19,36 @@ from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
 from services.records.store import Store
 
+BACKLOG = 128
+
 
 def bound(host: str, port: int) -> socket.socket:
-    """A listening address of our own; InputError if somebody else has it."""
+    """A listening address of our own; InputError if it cannot be had.
+
+    It listens at once: two that are only bound could share an address, and a page that asks early is kept waiting.
+    """
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        listener = socket.socket(family, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, port))
+        with ExitStack() as undo:
+            listener = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((host, port))
+            listener.listen(BACKLOG)
+            undo.pop_all()
     except OSError as error:
         raise InputError(
-            f"http://{host}:{port} cannot be served: {error.strerror or error}",
-            f"Another program uses it, perhaps this one. Stop that, or choose another with --port {port + 1}.",
+            f"http://{host}:{port} cannot be served: {error.strerror or error}", _remedy(error, port)
         ) from error
     return listener
+
+
+def _remedy(error: OSError, port: int) -> str:
+    other = port + 1 if port < 65535 else 8000
+    if error.errno == errno.EADDRINUSE:
+        return f"Another program uses it, perhaps this one. Stop that, or choose another with --port {other}."
+    if error.errno == errno.EACCES:
+        return "Ports below 1024 belong to the system. Choose one with --port 8000."
+    return "Give an address of this computer with --host: 127.0.0.1 for itself, 0.0.0.0 for the whole network."
 
 
 def serve(spec: InstrumentSpec, host: str, port: int, data: Path, ready: Callable[[], None]) -> None:
@@ -46,9 +64,22 @@ def serve(spec: InstrumentSpec, host: str, port: int, data: Path, ready: Callabl
         config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()
-            uvicorn.Server(config).run(sockets=[listener])
+            _Server(config, exam).run(sockets=[listener])
         finally:
             exam.close()
+
+
+class _Server(uvicorn.Server):
+    """A server that tells its event streams to end before it waits for them."""
+
+    def __init__(self, config: uvicorn.Config, exam: Exam) -> None:
+        super().__init__(config)
+        self._exam = exam
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the streams, then what uvicorn does."""
+        self._exam.bulletin.close()
+        await super().shutdown(sockets)
 
 
 def _stop_the_process() -> None:

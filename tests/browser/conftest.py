@@ -1,6 +1,7 @@
 """The real server, the stand-in, and a touch page that fails its test for anything unexpected in the console."""
 
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -17,6 +18,7 @@ from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, R
 from tests.browser.stub import Stub, Stubbed
 
 ROOT = Path(__file__).parents[2]
+PLANS = ROOT / "out" / "browser-plans"  # what the first start measured about this computer; `make clean` forgets it
 CHROMIUM = "/usr/bin/chromium-headless-shell"
 TABLET = (1280, 800)
 
@@ -39,11 +41,15 @@ class Server:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
+        """Launch the process without waiting for it; the first start measures the computer for half a minute."""
         command = [str(Path(sys.executable).parent / "diffuscope"), "run", "--head", "hardware/heads/sim.toml"]
         command += ["--port", str(self.port), "--data", str(self.data)]
         self._process = subprocess.Popen(command, cwd=ROOT, stdout=self._log, stderr=self._log)
-        end = time.monotonic() + 30
+
+    def wait_until_ready(self, limit_s: float = 120) -> None:
+        end = time.monotonic() + limit_s
         while time.monotonic() < end:
+            assert self._process is not None
             assert self._process.poll() is None, f"the server ended: {Path(self._log.name).read_text()[-2000:]}"
             try:
                 with urllib.request.urlopen(f"{self.url}/api/status", timeout=2) as answer:
@@ -51,7 +57,7 @@ class Server:
                 return
             except OSError:
                 time.sleep(0.1)
-        raise AssertionError(f"no answer in 30 s: {Path(self._log.name).read_text()[-2000:]}")
+        raise AssertionError(f"no answer in {limit_s} s: {Path(self._log.name).read_text()[-2000:]}")
 
     def stop(self) -> None:
         if self._process is not None:
@@ -71,6 +77,12 @@ class Server:
     def close(self) -> None:
         self.stop()
         self._log.close()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The journeys come last: the real server measures the computer in the meantime."""
+    here = Path(__file__).parent
+    items.sort(key=lambda item: item.path.parent == here and "server" in getattr(item, "fixturenames", ()))
 
 
 @dataclass
@@ -109,14 +121,23 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def launched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One real server for all tests, which gets ready while those tests run that do not need it."""
+    server = Server(tmp_path_factory.mktemp("shelf") / "data")
+    if PLANS.is_dir():
+        shutil.copytree(PLANS, server.data / "plans")
+    server.start()
+    yield server
+    server.close()
+    if (server.data / "plans").is_dir():
+        shutil.copytree(server.data / "plans", PLANS, dirs_exist_ok=True)
+
+
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    server = Server(tmp_path / "data")
-    try:
-        server.start()
-        yield server
-    finally:
-        server.close()
+def server(launched: Server) -> Server:
+    launched.wait_until_ready()
+    return launched
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,10 @@ def drawn_retina(blur: int, shift: float = 0.0) -> Image.Image:
     return picture.resize((COLS // blur, ROWS // blur)).resize((COLS, ROWS)) if blur > 1 else picture
 
 
-def encoded(picture: Image.Image, kind: str) -> bytes:
+@lru_cache
+def encoded(kind: str, blur: int, shift: float = 0.0) -> bytes:
     out = io.BytesIO()
-    picture.save(out, kind)
+    drawn_retina(blur, shift).save(out, kind)
     return out.getvalue()
 
 
@@ -98,9 +100,9 @@ class Stub:
 def build(stub: Stub) -> FastAPI:
     """The app around one pretended instrument."""
     app = FastAPI()
-    quick = encoded(drawn_retina(8), "jpeg")
-    final = encoded(drawn_retina(1), "png")
-    frames = [encoded(drawn_retina(4, 3 * np.sin(i)), "jpeg") for i in range(4)]
+    quick = encoded("jpeg", 8)
+    final = encoded("png", 1)
+    frames = [encoded("jpeg", 4, shift) for shift in (0.0, 3.0)]
 
     @app.get("/")
     def index() -> FileResponse:

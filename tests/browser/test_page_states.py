@@ -131,7 +131,7 @@ def test_fingers_wheel_and_keys_zoom_between_one_and_eight(open_page: Open, stub
     page.mouse.move(x, y)
     for _ in range(20):
         page.mouse.wheel(0, -200)
-    page.wait_for_function("document.querySelector('eye-pic').dataset.zoom === '8.00'")
+    expect(page.locator("eye-pic")).to_have_attribute("data-zoom", "8.00")
     page.locator("eye-pic").focus()
     page.keyboard.press("ArrowLeft")
     for _ in range(12):

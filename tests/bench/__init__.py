@@ -1,0 +1,1 @@
+"""What accuracy costs in time, as ratios within one run."""
