@@ -22,7 +22,8 @@ SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
 _BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
     ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError,
-    UnidentifiedImageError, tifffile.TiffFileError, Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile,
+    UnidentifiedImageError, tifffile.TiffFileError,
+    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
 
 

@@ -369,10 +369,14 @@ def test_every_head_and_every_scene_loads():
 
 def test_the_tree_of_errors_is_the_one_that_is_drawn():
     """The drawing in errors.py is what a newcomer reads first."""
-    kinds = {name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)}
+    kinds = {
+        name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)
+    }
     drawn: dict[str, list[str]] = {}
     branch: list[str] = []
-    for indent, name, builtin in re.findall(r"^([│├└─ ]*)([A-Z]\w+)(?: \((\w+)\))?(?: {2,}.*)?$", errors.__doc__ or "", re.M):
+    for indent, name, builtin in re.findall(
+        r"^([│├└─ ]*)([A-Z]\w+)(?: \((\w+)\))?(?: {2,}.*)?$", errors.__doc__ or "", re.M
+    ):
         branch[len(indent) // 4 :] = [name]
         drawn[name] = [branch[-2] if len(branch) > 1 else "Exception", *([builtin] if builtin else [])]
     assert drawn == {name: [base.__name__ for base in kind.__bases__] for name, kind in kinds.items()}
@@ -390,7 +394,9 @@ def new_errors(source: str) -> Iterator[Offence]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ClassDef):
             bases = {ast.unparse(base).split(".")[-1] for base in node.bases}
-            if bases & ({*vars(errors)} | {n for n in vars(builtins) if n.endswith(("Error", "Exception"))}) - {"ClassVar"}:
+            if bases & ({*vars(errors)} | {n for n in vars(builtins) if n.endswith(("Error", "Exception"))}) - {
+                "ClassVar"
+            }:
                 yield node.lineno, node.name, "an error outside the tree"
 
 
@@ -429,6 +435,7 @@ def test_the_wheel_holds_what_the_instrument_needs_at_run_time(tmp_path: Path):
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         held = set(wheel.namelist())
     needed = {name for name in files() if re.match(r"(device|services|web)/(?!pictures/)|hardware/heads/", name)}
+    needed |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
     assert needed - held == set()
 
 

@@ -151,32 +151,25 @@ def cross_validation(
 
 
 @_jit
-def stretch_cols(image: Image, first: NDArray[np.int64], weights: Image, out: Image) -> None:
-    """Each column of `out` from four of `image`: column j is pixel j % n of block j // n."""
+def stretch(image: Image, first: NDArray[np.int64], weights: Image, box: Box, out: Image) -> None:
+    """Fill `box` (top, bottom, left, right) of `out` from four by four of `image`; pixel j lies in block j // n."""
     n = first.size
-    rows, cols = out.shape
-    last = image.shape[1] - 1
-    for i in range(rows):
-        for j in range(cols):
-            p = j % n
-            k = j // n + first[p]
-            total = np.float32(0)
-            for tap in range(4):
-                total += weights[p, tap] * image[i, min(max(k + tap, 0), last)]
-            out[i, j] = total
-
-
-@_jit
-def stretch_rows(image: Image, first: NDArray[np.int64], weights: Image, out: Image) -> None:
-    """Each row of `out` from four of `image`: row i is pixel i % n of block i // n."""
-    n = first.size
-    rows, cols = out.shape
-    last = image.shape[0] - 1
-    for i in range(rows):
-        p = i % n
-        k = i // n + first[p]
-        a, b = min(max(k, 0), last), min(max(k + 1, 0), last)
-        c, d = min(max(k + 2, 0), last), min(max(k + 3, 0), last)
-        wa, wb, wc, wd = weights[p]
-        for j in range(cols):
-            out[i, j] = wa * image[a, j] + wb * image[b, j] + wc * image[c, j] + wd * image[d, j]
+    rows, cols = image.shape
+    top, bottom, left, right = box
+    low, high = max(left // n - 2, 0), min((right - 1) // n + 3, cols)  # the columns that the box needs
+    tall = np.empty(cols + 4, np.float32)  # one stretched row, its ends repeated twice on either side
+    for i in range(top, bottom):
+        k = i // n + first[i % n]
+        a, b = image[min(max(k, 0), rows - 1)], image[min(max(k + 1, 0), rows - 1)]
+        c, d = image[min(max(k + 2, 0), rows - 1)], image[min(max(k + 3, 0), rows - 1)]
+        wa, wb, wc, wd = weights[i % n]
+        for j in range(low, high):
+            tall[j + 2] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+        tall[:2], tall[cols + 2 :] = tall[2], tall[cols + 1]
+        line = out[i]
+        for p in range(n):
+            va, vb, vc, vd = weights[p]
+            shift = first[p] + 2
+            for k in range((left - p + n - 1) // n, (right - p + n - 1) // n):
+                m = min(k + shift, cols)
+                line[k * n + p] = va * tall[m] + vb * tall[m + 1] + vc * tall[m + 2] + vd * tall[min(m + 3, cols + 3)]

@@ -58,10 +58,13 @@ class RealFft:
 class Planner:
     """Makes plans, and keeps FFTW's wisdom in a folder so that the next start need not measure again.
 
+    One thread by default: two save a fifth of a full-size pair on an idle machine, and cost it double (small grids: ten
+    times) when a neighbour holds the other core. The slowest press counts, not the mean.
+
     Wisdom belongs to one processor and one build of FFTW: the file's name says which.
     """
 
-    def __init__(self, folder: Path | None, threads: int = 2, effort: str = "FFTW_MEASURE") -> None:
+    def __init__(self, folder: Path | None, threads: int = 1, effort: str = "FFTW_MEASURE") -> None:
         if threads < 1:
             raise SettingError(f"{threads} threads cannot plan anything")
         self.threads, self.effort, self.folder = threads, effort, folder

@@ -116,7 +116,7 @@ class Reconstructor:
                 watch(Stage(rung.recipe, rung.picture, last=rung is self.rungs[-1]))
         assert done is not None
         solved_s = self.clock.now_s()
-        picture = upsample(done.picture, done.recipe.bin, self.shape)
+        picture = upsample(done.picture, done.recipe.bin, self.shape, done.model.box)
         seconds = {"solve": solved_s - begin_s, "upsample": self.clock.now_s() - solved_s}
         return Reconstruction(picture, self._report(done, report, stopped, seconds), simulated)
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from device.recon import kernels
+from device.recon.kernels import Box
 from device.values import Image
 
 
@@ -27,15 +28,20 @@ def cubic_weights(n: int) -> tuple[np.ndarray, Image]:
     return first - 1, weights.astype(np.float32)
 
 
-def upsample(picture: Image, n: int, shape: tuple[int, int]) -> Image:
-    """A picture on blocks of n x n pixels as (rows, cols) = `shape` pixels; beyond the last whole block it repeats."""
+def upsample(picture: Image, n: int, shape: tuple[int, int], box: Box | None = None) -> Image:
+    """A picture on blocks of n x n pixels as (rows, cols) = `shape` pixels; beyond the last whole block it repeats.
+
+    `box` (top, bottom, left, right, in blocks) is where the picture is not dark; nothing outside it is computed.
+    """
     if picture.ndim == 3:
-        return np.stack([upsample(picture[..., c], n, shape) for c in range(picture.shape[2])], axis=-1)
+        return np.stack([upsample(picture[..., c], n, shape, box) for c in range(picture.shape[2])], axis=-1)
     if n == 1:
         return np.array(picture, np.float32)
     first, weights = cubic_weights(n)
-    wide = np.empty((picture.shape[0], shape[1]), np.float32)
-    kernels.stretch_cols(np.ascontiguousarray(picture), first, weights, wide)
-    out = np.empty(shape, np.float32)
-    kernels.stretch_rows(wide, first, weights, out)
+    out = np.zeros(shape, np.float32)
+    rows, cols = picture.shape
+    top, bottom, left, right = box or (0, rows, 0, cols)
+    bottom_px = shape[0] if bottom == rows else bottom * n
+    right_px = shape[1] if right == cols else right * n
+    kernels.stretch(np.ascontiguousarray(picture), first, weights, (top * n, bottom_px, left * n, right_px), out)
     return out

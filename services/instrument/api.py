@@ -244,18 +244,20 @@ def _live(app: FastAPI, exam: Exam) -> None:
         async def lines() -> AsyncIterator[str]:
             async for event in exam.bulletin.follow(last_event_id):
                 if event.kind == "kept":
-                    event = replace(event, data=_kept(exam, event.data["id"]))
+                    if (capture := _still_kept(exam, event.data["id"])) is None:
+                        continue
+                    event = replace(event, data=shown(capture))
                 yield event.as_sse()
 
         return StreamingResponse(lines(), media_type="text/event-stream")
 
 
-def _kept(exam: Exam, id: str) -> dict[str, Any]:
-    """A kept capture for the page; if it has been damaged since, its name alone, so that the other news arrive."""
+def _still_kept(exam: Exam, id: str) -> Capture | None:
+    """A kept capture; None if it has been damaged since, because the news after it must arrive all the same."""
     try:
-        return shown(exam.store.get(id))
+        return exam.store.get(id)
     except StoreError:
-        return {"id": id}
+        return None
 
 
 def _page(app: FastAPI) -> None:

@@ -178,6 +178,7 @@ class Exam:
             future.set_exception(DiffuscopeError("the instrument stopped unexpectedly"))
             raise
         else:
+            self._report_problem(None)
             self._free()
             future.set_result(kept)
 

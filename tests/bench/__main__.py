@@ -7,6 +7,7 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +23,23 @@ from device.values import Counts, Frame, Glow, Image, Shot
 
 SHAPE = (1080, 1920)
 ROUNDS = 15
+RECIPES = (Recipe("tikhonov"), Recipe("gradient"), Recipe("gradient", 2), Recipe("gradient", 4))
 PLANS = Path.home() / ".cache" / "diffuscope"
 
 
-def median_ms(act: Callable[[], object], rounds: int = ROUNDS) -> float:
-    """The median of some runs after two that warm up: a neighbour's burst moves it less than it moves the mean."""
-    times = []
+def side_by_side_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
+    """Median times of several acts that take turns, after two turns that warm up.
+
+    A neighbour's burst then hits all of them alike, and the ratio of two medians is about the code.
+    """
+    times: list[list[float]] = [[] for _ in acts]
     for k in range(rounds + 2):
-        begin = time.perf_counter()
-        act()
-        if k >= 2:
-            times.append(time.perf_counter() - begin)
-    return statistics.median(times) * 1e3
+        for act, own in zip(acts, times, strict=True):
+            begin = time.perf_counter()
+            act()
+            if k >= 2:
+                own.append(time.perf_counter() - begin)
+    return [statistics.median(own) * 1e3 for own in times]
 
 
 def seen_by(head: Head) -> Frame:
@@ -62,18 +68,17 @@ def main() -> None:
     truth = World(spec, VirtualClock()).truth("green")
     inside = disc(SHAPE, ((SHAPE[0] - 1) / 2, (SHAPE[1] - 1) / 2), field_radius_px(head.calibration) - 2) > 0.5
     print(f"{'1080 x 1920, simulated retina':<42} {'ms':>8} {'ratio':>7} {'PCC':>6}")
-    for threads in (1, 2):
-        planner = Planner(PLANS / f"bench-{threads}", threads)
-        fft = planner.plan(SHAPE)
-        pair_ms = median_ms(lambda fft=fft: (fft.forward(), fft.inverse()))
-        row(f"bare real FFT pair, {threads} thread(s)", pair_ms, 1.0)
-        for recipe in (Recipe("tikhonov"), Recipe("gradient"), Recipe("gradient", 2), Recipe("gradient", 4)):
-            make = Reconstructor(head.calibration, SHAPE, planner, SystemClock(), (recipe,))
-            ms = median_ms(lambda make=make: make(counts))
-            pcc = correlation(make(counts).picture, truth, inside)
-            row(f"  {recipe.method}, bin {recipe.bin}, counts to picture", ms, ms / pair_ms, pcc)
+    planner = Planner(PLANS)
+    fft = planner.plan(SHAPE)
+    makers = [Reconstructor(head.calibration, SHAPE, planner, SystemClock(), (recipe,)) for recipe in RECIPES]
+    acts = [lambda: (fft.forward(), fft.inverse()), *(partial(make, counts) for make in makers)]
+    pair_ms, *made_ms = side_by_side_ms(*acts)
+    row("bare real FFT pair, planned", pair_ms, 1.0)
+    for recipe, make, ms in zip(RECIPES, makers, made_ms, strict=True):
+        pcc = correlation(make(counts).picture, truth, inside)
+        row(f"{recipe.method}, bin {recipe.bin}, counts to picture", ms, ms / pair_ms, pcc)
     psf = head.calibration.psfs[0].pixels
-    ms = median_ms(lambda: skimage_wiener(counts, psf), 3)
+    pair_ms, ms = side_by_side_ms(acts[0], partial(skimage_wiener, counts, psf), rounds=3)
     row("scikit-image restoration.wiener", ms, ms / pair_ms, correlation(skimage_wiener(counts, psf), truth, inside))
     print(f"peak memory of this run: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 

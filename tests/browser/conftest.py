@@ -140,10 +140,17 @@ def server(launched: Server) -> Server:
     return launched
 
 
-@pytest.fixture
-def stub() -> Iterator[Stubbed]:
+@pytest.fixture(scope="session")
+def standing_stub() -> Iterator[Stubbed]:
     with Stubbed(Stub(), free_port()) as stubbed:
         yield stubbed
+
+
+@pytest.fixture
+def stub(standing_stub: Stubbed) -> Stubbed:
+    """The stand-in for the API, as new."""
+    standing_stub.stub.reset()
+    return standing_stub
 
 
 @pytest.fixture

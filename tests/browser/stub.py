@@ -71,6 +71,10 @@ class Stub:
     captures: list[dict[str, Any]] = field(default_factory=list)
     events: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
 
+    def reset(self) -> None:
+        """As new, for the next test."""
+        vars(self).update(vars(Stub()))
+
     def tell(self, kind: str, data: dict[str, Any]) -> None:
         self.events.append((kind, data))
 
@@ -100,20 +104,27 @@ class Stub:
 def build(stub: Stub) -> FastAPI:
     """The app around one pretended instrument."""
     app = FastAPI()
-    quick = encoded("jpeg", 8)
-    final = encoded("png", 1)
-    frames = [encoded("jpeg", 4, shift) for shift in (0.0, 3.0)]
+    _status(app, stub)
+    _captures(app, stub)
+    _live(app, stub)
 
     @app.get("/")
     def index() -> FileResponse:
         return FileResponse(WEB / "index.html", headers={"Content-Security-Policy": CSP})
 
+    app.mount("/web", StaticFiles(directory=WEB), name="web")
+    return app
+
+
+def _status(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/status")
     def status() -> dict[str, Any]:
         state = "busy" if stub.busy else "aim"
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem}  # fmt: skip
 
+
+def _captures(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/captures")
     def captures(limit: int = 20) -> dict[str, Any]:
         return {"captures": stub.captures[:limit]}
@@ -138,14 +149,16 @@ def build(stub: Stub) -> FastAPI:
 
     @app.get("/api/captures/{name}/{file}")
     def kept(name: str, file: str) -> Response:
-        return Response(quick, media_type="image/jpeg") if file == "quick.jpg" else Response(final, media_type="image/png")
+        kind, blur = ("jpeg", 8) if file == "quick.jpg" else ("png", 1)
+        return Response(encoded(kind, blur), media_type=f"image/{kind}")
 
+
+def _live(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/preview")
     async def preview(after: int) -> Response:
         await asyncio.sleep(0.1)
-        number = max(after + 1, int(time.monotonic() * 10) % 100000)
-        headers = {"X-Frame": str(number), "X-Age-Ms": str(stub.preview_age_ms)}
-        return Response(frames[number % len(frames)], media_type="image/jpeg", headers=headers)
+        headers = {"X-Frame": str(after + 1), "X-Age-Ms": str(stub.preview_age_ms)}
+        return Response(encoded("jpeg", 4, 3.0 * (after % 2)), media_type="image/jpeg", headers=headers)
 
     async def stream() -> AsyncIterator[str]:
         told = len(stub.events)
@@ -163,9 +176,6 @@ def build(stub: Stub) -> FastAPI:
     @app.get("/api/events")
     async def events() -> StreamingResponse:
         return StreamingResponse(stream(), media_type="text/event-stream")
-
-    app.mount("/web", StaticFiles(directory=WEB), name="web")
-    return app
 
 
 class Stubbed:

@@ -125,9 +125,7 @@ def test_what_was_taken_is_still_there_after_a_restart(page: Page, server: Serve
     page.wait_for_selector(".stage[data-mark=final]")
 
 
-def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(
-    page: Page, complaints: Complaints
-) -> None:
+def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(page: Page, complaints: Complaints) -> None:
     complaints.expect("409", "423")
     live(page)
     page.evaluate("""() => {
@@ -176,9 +174,12 @@ def test_the_whole_way_by_keyboard(page: Page, complaints: Complaints) -> None:
     reached = []
     for _ in range(40):
         page.keyboard.press("Tab")
-        what = page.evaluate("""() => { const el = document.activeElement;
+        what = page.evaluate("""() => {
+            const el = document.activeElement;
             const line = getComputedStyle(el);
-            return [el.ariaLabel ?? el.textContent.trim().replace(/\\s+/g, " "), line.outlineStyle, parseFloat(line.outlineWidth)]; }""")
+            const name = el.ariaLabel ?? el.textContent.trim().replace(/\\s+/g, " ");
+            return [name, line.outlineStyle, parseFloat(line.outlineWidth)];
+        }""")
         reached.append(what[0])
         assert what[0] == "" or (what[1] == "solid" and what[2] >= 4), f"no visible focus on {what}"
         if what[0].startswith("Next"):

@@ -19,6 +19,7 @@ BUSY = {
     "message": "The instrument is taking another picture.",
     "remedy": "A picture is being taken. Wait until it is done, then press again.",
 }
+BROKEN = {"code": "light.fault", "message": "One light is not working.", "remedy": "Call the technician."}
 SHUTTER = "#shutter"
 Open = Callable[..., Page]
 
@@ -35,8 +36,11 @@ def zoom(page: Page) -> float:
 
 def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
     """The RGB value drawn in the viewer, `dx` picture heights right of the middle."""
-    script = """dx => { const c = document.querySelector("eye-pic canvas");
-        return [...c.getContext("2d").getImageData(c.width / 2 + dx * c.height, c.height / 2, 1, 1).data].slice(0, 3); }"""
+    script = """dx => {
+        const c = document.querySelector("eye-pic canvas");
+        const { data } = c.getContext("2d").getImageData(c.width / 2 + dx * c.height, c.height / 2, 1, 1);
+        return [...data].slice(0, 3);
+    }"""
     value: list[int] = page.evaluate(script, dx)
     return value
 
@@ -44,7 +48,7 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
 def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int]) -> None:
     stub.stub.refine_s = 1.5
-    stub.stub.problem = {"code": "light.fault", "message": "One light is not working.", "remedy": "Call the technician."}
+    stub.stub.problem = BROKEN
     page = live(open_page(stub.url, size))
     faults = {"problem": look_for_faults(page, SHUTTER)}
     stub.stub.problem = None

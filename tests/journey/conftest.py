@@ -1,0 +1,217 @@
+"""A small simulated instrument, built from its real parts by constructor arguments, and ways to talk to it."""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from device.clock import VirtualClock
+from device.guard import GuardedLight
+from device.head import Head
+from device.ports import Camera
+from device.sim.calibrate import simulated_calibration
+from device.sim.camera import SimCamera
+from device.sim.light import SimLight
+from device.sim.world import World
+from device.spec import InstrumentSpec, load_head
+from services.instrument.api import create_app
+from services.instrument.bulletin import Bulletin
+from services.instrument.exam import Exam
+from services.records.store import Store
+
+SMALL_HEAD = """\
+name = "Small simulated head"
+
+[camera]
+backend = "sim"
+rows = 270
+cols = 480
+pitch_um = 20.16
+full_well_e = 23000
+read_noise_e = 1.03
+
+[light]
+backend = "sim"
+
+[optics]
+iris_um = 3200
+diffuser_to_sensor_um = 6000
+angular_magnification = 0.75
+field_deg = 33.4
+
+[sim]
+haemorrhages = 3
+"""
+
+
+class GateClock(VirtualClock):
+    """Virtual time that passes only while its gate is open: what sleeps hangs until then."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate = Event()
+        self.gate.set()
+        self.someone_sleeps = Event()
+
+    def sleep(self, duration_s: float) -> None:
+        self.someone_sleeps.set()
+        assert self.gate.wait(30)
+        super().sleep(duration_s)
+
+
+@dataclass
+class Rig:
+    """An instrument with everything a test may want to look at."""
+
+    world: World
+    clock: GateClock
+    store: Store
+    bulletin: Bulletin
+    exam: Exam
+    app: FastAPI
+    died: Event = field(default_factory=Event)
+
+    def told(self) -> list[tuple[str, dict[str, Any]]]:
+        """Every event so far."""
+        return [(event.kind, event.data) for event in self.bulletin._events]
+
+    def hang(self) -> None:
+        """From now on every exposure hangs until the gate is opened."""
+        self.clock.gate.clear()
+        self.clock.someone_sleeps.clear()
+
+    def wait_for_hanging(self) -> None:
+        assert self.clock.someone_sleeps.wait(10)
+
+    def ask(self, story: Callable[[httpx.AsyncClient], Coroutine[Any, Any, Any]], **options: Any) -> Any:
+        """Run a story told by a client of the application in this process."""
+
+        async def told() -> Any:
+            transport = httpx.ASGITransport(app=self.app, **options)
+            async with httpx.AsyncClient(transport=transport, base_url="http://eye", timeout=30) as client:
+                return await story(client)
+
+        return asyncio.run(told())
+
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        answer: httpx.Response = self.ask(lambda client: client.request(method, path, **options))
+        return answer
+
+
+@pytest.fixture(scope="session")
+def head_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("head") / "small.toml"
+    path.write_text(SMALL_HEAD)
+    return path
+
+
+@pytest.fixture(scope="session")
+def spec(head_file: Path) -> InstrumentSpec:
+    return load_head(head_file)
+
+
+@pytest.fixture(scope="session")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("plans")
+
+
+MakeRig = Callable[..., Rig]
+
+
+@pytest.fixture
+def make_rig(tmp_path: Path, spec: InstrumentSpec, plans: Path) -> Iterator[MakeRig]:
+    """Build instruments: `camera` wraps the simulated one, `store` and `world` give options, `max_on_s` the guard's."""
+    with ExitStack() as undo:
+
+        def made(
+            camera: Callable[[Camera], Camera] = lambda camera: camera,
+            max_on_s: float = 30.0,
+            world: dict[str, Any] | None = None,
+            store: dict[str, Any] | None = None,
+        ) -> Rig:
+            clock, died = GateClock(), Event()
+            scene = World(spec, clock, **world or {})
+            light = GuardedLight(SimLight(scene), clock, max_on_s)
+            head = Head(spec, camera(SimCamera(scene)), light, simulated_calibration(scene))
+            shelf = undo.enter_context(Store(tmp_path / "shelf", **{"reserve_bytes": 0, **(store or {})}))
+            bulletin = Bulletin()
+            exam = Exam(head, shelf, bulletin, clock, plans, died.set)
+            undo.callback(exam.close)
+            undo.callback(clock.gate.set)
+            return Rig(scene, clock, shelf, bulletin, exam, create_app(exam), died)
+
+        yield made
+
+
+@pytest.fixture
+def rig(make_rig: MakeRig) -> Rig:
+    return make_rig()
+
+
+def until(holds: Callable[[], bool], patience_s: float = 15.0) -> None:
+    """Wait for another thread; real time, because threads need it."""
+    end = time.monotonic() + patience_s
+    while not holds():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def wait_until() -> Callable[..., None]:
+    return until
+
+
+async def follow(
+    app: FastAPI,
+    enough: Callable[[list[tuple[int | None, str, dict[str, Any]]]], bool],
+    headers: dict[str, str] | None = None,
+    begin: Callable[[], None] = lambda: None,
+) -> list[tuple[int | None, str, dict[str, Any]]]:
+    """Read the event stream as a browser would, until there is enough, then go away; calls `begin` once it is open."""
+    done, text = asyncio.Event(), ""
+    heard: list[tuple[int | None, str, dict[str, Any]]] = []
+
+    async def receive() -> dict[str, Any]:
+        await done.wait()
+        return {"type": "http.disconnect"}
+
+    async def send(message: Any) -> None:
+        nonlocal text
+        if message["type"] == "http.response.start":
+            assert message["status"] == 200
+            return
+        if not heard and message["body"]:
+            begin()
+        text += message["body"].decode()
+        *whole, text = text.split("\n\n")
+        heard.extend(parsed(block) for block in whole)
+        if enough(heard):
+            done.set()
+
+    scope = {
+        "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1", "method": "GET",
+        "scheme": "http", "path": "/api/events", "raw_path": b"/api/events", "query_string": b"", "root_path": "",
+        "headers": [(key.lower().encode(), value.encode()) for key, value in (headers or {}).items()],
+        "server": ("eye", 80), "client": ("page", 1),
+    }  # fmt: skip
+    await asyncio.wait_for(app(scope, receive, send), 20)
+    return heard
+
+
+def parsed(block: str) -> tuple[int | None, str, dict[str, Any]]:
+    fields = dict(line.split(": ", 1) for line in block.splitlines())
+    return int(fields["id"]) if "id" in fields else None, fields["event"], json.loads(fields["data"])
+
+
+@pytest.fixture
+def read_events() -> Callable[..., Any]:
+    return lambda *args, **options: asyncio.run(follow(*args, **options))
