@@ -1,6 +1,6 @@
 // The page's story: aim, press, hold still, look, next. State lives in the store, looks live in views.js.
 
-import { getCaptures, getStatus, listen, Refusal, takePicture } from "./api.js";
+import { EventLine, getCaptures, getStatus, Refusal, takePicture } from "./api.js";
 import "./live.js";
 import { createStore } from "./store.js";
 import { render } from "./vendor/lit-html.js";
@@ -198,7 +198,7 @@ function addToStrip(capture) {
 
 let beats = 0;
 
-listen({
+const heard = {
   link(link) {
     set({ link });
     if (link === "live") refresh();
@@ -231,7 +231,7 @@ listen({
     if (get().screen === "making" && capture.id === makingId) pictureKept(capture);
     else addToStrip(capture);
   },
-});
+};
 
 async function refreshStatus() {
   try {
@@ -325,3 +325,4 @@ function draw(state) {
 
 store.subscribe(draw);
 draw(get());
+new EventLine(heard);
