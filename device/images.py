@@ -7,6 +7,7 @@ import zlib
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or a
 _BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
     ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError,
     UnidentifiedImageError, tifffile.TiffFileError,
-    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile,
+    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
 )  # fmt: skip
 
 

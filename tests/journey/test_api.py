@@ -107,9 +107,7 @@ def test_a_request_that_the_network_doubles_makes_one_picture(rig: Any) -> None:
     rig.ask(story)
 
 
-@pytest.mark.parametrize(
-    ("fault", "status"), [("camera.missing", 503), ("camera.stalled", 503), ("light.fault", 423)]
-)
+@pytest.mark.parametrize(("fault", "status"), [("camera.missing", 503), ("camera.stalled", 503), ("light.fault", 423)])
 def test_a_broken_part_is_answered_with_its_own_words(rig: Any, fault: str, status: int) -> None:
     rig.world.faults.add(fault)
     refused(rig.request("POST", "/api/captures", json=OD), status, fault)
@@ -250,9 +248,7 @@ def test_the_page_and_its_scripts_are_served(rig: Any) -> None:
     assert "javascript" in rig.request("GET", "/web/app.js").headers["content-type"]
 
 
-def test_status_and_health_say_what_it_is_and_whether_it_works(
-    rig: Any, wait_until: Callable[..., None]
-) -> None:
+def test_status_and_health_say_what_it_is_and_whether_it_works(rig: Any, wait_until: Callable[..., None]) -> None:
     status = rig.request("GET", "/api/status").json()
     assert status["kind"] == "simulated"
     assert status["state"] == "aim"

@@ -90,7 +90,8 @@ def test_a_dim_or_black_frame_stays_as_it_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "top", "white"), [(np.uint8, 200, 255), (np.uint16, 1000, 1023), (np.int32, 4000, 4095), (np.uint64, 65535, 65535)]
+    ("dtype", "top", "white"),
+    [(np.uint8, 200, 255), (np.uint16, 1000, 1023), (np.int32, 4000, 4095), (np.uint64, 65535, 65535)],
 )
 def test_whole_numbers_of_any_width_become_counts(dtype: Any, top: int, white: int) -> None:
     array = np.array([[1, 7], [3, top]], dtype)
@@ -270,7 +271,9 @@ def test_a_file_cut_off_anywhere_is_refused_with_words(tmp_path: Path, name: str
     if name == "packed.tiff":
         path.write_bytes(raw_tiff(twelve_bit(0, (20, 30)), {"eye": "OD"}))
     else:
-        write(path, np.random.default_rng(0).integers(0, 255, (20, 30)).astype(np.uint8 if "grey" in name else np.uint16))
+        write(
+            path, np.random.default_rng(0).integers(0, 255, (20, 30)).astype(np.uint8 if "grey" in name else np.uint16)
+        )
     whole, image = path.read_bytes(), read_image(path)
     refused = 0
     for length in range(1, len(whole), max(1, len(whole) // 60)):

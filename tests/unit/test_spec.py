@@ -36,7 +36,9 @@ def line(text: str, begin: str) -> int:
     return next(n for n, line in enumerate(text.splitlines(), 1) if line.startswith(begin))
 
 
-@pytest.mark.parametrize("path", sorted(HEAD.parent.glob("*.toml")) + sorted(HEAD.parents[2].glob("device/sim/scenes/*.toml")))
+@pytest.mark.parametrize(
+    "path", sorted(HEAD.parent.glob("*.toml")) + sorted(HEAD.parents[2].glob("device/sim/scenes/*.toml"))
+)
 def test_every_head_and_scene_that_we_bring_is_right(path: Path) -> None:
     assert load_head(path).name
 

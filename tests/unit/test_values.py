@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 
 from device.errors import FrameError, PsfError, SettingError
 from device.values import (
-    Calibration, Capture, Frame, Geometry, Glow, Psf, Reconstruction, Report, Sensor, Shot, check_image_shape,
+    Calibration,
+    Capture,
+    Frame,
+    Geometry,
+    Glow,
+    Psf,
+    Reconstruction,
+    Report,
+    Sensor,
+    Shot,
+    check_image_shape,
 )  # fmt: skip
 
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
