@@ -81,12 +81,11 @@ const act = {
 
   // The viewer tells what it has drawn; until then nothing on the page says "final".
   drawn({ detail }) {
-    if (detail.url !== get().src?.url) return;
     set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
   },
 
   pictureFault({ detail }) {
-    if (detail.mark === "quick" || detail.url !== get().src?.url) return; // the final picture is still to come
+    if (detail.mark === "quick") return; // the final picture is still to come
     set({ alert: { code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy") } });
   },
 

@@ -69,18 +69,18 @@ def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, 
 
 
 def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.refine_s = 1.2
+    stub.stub.refine_s = 2.5
     page = live(open_page(stub.url))
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
     expect(page.get_by_role("status")).to_contain_text("Quick look")
+    bar = page.locator("progress").evaluate("bar => bar.value")
     page.get_by_role("button", name="Red-free").tap()
     page.get_by_role("button", name="Zoom in").tap()
     page.get_by_role("button", name="Zoom in").tap()
     assert zoom(page) == 2.25
     assert page.locator(".stage").get_attribute("data-mark") == "quick"
-    bar = page.locator("progress").evaluate("bar => bar.value")
-    page.wait_for_timeout(400)
+    page.wait_for_timeout(300)
     assert page.locator("progress").evaluate("bar => bar.value") > bar
     page.wait_for_selector(".stage[data-mark=final]")
     expect(page.get_by_role("status")).to_contain_text("Final picture, kept")
