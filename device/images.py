@@ -22,7 +22,7 @@ from device.values import Image, Mask, Psf, check_image_shape
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
 _BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
-    ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError,
+    ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError, AssertionError,
     UnidentifiedImageError, tifffile.TiffFileError,
     Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
 )  # fmt: skip
@@ -59,7 +59,10 @@ def _decode(path: Path, data: bytes) -> NDArray[Any]:
             case ".npy":
                 return np.asarray(np.load(BytesIO(data), allow_pickle=False))
             case ".tif" | ".tiff":
-                return np.asarray(tifffile.imread(BytesIO(data)))
+                with tifffile.TiffFile(BytesIO(data)) as tiff:
+                    if not 0 < tiff.series[0].size <= 3 * MOST_PIXELS:  # before a damaged header costs all our time
+                        raise ValueError(f"it says that it holds {tiff.series[0].size} values")
+                    return np.asarray(tiff.asarray())
             case ".png":
                 _refuse_what_would_lose_bits(path, data)
                 with Pillow.open(BytesIO(data)) as picture:

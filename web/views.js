@@ -167,7 +167,7 @@ function resultCard({ shown, eye, grey }) {
       <h2 tabindex="-1" id="result-title">${t("result.title", { eye: t(`eye.${shown?.eye ?? eye}`) })}</h2>
       ${shown ? html`<p class="muted">${takenWords(shown.taken_at)}</p>` : nothing}
       ${(shown?.report?.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
-      ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing} ${shown ? details(shown) : nothing}
+      ${shown ? details(shown, grey) : nothing}
     </div>
   `;
 }
@@ -176,7 +176,7 @@ const takenWords = (moment) =>
   isToday(moment) ? clockTime(moment) : `${calendarDay(moment)}, ${clockTime(moment)}`;
 
 // For the technician: how the picture was made, and the files to take away.
-function details({ id, report, calibration_id: calibration, links }) {
+function details({ id, report, calibration_id: calibration, links }, grey) {
   const total = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const rows = [
     ["method", report.method],
@@ -189,6 +189,7 @@ function details({ id, report, calibration_id: calibration, links }) {
   return html`
     <details>
       <summary>${t("result.details")}</summary>
+      ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
       <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
       <p class="links">
         ${["picture", "raw", "report"].map((key) => html`<a href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
@@ -197,7 +198,7 @@ function details({ id, report, calibration_id: calibration, links }) {
   `;
 }
 
-function tools({ redfree, contrast, zoom }, act) {
+function tools({ redfree, contrast, zoom, grey }, act) {
   const step = (less, more, label, lessName, moreName) => html`
     <div class="step" role="group" aria-label=${label}>
       <button type="button" aria-label=${lessName} @click=${less}>−</button>
@@ -214,7 +215,7 @@ function tools({ redfree, contrast, zoom }, act) {
       <div class="pair">
         ${[false, true].map(
           (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => act.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : "tool.colour")}
+            ${t(on ? "tool.redfree" : grey ? "tool.plain" : "tool.colour")}
           </button>`,
         )}
       </div>

@@ -64,6 +64,7 @@ const ENGLISH = {
   "detail.report": "Report",
 
   "tool.colour": "Colour",
+  "tool.plain": "As taken",
   "tool.redfree": "Red-free",
   "tool.contrast": "Contrast",
   "tool.contrast.less": "Less contrast",

@@ -215,6 +215,14 @@ def test_aiming_fits_every_screen(open_page: Open, server: Server, size: tuple[i
     assert look_for_faults(page, SHUTTER) == []
 
 
+def test_the_result_fits_a_telephone(open_page: Open, server: Server, complaints: Complaints) -> None:
+    page = open_page(server.url, SIZES["phone"])
+    live(page)
+    press(page, complaints, lambda: page.locator(SHUTTER).tap())
+    page.wait_for_selector(".stage[data-mark=final]")
+    assert look_for_faults(page, "#next", "#again") == []
+
+
 def test_no_file_speaks_outside_the_words() -> None:
     """Texts for people live in words.js: a template has no letters of its own between its tags."""
     views = (WEB / "views.js").read_text()

@@ -1,0 +1,298 @@
+"""Recordings played through the whole instrument: real raws, no lamp, and never marked as simulated."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from device.clock import VirtualClock
+from device.errors import CameraMissing, PsfError, SpecError
+from device.head import Head, open_head, recording
+from device.images import as_raw, read_image
+from device.values import Capture, Glow, Shot
+from services.instrument.bulletin import Bulletin
+from services.instrument.exam import Exam
+from services.records.picture import raw_tiff, read_raw_tiff
+from services.records.store import Store
+from tests import scenes
+
+SHAPE = (120, 160)
+RECORDINGS = Path(__file__).parents[3] / "shared" / "data" / "lensless"
+Played = Callable[..., tuple[Capture, Exam]]
+
+
+def blurred(seed: int = 0, psf: Any = None) -> Any:
+    """What a sensor would see of a few bright spots, 12 bits."""
+    rng = np.random.default_rng(seed)
+    scene = np.zeros(SHAPE)
+    scene[40:80, 50:110] = rng.random((40, 60))
+    otf = np.fft.rfft2(np.fft.ifftshift(scenes.speckle(SHAPE) if psf is None else psf))
+    seen = np.fft.irfft2(np.fft.rfft2(scene) * otf, SHAPE)
+    return np.clip(64 + 3500 * seen / seen.max() + rng.normal(0, 2, SHAPE), 0, 4095)
+
+
+def psf_counts() -> Any:
+    psf = scenes.speckle(SHAPE)
+    return np.rint(64 + 3900 * psf / psf.max()).astype(np.uint16)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A recording told by its names alone."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    tifffile.imwrite(folder / "raw.tiff", np.rint(blurred()).astype(np.uint16))
+    tifffile.imwrite(folder / "psf.tiff", psf_counts())
+    return folder
+
+
+@pytest.fixture
+def play(tmp_path: Path, plans: Path) -> Iterator[Played]:
+    """Press once on a head that plays a recording; the kept capture and its instrument."""
+    with ExitStack() as undo:
+
+        def played(*where: Any) -> tuple[Capture, Exam]:
+            clock = VirtualClock()
+            head = open_head(recording(*where), clock)
+            assert head.kind == "recording"
+            store = undo.enter_context(Store(tmp_path / f"shelf{len(list(tmp_path.iterdir()))}", reserve_bytes=0))
+            exam = Exam(head, store, Bulletin(), clock, plans, lambda: None)
+            undo.callback(exam.close)
+            return exam.press("OD").result(60), exam
+
+        yield played
+
+
+def opened(folder: Path) -> Head:
+    return open_head(recording(folder), VirtualClock())
+
+
+def lit(head: Head) -> Any:
+    with head.light.on(Glow("green")):
+        return head.camera.expose(Shot(0.02)).counts
+
+
+def test_one_press_on_a_recording_gives_a_picture_that_is_not_marked(folder: Path, play: Played) -> None:
+    kept, exam = play(folder)
+    assert kept.simulated is False
+    assert json.loads(exam.store.read(kept.id, "report.json"))["simulated"] is False
+    raw, facts = read_raw_tiff(exam.store.read(kept.id, "raw.tiff"))
+    assert facts["simulated"] is False
+    assert np.array_equal(raw, read_image(folder / "raw.tiff"))
+    with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
+        assert picture.text["simulated"] == "false"
+        assert picture.size == (160, 120)
+        pixels = np.asarray(picture).astype(float)
+    assert pixels[40:80, 50:110].mean() > 2 * pixels[90:, :].mean()  # the spots are back where they were
+
+
+def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Played) -> None:
+    counts = read_image(folder / "raw.tiff")
+    (folder / "raw.tiff").write_bytes(raw_tiff(counts, {"simulated": True}))
+    kept, exam = play(folder)
+    assert kept.simulated is True
+    with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
+        assert picture.text["simulated"] == "true"
+
+
+def test_a_preview_of_a_recording_comes_too(folder: Path, play: Played) -> None:
+    _, exam = play(folder)
+    live = exam.preview(0)
+    assert live is not None
+    with Image.open(BytesIO(live.jpeg)) as picture:
+        assert b"simulated=false" in picture.info["comment"]
+
+
+def test_several_raws_are_played_in_turn_and_a_thumbnail_psf_is_left_out(folder: Path) -> None:
+    tifffile.imwrite(folder / "raw2.tiff", np.rint(blurred(1)).astype(np.uint16))
+    tifffile.imwrite(folder / "psf_figure.tiff", psf_counts()[::4, ::4])
+    head = opened(folder)
+    first, second, again = lit(head), lit(head), lit(head)
+    assert not np.array_equal(first, second)
+    assert np.array_equal(first, again)
+    assert len(head.calibration.psfs) == 1
+    head.close()
+    with pytest.raises(CameraMissing):
+        head.camera.expose(Shot(0.02))
+
+
+def test_the_right_psf_of_a_stack_is_found(folder: Path, play: Played) -> None:
+    (folder / "psf.tiff").unlink()
+    for index, seed in enumerate((3, 0, 5)):
+        psf = scenes.speckle(SHAPE, seed)
+        tifffile.imwrite(folder / f"psf{index}.tiff", psf)
+    kept, _ = play(folder)
+    assert kept.report["psf_index"] == 1
+
+
+def test_a_float_recording_is_put_on_counts_by_one_scale(folder: Path, play: Played) -> None:
+    (folder / "raw.tiff").unlink()
+    original = ((blurred() - 64) / 4000).astype(np.float32)
+    original[0, :5] = np.nan
+    np.save(folder / "raw.npy", original)
+    head = opened(folder)
+    counts, dark = lit(head).astype(float), head.camera.expose(Shot(0.02)).counts.astype(float)
+    ratio = (counts - dark)[1:] / np.where(np.abs(original[1:]) > 0.1, original[1:], np.nan)
+    assert np.nanstd(ratio) < 1e-3 * np.nanmean(ratio)
+    assert counts.max() == 60000
+    assert head.calibration.bad is not None
+    assert head.calibration.bad.sum() == 5
+    kept, _ = play(folder)
+    assert kept.report["stopped"] == "done"
+
+
+def test_a_recording_in_three_channels_gives_a_picture_in_colour(folder: Path, play: Played) -> None:
+    colour = np.stack([blurred() * share for share in (1.0, 0.5, 0.25)], axis=2)
+    tifffile.imwrite(folder / "raw.tiff", np.rint(colour).astype(np.uint16), photometric="rgb")
+    kept, exam = play(folder)
+    with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
+        pixels = np.asarray(picture).astype(float)
+    assert pixels.shape == (120, 160, 3)
+    spots = pixels[40:80, 50:110].mean(axis=(0, 1))
+    assert spots[0] > spots[1] > spots[2]
+
+
+TOML = """
+name = "Bench recording"
+[camera]
+backend = "replay"
+rows = 120
+cols = 160
+pitch_um = 20.0
+full_well_e = 20000
+read_noise_e = 2
+[light]
+backend = "replay"
+[optics]
+iris_um = 3200
+diffuser_to_sensor_um = 6000
+angular_magnification = 0.75
+field_deg = 20
+[replay]
+raws = ["a/one.tiff"]
+psfs = ["point.tiff"]
+black_dn = 64
+"""
+
+
+@pytest.fixture
+def told(folder: Path) -> Path:
+    """A recording whose recording.toml says what the names do not."""
+    (folder / "a").mkdir()
+    (folder / "raw.tiff").rename(folder / "a" / "one.tiff")
+    (folder / "psf.tiff").rename(folder / "point.tiff")
+    (folder / "recording.toml").write_text(TOML)
+    return folder
+
+
+def test_a_recording_toml_names_the_files_the_geometry_and_the_black_level(told: Path, play: Played) -> None:
+    kept, exam = play(told)
+    head = exam.head
+    assert head.spec.name == "Bench recording"
+    assert head.calibration.geometry is not None
+    assert head.calibration.field_deg == 20
+    assert (head.camera.expose(Shot(0.02)).counts == 64).all()
+    radius_px = 10 * head.calibration.geometry.px_per_deg
+    with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
+        assert picture.size[0] == pytest.approx(2 * radius_px + 8, abs=2)
+
+
+def test_the_dark_frame_of_a_left_justified_recording_moves_with_it(told: Path) -> None:
+    (told / "recording.toml").write_text(TOML + 'dark = "dark.tiff"\n')
+    dark = np.random.default_rng(0).integers(60, 68, SHAPE).astype(np.uint16)
+    raw = read_image(told / "a" / "one.tiff")
+    for path, counts in ((told / "dark.tiff", dark), (told / "a" / "one.tiff", raw)):
+        tifffile.imwrite(path, counts << np.uint16(4))
+    head = opened(told)
+    assert np.array_equal(lit(head), raw)
+    assert np.array_equal(head.camera.expose(Shot(0.02)).counts, dark)
+
+
+def test_the_dark_frame_of_a_float_recording_is_scaled_with_it(told: Path) -> None:
+    (told / "a" / "one.tiff").unlink()
+    text = TOML.replace("one.tiff", "one.npy").replace("black_dn = 64", 'dark = "dark.npy"')
+    (told / "recording.toml").write_text(text)
+    np.save(told / "a" / "one.npy", blurred().astype(np.float32) / 4095)
+    np.save(told / "dark.npy", np.full(SHAPE, 64 / 4095, np.float32))
+    head = opened(told)
+    counts, dark = lit(head).astype(float), head.camera.expose(Shot(0.02)).counts.astype(float)
+    original = read_image(told / "a" / "one.npy") * 4095
+    scale = (60000 - 1000) / original.max()
+    assert np.allclose(counts - dark, (original - 64) * scale, atol=1.5)
+
+
+def refused(*where: Any) -> SpecError | PsfError:
+    with pytest.raises((SpecError, PsfError)) as error:
+        open_head(recording(*where), VirtualClock())
+    assert error.value.remedy
+    return error.value
+
+
+def test_a_folder_that_could_mean_anything_is_refused_with_words(folder: Path) -> None:
+    (folder / "raw.tiff").rename(folder / "one.tiff")
+    tifffile.imwrite(folder / "two.tiff", np.rint(blurred(1)).astype(np.uint16))
+    error = refused(folder)
+    assert "0 files that are raws and 1 that are PSFs" in error.message
+    assert "recording.toml" in error.remedy
+    (folder / "two.tiff").unlink()
+    assert opened(folder).camera.shape == SHAPE  # one image that is no PSF can only be the raw
+
+
+def test_what_is_no_recording_is_refused(folder: Path, told: Path, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "0 files that are raws and 0" in refused(empty).message
+    assert "is not a folder" in refused(tmp_path / "nowhere").message
+    (told / "recording.toml").write_text(TOML[: TOML.index("[replay]")])
+    assert "[replay]" in refused(told).message
+    (told / "recording.toml").write_text(TOML.replace("psfs", "psf"))
+    assert "did you mean 'psfs'?" in refused(told).message
+    raw = folder / "a" / "one.tiff"
+    assert "both" in refused(folder, (raw,), ()).message
+
+
+def test_files_that_do_not_belong_together_are_refused(folder: Path, told: Path) -> None:
+    raw, psf, small = folder / "a" / "one.tiff", folder / "point.tiff", folder / "small.tiff"
+    tifffile.imwrite(small, psf_counts()[:60, :80])
+    assert "small.tiff has 60 x 80 pixels, the raw 120 x 160" in refused(folder, (raw,), (small,)).message
+    assert "same rows and columns" in refused(folder, (raw, small), (psf,)).message
+    (told / "recording.toml").write_text(TOML + 'dark = "small.tiff"\n')
+    assert "small.tiff" in refused(told).message
+
+
+def test_named_files_need_no_folder_of_their_own(folder: Path, play: Played) -> None:
+    raw, psf = folder / "raw.tiff", folder / "psf.tiff"
+    kept, _ = play(folder, (raw,), (psf,))
+    assert kept.simulated is False
+    assert recording(Path(), (raw,), (psf,)).name  # a name, also for files that stand where we are
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason=f"the recordings are not in {RECORDINGS}")
+@pytest.mark.parametrize(
+    ("name", "shape", "psf"),
+    [("tutorial", (1200, 1600), "psf_sample.tif"), ("diffusercam3d", (270, 320), "psf16.tiff"),
+     ("dlmd", (270, 480, 3), "derived_psf_480x270_f32.npy")],
+)  # fmt: skip
+def test_a_real_recording_gives_a_picture_after_one_press(
+    play: Played, name: str, shape: tuple[int, ...], psf: str
+) -> None:
+    kept, exam = play(RECORDINGS / name)
+    assert kept.simulated is False
+    assert exam.head.calibration.psfs[kept.report["psf_index"]].name == psf
+    with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
+        pixels = np.asarray(picture).astype(float)
+    assert pixels.shape == shape
+    assert pixels.std() > 10  # neither black nor one grey
+    rows, cols = shape[:2]
+    middle = pixels[rows // 4 : -rows // 4, cols // 4 : -cols // 4]
+    assert middle.mean() > 1.2 * pixels.mean() or name != "tutorial"  # the hand stands in the middle
+    if name == "tutorial":
+        assert as_raw(read_image(RECORDINGS / name / "rawdata_hand_sample.tif")).shift == 4
