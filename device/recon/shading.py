@@ -17,6 +17,7 @@ from device.values import Image
 DEGREE = 8
 BLOCK = 4  # the fit looks at means of 4 x 4 samples: the modes are smooth
 RIDGE = 1e-4
+STRAY_RIDGE = 1e-2  # where the whole sensor is lit a constant is nearly a mode: doubt it until the frame insists
 
 
 class Shading:
@@ -34,15 +35,17 @@ class Shading:
         self._modes = np.stack([mode[top:bottom, left:right].ravel() for mode in modes])
         if isfinite(model.grid.radius):
             seen.append(np.full_like(seen[0], float(seen[0].max())))  # stray light, at home in the same scale
-        self._fit = self._solver(np.stack(seen))
+        ridge = np.full(len(seen), RIDGE)
+        ridge[len(modes) :] = STRAY_RIDGE
+        self._fit = self._solver(np.stack(seen), ridge)
         self._stray_scale = float(seen[0].max())
 
     @staticmethod
-    def _solver(seen: Image) -> Image:
+    def _solver(seen: Image, ridge: NDArray[np.float64]) -> Image:
         """Weighted ridge regression: the weights are those of shot noise under an even field."""
         weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + 0.03)
         normal = (seen * weights) @ seen.T
-        return np.asarray(np.linalg.solve(normal + RIDGE * np.diag(np.diag(normal)), seen * weights), np.float32)
+        return np.asarray(np.linalg.solve(normal + np.diag(ridge * np.diag(normal)), seen * weights), np.float32)
 
     def fit(self, y: Image, out: Image) -> tuple[float, float]:
         """Write the smooth picture into `out` (the grid); return the mean level in the field and the stray light, in DN."""
