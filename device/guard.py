@@ -42,7 +42,7 @@ class GuardedLight:
         now_s = self._clock.now_s()
         if self._held is not None:
             raise LightLimit("the lamp is already lit by someone else")
-        self._debt_s = max(0.0, self._debt_s - (now_s - self._dark_at_s))
+        self._debt_s, self._dark_at_s = max(0.0, self._debt_s - (now_s - self._dark_at_s)), now_s  # counts once
         if self._debt_s >= self.max_on_s:
             raise LightLimit(f"{self._debt_s:.1f} s of light have not yet been followed by darkness")
         self._lit_at_s, self._cut_at_s = now_s, None

@@ -7,6 +7,7 @@ import zlib
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or a
 _BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
     ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError,
     UnidentifiedImageError, tifffile.TiffFileError,
-    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile,
+    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
 )  # fmt: skip
 
 
@@ -92,7 +93,7 @@ def write_linear(path: Path, picture: Image) -> None:
         case ".npy":
             np.save(path, picture)
         case ".tif" | ".tiff":
-            tifffile.imwrite(path, picture)
+            tifffile.imwrite(path, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
         case other:
             raise SettingError(f"{path}: linear pictures are written as .npy or .tiff, not '{other}'")
 
@@ -155,7 +156,10 @@ def as_psf(array: NDArray[Any], name: str) -> Psf:
     """
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise PsfError(f"{name} holds values that are not numbers (NaN or infinite)")
-    raw = as_raw(array)
+    try:
+        raw = as_raw(array)
+    except FrameError as error:
+        raise PsfError(f"{name}: {error.message}") from error
     pixels = raw.pixels.astype(np.float32)
     if pixels.ndim == 3:
         pixels = pixels.mean(axis=2)
@@ -181,6 +185,7 @@ def refuse_other_sizes(psfs: tuple[Psf, ...], shape: tuple[int, int]) -> None:
 def read_psf(path: Path) -> Psf:
     """The PSF in an image file, cleaned as `as_psf` does."""
     try:
-        return as_psf(read_image(path), path.name)
+        array = read_image(path)
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
+    return as_psf(array, path.name)

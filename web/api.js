@@ -69,53 +69,58 @@ const EVENTS = ["beat", "state", "stage", "kept", "failed"];
  * Calls `on[type](data)` for each event, and `on.link("live" | "lost")` when data begins or stops to arrive;
  * freshness is judged by data alone, because navigator.onLine knows nothing about this device.
  */
-export function listen(on) {
-  let source = null;
-  let heardAt = 0;
-  let openedAt = 0;
-  let link = "opening";
+export class EventLine {
+  #on;
+  #source = null;
+  #heardAt = 0;
+  #openedAt = 0;
+  #link = "opening";
 
-  const say = (now) => {
-    if (now === link) return;
-    link = now;
-    on.link(now);
-  };
+  constructor(on) {
+    this.#on = on;
+    document.addEventListener("visibilitychange", () => this.#wake());
+    addEventListener("pagehide", () => this.#close());
+    addEventListener("pageshow", (event) => event.persisted && this.#wake());
+    setInterval(() => this.#look(), 250);
+    this.#wake();
+  }
 
-  const close = () => {
-    source?.close();
-    source = null;
-  };
+  #wake() {
+    if (document.hidden) return this.#close();
+    this.#heardAt = performance.now(); // a page that comes back gets its three seconds before it complains
+    return this.#open();
+  }
 
-  const open = () => {
-    close();
-    openedAt = performance.now();
-    source = new EventSource("/api/events");
+  #open() {
+    this.#close();
+    this.#openedAt = performance.now();
+    this.#source = new EventSource("/api/events");
     for (const type of EVENTS) {
-      source.addEventListener(type, (event) => {
-        heardAt = performance.now();
-        say("live");
-        on[type]?.(event.data ? JSON.parse(event.data) : {});
+      this.#source.addEventListener(type, (event) => {
+        this.#heardAt = performance.now();
+        this.#say("live");
+        this.#on[type]?.(event.data ? JSON.parse(event.data) : {});
       });
     }
-  };
+  }
 
-  const look = () => {
-    if (!source) return;
+  #close() {
+    this.#source?.close();
+    this.#source = null;
+  }
+
+  #look() {
+    if (!this.#source) return;
     const now = performance.now();
-    if (now - heardAt < SILENCE_MS) return;
-    say("lost");
-    if (now - openedAt > RETRY_MS || source.readyState === EventSource.CLOSED) open();
-  };
+    if (now - this.#heardAt < SILENCE_MS) return;
+    this.#say("lost");
+    const patience = this.#source.readyState === EventSource.CLOSED ? RETRY_MS / 2 : RETRY_MS;
+    if (now - this.#openedAt > patience) this.#open();
+  }
 
-  const wake = () => {
-    if (document.hidden) return close();
-    heardAt = performance.now(); // a page that comes back gets its three seconds before it complains
-    return open();
-  };
-
-  document.addEventListener("visibilitychange", wake);
-  addEventListener("pagehide", close);
-  addEventListener("pageshow", (event) => event.persisted && wake());
-  setInterval(look, 250);
-  wake();
+  #say(link) {
+    if (link === this.#link) return;
+    this.#link = link;
+    this.#on.link(link);
+  }
 }

@@ -1,6 +1,6 @@
 // The page's story: aim, press, hold still, look, next. State lives in the store, looks live in views.js.
 
-import { getCaptures, getStatus, listen, Refusal, takePicture } from "./api.js";
+import { EventLine, getCaptures, getStatus, Refusal, takePicture } from "./api.js";
 import "./live.js";
 import { createStore } from "./store.js";
 import { render } from "./vendor/lit-html.js";
@@ -81,12 +81,11 @@ const act = {
 
   // The viewer tells what it has drawn; until then nothing on the page says "final".
   drawn({ detail }) {
-    if (detail.url !== get().src?.url) return;
     set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
   },
 
   pictureFault({ detail }) {
-    if (detail.mark === "quick" || detail.url !== get().src?.url) return; // the final picture is still to come
+    if (detail.mark === "quick") return; // the final picture is still to come
     set({ alert: { code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy") } });
   },
 
@@ -198,7 +197,7 @@ function addToStrip(capture) {
 
 let beats = 0;
 
-listen({
+const heard = {
   link(link) {
     set({ link });
     if (link === "live") refresh();
@@ -231,7 +230,7 @@ listen({
     if (get().screen === "making" && capture.id === makingId) pictureKept(capture);
     else addToStrip(capture);
   },
-});
+};
 
 async function refreshStatus() {
   try {
@@ -325,3 +324,4 @@ function draw(state) {
 
 store.subscribe(draw);
 draw(get());
+new EventLine(heard);

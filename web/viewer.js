@@ -54,7 +54,7 @@ export class EyePic extends HTMLElement {
   #before = null; // what was drawn before, while it fades
   #fadeFrom = 0;
   #pixels = null;
-  #loading = null;
+  #loading = new AbortController(); // of this subject: its quick look and its final picture
   #frame = 0;
   #view = { zoom: 1, u: 0, v: 0 }; // centre as a fraction of the picture's width, so that it survives a sharper picture
   #fingers = new Map();
@@ -80,16 +80,23 @@ export class EyePic extends HTMLElement {
   set subject(name) {
     if (name === this.#subject) return;
     this.#subject = name;
+    this.#clear();
     this.showAll();
   }
 
   /** {url, mark: "quick" | "final"} or null. The mark becomes visible with its pixels, never before them. */
   set src(src) {
     if (src?.url === this.#src?.url) return;
+    if (!src) this.#clear();
     this.#src = src;
-    this.#loading?.abort();
     if (src) this.#load(src);
-    else this.#take(null, "");
+  }
+
+  #clear() {
+    this.#loading.abort();
+    this.#loading = new AbortController();
+    this.#src = null;
+    this.#take(null, "");
   }
 
   set head(head) {
@@ -128,15 +135,15 @@ export class EyePic extends HTMLElement {
   }
 
   async #load({ url, mark }) {
-    const loading = new AbortController();
-    this.#loading = loading;
+    const { signal } = this.#loading;
     try {
-      const bitmap = await getBitmap(url, loading.signal);
-      if (loading.signal.aborted) return;
+      const bitmap = await getBitmap(url, signal);
+      // On a slow link the small quick look still comes first, and is welcome; after the final picture it is not.
+      if (signal.aborted || (mark === "quick" && this.#mark === "final")) return;
       this.#take(bitmap, mark);
       this.dispatchEvent(new CustomEvent("drawn", { detail: { url, mark, grey: this.#isGrey() } }));
     } catch {
-      if (!loading.signal.aborted) this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
+      if (!signal.aborted) this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
     }
   }
 

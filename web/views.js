@@ -1,11 +1,28 @@
 // What the page looks like for a given state: pure templates, no fetches, no decisions about the instrument.
 // Never bind the `style` attribute (the CSP forbids it) and never build HTML from strings (Trusted Types forbid it).
 
-import { icon } from "./icons.js";
-import { html, nothing } from "./vendor/lit-html.js";
+import { html, nothing, svg } from "./vendor/lit-html.js";
 import { calendarDay, clockTime, isToday, number, t } from "./words.js";
 
 const EYES = ["OD", "OS"];
+
+const PATHS = {
+  ring: svg`<circle cx="12" cy="12" r="9" stroke-dasharray="4 2.6"></circle><circle cx="12" cy="12" r="1.5"></circle>`,
+  hand: svg`<path
+    d="M8 13V5.5a1.5 1.5 0 0 1 3 0V11M11 11V4a1.5 1.5 0 0 1 3 0v7M14 11V5.5a1.5 1.5 0 0 1 3 0V14c0 4-2.5 7-6 7
+       -3 0-4.5-1.5-6-4l-1.7-3a1.5 1.5 0 0 1 2.5-1.6L8 15"></path>`,
+  circle: svg`<circle cx="12" cy="12" r="9"></circle>`,
+  check: svg`<path d="M4 12.5 9.5 18 20 6.5"></path>`,
+  again: svg`<path d="M4 12a8 8 0 1 0 2.5-5.8M4 4v4.5h4.5"></path>`,
+  next: svg`<path d="M5 12h14M13 6l6 6-6 6"></path>`,
+  warn: svg`<path d="M12 4 2.5 20h19zM12 10v4.5M12 17.2v.3"></path>`,
+  wait: svg`<circle cx="12" cy="12" r="9"></circle><path d="M12 7v5l3.5 2"></path>`,
+  menu: svg`<path d="M4 7h16M4 12h16M4 17h16"></path>`,
+  camera: svg`<circle cx="12" cy="13" r="3.5"></circle>
+    <path d="M4 8h3.5L9 5.5h6L16.5 8H20a1 1 0 0 1 1 1v9a1 1 0 0 1-1 1H4a1 1 0 0 1-1-1V9a1 1 0 0 1 1-1z"></path>`,
+  nolink: svg`<path
+    d="M3 3l18 18M5 12.5a10 10 0 0 1 4-2.4M15.5 10.3a10 10 0 0 1 3.5 2.2M8.5 16a5 5 0 0 1 7 0M12 19.5v.1"></path>`,
+};
 
 export function page(state, act) {
   return html`
@@ -57,9 +74,13 @@ function header({ status, link, busy, shown }, act) {
       </p>
       ${kindChip(kind)}
       <button class="quiet" type="button" @click=${act.openMenu}>${icon("menu")} ${t("menu")}</button>
-      ${link === "lost" ? html`<div class="banner">${icon("nolink")} <p role="alert">${t("link.lost")}</p> ${kindChip(kind)}</div>` : nothing}
+      ${link === "lost" ? banner(kind) : nothing}
     </header>
   `;
+}
+
+function banner(kind) {
+  return html`<div class="banner">${icon("nolink")} <p role="alert">${t("link.lost")}</p> ${kindChip(kind)}</div>`;
 }
 
 // What is not a real eye must be unmistakable on every screen, also when a picture's own mark is zoomed out of view.
@@ -129,27 +150,30 @@ function card(state) {
 
 function makingCard({ stage }) {
   const left = Math.round(stage.left); // 0: not known, and then nothing is promised
-  const words = { expose: "make.expose", quick: "make.refine", refine: "make.refine", keep: "make.keep" };
+  const words = { expose: "make.expose", keep: "make.keep" };
+  const promise = left >= 1 ? t("make.left", { n: left }) : stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
       <h2>${t(words[stage.name] ?? "make.refine")}</h2>
-      <p class="muted">${left >= 1 ? t("make.left", { n: left }) : stage.fraction >= 0.9 ? t("make.soon") : "\u00a0"}</p>
+      <p class="muted">${promise}</p>
       <progress max="1" .value=${stage.fraction} aria-label=${t("make.progress")}></progress>
     </div>
   `;
 }
 
 function resultCard({ shown, eye, grey }) {
-  const time = shown && clockTime(shown.taken_at);
   return html`
     <div class="card">
       <h2 tabindex="-1" id="result-title">${t("result.title", { eye: t(`eye.${shown?.eye ?? eye}`) })}</h2>
-      ${shown ? html`<p class="muted">${isToday(shown.taken_at) ? time : `${calendarDay(shown.taken_at)}, ${time}`}</p>` : nothing}
+      ${shown ? html`<p class="muted">${takenWords(shown.taken_at)}</p>` : nothing}
       ${(shown?.report?.warnings ?? []).map((warning) => html`<p class="warning">${icon("warn")} ${warning}</p>`)}
       ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing} ${shown ? details(shown) : nothing}
     </div>
   `;
 }
+
+const takenWords = (moment) =>
+  isToday(moment) ? clockTime(moment) : `${calendarDay(moment)}, ${clockTime(moment)}`;
 
 // For the technician: how the picture was made, and the files to take away.
 function details({ id, report, calibration_id: calibration, links }) {
@@ -181,14 +205,20 @@ function tools({ redfree, contrast, zoom }, act) {
       <button type="button" aria-label=${moreName} @click=${more}>+</button>
     </div>
   `;
-  const contrastWord = contrast === 0 ? t("tool.contrast") : `${t("tool.contrast")} ${contrast > 0 ? "+" : "−"}${Math.abs(contrast)}`;
+  const sign = contrast > 0 ? "+" : "−";
+  const contrastWord = t("tool.contrast") + (contrast ? ` ${sign}${Math.abs(contrast)}` : "");
+  const soften = () => act.contrastBy(-1);
+  const harden = () => act.contrastBy(1);
   return html`
     <div class="tools" role="group" aria-label=${t("part.tools")}>
       <div class="pair">
-        <button type="button" aria-pressed=${!redfree} @click=${() => act.setRedfree(false)}>${t("tool.colour")}</button>
-        <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(true)}>${t("tool.redfree")}</button>
+        ${[false, true].map(
+          (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => act.setRedfree(on)}>
+            ${t(on ? "tool.redfree" : "tool.colour")}
+          </button>`,
+        )}
       </div>
-      ${step(() => act.contrastBy(-1), () => act.contrastBy(1), contrastWord, t("tool.contrast.less"), t("tool.contrast.more"))}
+      ${step(soften, harden, contrastWord, t("tool.contrast.less"), t("tool.contrast.more"))}
       ${step(act.zoomOut, act.zoomIn, t("tool.zoom", { z: number(zoom) }), t("tool.zoom.less"), t("tool.zoom.more"))}
       <button class="reset" type="button" @click=${act.reset}>${t("tool.reset")}</button>
     </div>
@@ -210,11 +240,13 @@ function strip({ captures, screen, shown }, act) {
                 data-id=${capture.id}
                 aria-current=${current ? "true" : "false"}
                 aria-disabled=${screen === "making"}
-                aria-label=${t("strip.open", { eye: t(`eye.${capture.eye}`), time })}
+                aria-label=${t("strip.open", { eye: t(`eye.${capture.eye}.short`), time })}
                 @click=${() => act.open(capture)}
               >
-                <span class="thumb"><img src=${capture.links.quick} alt="" loading="lazy" @load=${act.thumbLoaded} /></span>
-                <span>${t(`eye.${capture.eye}.short`)}<br />${time}</span>
+                <span class="thumb">
+                  <img src=${capture.links.quick} alt="" loading="lazy" @load=${act.thumbLoaded} />
+                </span>
+                <span>${t(`eye.${capture.eye}.short`)} <br />${time}</span>
               </button>
             </li>
           `;
@@ -272,10 +304,19 @@ function menu({ theme, letters, status }, act) {
       <h3>${t("menu.keys")}</h3>
       <label><input type="checkbox" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
       <dl>
-        ${["take", "g", "contrast", "zero", "rn"].map((key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`)}
+        ${["take", "g", "contrast", "zero", "rn"].map(
+          (key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`,
+        )}
       </dl>
       <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
       <button class="primary" type="button" @click=${act.closeMenu}>${t("menu.close")}</button>
     </dialog>
   `;
+}
+
+// ---- icons: a few lines each, drawn here so that nothing is fetched. An icon never stands without its word, and is
+// hidden from screen readers because the word says the same.
+
+function icon(name) {
+  return html`<svg class="icon" viewBox="0 0 24 24" aria-hidden="true" focusable="false">${PATHS[name]}</svg>`;
 }

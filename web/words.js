@@ -3,7 +3,6 @@
 
 const ENGLISH = {
   "app.name": "Diffuscope",
-  "app.title": "{state} · Diffuscope",
   "chip.simulated": "SIMULATED",
   "chip.simulated.why": "No real eye: these pictures are simulated.",
   "chip.recording": "RECORDING",
@@ -18,7 +17,6 @@ const ENGLISH = {
   "eye.OS": "Left eye (OS)",
   "eye.OD.short": "Right",
   "eye.OS.short": "Left",
-  "eye.now": "Now: {eye}.",
 
   "part.live": "Live picture and result",
   "part.controls": "Controls",
@@ -76,7 +74,7 @@ const ENGLISH = {
   "tool.reset": "Show all",
 
   "strip.empty": "Pictures that you take appear here.",
-  "strip.open": "Open the picture of the {eye}, {time}",
+  "strip.open": "{eye} {time}: open this picture",
 
   "alert.close": "OK",
   "link.lost": "The camera is not answering. Stay close to it. Trying again…",
@@ -109,7 +107,6 @@ const ENGLISH = {
   "key.zero.what": "Show all",
   "key.rn": "R and N",
   "key.rn.what": "Take again, next",
-  "menu.about": "About",
   "menu.version": "Version {version}",
 };
 
@@ -134,7 +131,8 @@ export function t(key, vars = {}) {
 }
 
 export function clockTime(iso) {
-  return new Intl.DateTimeFormat(language, { hour: "2-digit", minute: "2-digit", hourCycle: "h23" }).format(new Date(iso));
+  const form = new Intl.DateTimeFormat(language, { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
+  return form.format(new Date(iso));
 }
 
 export function calendarDay(iso) {

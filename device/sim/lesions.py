@@ -19,7 +19,7 @@ def scatter(
     x: Image,
     y: Image,
     rng: np.random.Generator,
-    reach: float,
+    reach_deg: float,
     centre: tuple[float, float],
     haemorrhages: int,
     microaneurysms: int,
@@ -32,10 +32,10 @@ def scatter(
     dark = np.zeros((y.size, x.size), np.float32)
     bright = np.zeros_like(dark)
     for _ in range(haemorrhages):
-        _blot(dark, x, y, rng, _somewhere(rng, reach, centre, 2.5), rng.uniform(0.3, 0.85), 0.85, rough=0.17)
+        _blot(dark, x, y, rng, _somewhere(rng, reach_deg, centre, 2.5), rng.uniform(0.3, 0.85), 0.85, rough=0.17)
     for _ in range(microaneurysms):
-        _blot(dark, x, y, rng, _somewhere(rng, reach, centre, 1.6), rng.uniform(0.09, 0.17), 0.75, rough=0.05)
-    heart = _somewhere(rng, 0.35 * reach, (0.0, 0.0), 2.5)
+        _blot(dark, x, y, rng, _somewhere(rng, reach_deg, centre, 1.6), rng.uniform(0.09, 0.17), 0.75, rough=0.05)
+    heart = _somewhere(rng, 0.35 * reach_deg, (0.0, 0.0), 2.5)
     for _ in range(exudates):
         turn, far = rng.uniform(0, 2 * np.pi), abs(rng.normal(1.3, 0.45))
         place = (heart[0] + far * np.cos(turn), heart[1] + far * np.sin(turn))
@@ -44,11 +44,11 @@ def scatter(
 
 
 def _somewhere(
-    rng: np.random.Generator, reach: float, centre: tuple[float, float], from_fovea: float
+    rng: np.random.Generator, reach_deg: float, centre: tuple[float, float], from_fovea: float
 ) -> tuple[float, float]:
     """A place in the field, not in the disc (15 degrees nasal) and not closer to the fovea than asked."""
     for _ in range(100):
-        far, turn = 0.92 * reach * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+        far, turn = 0.92 * reach_deg * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
         x, y = centre[0] + far * np.cos(turn), centre[1] + far * np.sin(turn)
         if np.hypot(x, y) > from_fovea and np.hypot(x - 15.2, y + 1.5) > 4:
             break

@@ -25,7 +25,7 @@ WANDER = 1.3  # over which length a vessel forgets its bend
 
 @dataclass(frozen=True)
 class Vessel:
-    """One vessel from its beginning to its end: points (n, 3) of x, y and width."""
+    """One vessel from its beginning to its end: points (n, 3) of x, y and width_deg."""
 
     kind: Kind
     points: NDArray[np.float32]
@@ -37,7 +37,7 @@ class Trunk:
 
     kind: Kind
     heading_deg: float
-    width: float
+    width_deg: float
     arch: float | None
 
 
@@ -62,8 +62,8 @@ class Tip:
     kind: Kind
     x: float
     y: float
-    heading: float
-    width: float
+    heading_rad: float
+    width_deg: float
     arch: float | None = None
     inward: bool = False  # towards the macula
     family: tuple[int, ...] = ()  # itself and those it came from
@@ -74,10 +74,10 @@ class Tip:
 
 @dataclass
 class Garden:
-    """The ground on which the vessels of one eye grow: a circle of `reach` around `centre`."""
+    """The ground on which the vessels of one eye grow: a circle of `reach_deg` around `centre`."""
 
     rng: np.random.Generator
-    reach: float
+    reach_deg: float
     centre: tuple[float, float]
     taken: dict[tuple[Kind, int, int], int] = field(default_factory=dict)
     born: int = 0
@@ -92,10 +92,10 @@ class Garden:
         """Remember that this vessel was here first."""
         self.taken.setdefault((tip.kind, round(tip.x / CELL), round(tip.y / CELL)), tip.family[-1])
 
-    def free(self, tip: Tip, turn: float, ahead: float) -> bool:
+    def free(self, tip: Tip, turn_rad: float, ahead: float) -> bool:
         """Whether no strange vessel of the same kind lies ahead, if the tip turned."""
-        x = tip.x + ahead * math.cos(tip.heading + turn)
-        y = tip.y + ahead * math.sin(tip.heading + turn)
+        x = tip.x + ahead * math.cos(tip.heading_rad + turn_rad)
+        y = tip.y + ahead * math.sin(tip.heading_rad + turn_rad)
         owner = self.taken.get((tip.kind, round(x / CELL), round(y / CELL)))
         return owner is None or owner == tip.family[-1]
 
@@ -103,20 +103,20 @@ class Garden:
         """Whether the tip has left the ground, become too thin, curled up, or come past the fovea."""
         away = math.hypot(tip.x - self.centre[0], tip.y - self.centre[1])
         from_fovea = math.hypot(tip.x, tip.y)
-        leaving = math.cos(tip.heading) * tip.x + math.sin(tip.heading) * tip.y > 0
+        leaving = math.cos(tip.heading_rad) * tip.x + math.sin(tip.heading_rad) * tip.y > 0
         past = from_fovea < AVASCULAR or (leaving and tip.inward and from_fovea < 6)
-        return away > self.reach or tip.width < THINNEST or past or abs(tip.spun) > CURL
+        return away > self.reach_deg or tip.width_deg < THINNEST or past or abs(tip.spun) > CURL
 
 
-def grow(seed: int, reach: float, centre: tuple[float, float]) -> list[Vessel]:
-    """All vessels of one eye within `reach` of `centre`: the same for the same seed, the widest first."""
-    garden = Garden(np.random.default_rng((seed, 1)), reach, centre)
+def grow(seed: int, reach_deg: float, centre: tuple[float, float]) -> list[Vessel]:
+    """All vessels of one eye within `reach_deg` of `centre`: the same for the same seed, the widest first."""
+    garden = Garden(np.random.default_rng((seed, 1)), reach_deg, centre)
     waiting = [_sprout(garden, trunk) for trunk in TRUNKS]
     vessels = []
     while waiting:
-        waiting.sort(key=lambda tip: -tip.width)
+        waiting.sort(key=lambda tip: -tip.width_deg)
         tip = waiting.pop(0)
-        points = [(tip.x, tip.y, tip.width)]
+        points = [(tip.x, tip.y, tip.width_deg)]
         for branch in _lengthen(garden, tip, points):
             waiting.append(branch)
         if len(points) > 8:
@@ -131,7 +131,7 @@ def _sprout(garden: Garden, trunk: Trunk) -> Tip:
     arch = None if trunk.arch is None else trunk.arch + rng.normal(0, 0.5)
     x, y = DISC[0] + 0.35 + 0.3 * math.cos(heading), DISC[1] + 0.5 * math.sin(heading)
     side = 1 if rng.random() < 0.5 else -1
-    return garden.seed(Tip(trunk.kind, x, y, heading, trunk.width * rng.uniform(0.9, 1.1), arch, side=side))
+    return garden.seed(Tip(trunk.kind, x, y, heading, trunk.width_deg * rng.uniform(0.9, 1.1), arch, side=side))
 
 
 def _lengthen(garden: Garden, tip: Tip, points: list[tuple[float, float, float]]) -> Iterator[Tip]:
@@ -141,34 +141,34 @@ def _lengthen(garden: Garden, tip: Tip, points: list[tuple[float, float, float]]
     grown = 0.0
     while not garden.ends(tip):
         _steer(garden, tip, grown)
-        tip.x += STEP * math.cos(tip.heading)
-        tip.y += STEP * math.sin(tip.heading)
-        tip.width *= 1 - 0.012 * STEP
+        tip.x += STEP * math.cos(tip.heading_rad)
+        tip.y += STEP * math.sin(tip.heading_rad)
+        tip.width_deg *= 1 - 0.012 * STEP
         grown += STEP
         if grown > 0.7 and not garden.free(tip, 0, 0.3):
             return
         garden.take(tip)
-        points.append((tip.x, tip.y, tip.width))
+        points.append((tip.x, tip.y, tip.width_deg))
         until_branch -= STEP
-        if until_branch < 0 and tip.width > 1.5 * THINNEST:
+        if until_branch < 0 and tip.width_deg > 1.5 * THINNEST:
             yield _branch(garden, tip)
-            until_branch = rng.uniform(0.7, 1.5) * (1.3 + 3.0 * math.sqrt(tip.width))
+            until_branch = rng.uniform(0.7, 1.5) * (1.3 + 3.0 * math.sqrt(tip.width_deg))
 
 
 def _steer(garden: Garden, tip: Tip, grown: float) -> None:
     """Turn a little: at random, towards where this vessel belongs, and away from others of its kind."""
-    rough = 0.14 if tip.width > 0.2 else 0.22
+    rough = 0.14 if tip.width_deg > 0.2 else 0.22
     tip.bend += -tip.bend * STEP / WANDER + rough * math.sqrt(2 * STEP / WANDER) * garden.rng.standard_normal()
     wanted, pull = _course(tip)
-    error = math.remainder(wanted - tip.heading, math.tau)
-    before = tip.heading
-    tip.heading += STEP * (tip.bend + pull * error)
+    error = math.remainder(wanted - tip.heading_rad, math.tau)
+    before = tip.heading_rad
+    tip.heading_rad += STEP * (tip.bend + pull * error)
     if grown > 0.7 and not (garden.free(tip, 0, 0.6) and garden.free(tip, 0, 1.0)):
         left = garden.free(tip, -0.7, 0.7) + garden.free(tip, -0.5, 1.1)
         right = garden.free(tip, 0.7, 0.7) + garden.free(tip, 0.5, 1.1)
         if left != right:
-            tip.heading += STEP * (1.6 if right > left else -1.6)
-    tip.spun += tip.heading - before if tip.arch is None else 0
+            tip.heading_rad += STEP * (1.6 if right > left else -1.6)
+    tip.spun += tip.heading_rad - before if tip.arch is None else 0
 
 
 def _course(tip: Tip) -> tuple[float, float]:
@@ -189,14 +189,14 @@ def _course(tip: Tip) -> tuple[float, float]:
 def _branch(garden: Garden, tip: Tip) -> Tip:
     """Split: the thinner daughter leaves at a wide angle, the thicker one goes on; w0^3 = w1^3 + w2^3 (Murray 1926)."""
     rng = garden.rng
-    ratio = rng.uniform(0.38, 0.62) if tip.width > 0.2 else rng.uniform(0.55, 0.95)
-    wide = tip.width / (1 + ratio**3) ** (1 / 3)
+    ratio = rng.uniform(0.38, 0.62) if tip.width_deg > 0.2 else rng.uniform(0.55, 0.95)
+    wide = tip.width_deg / (1 + ratio**3) ** (1 / 3)
     angle = math.radians(rng.uniform(38, 62))
     side = tip.side
     tip.side = -side if rng.random() < 0.75 else side
-    heading = tip.heading + side * angle
-    tip.heading -= side * angle * 0.35 * ratio**2
-    tip.width = wide
+    heading = tip.heading_rad + side * angle
+    tip.heading_rad -= side * angle * 0.35 * ratio**2
+    tip.width_deg = wide
     to_fovea = math.cos(heading - math.atan2(-tip.y, -tip.x))
     return garden.seed(
         Tip(tip.kind, tip.x, tip.y, heading, ratio * wide, None, to_fovea > 0.25, tip.family, side=-side)

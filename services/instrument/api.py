@@ -93,6 +93,7 @@ def create_app(exam: Exam) -> FastAPI:
     _words_for_errors(app)
     app.add_middleware(SafeHeaders)
     _captures(app, exam)
+    _state(app, exam)
     _live(app, exam)
     _page(app)
     return app
@@ -208,7 +209,7 @@ def _captures(app: FastAPI, exam: Exam) -> None:
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _live(app: FastAPI, exam: Exam) -> None:
+def _state(app: FastAPI, exam: Exam) -> None:
     @app.get("/api/status")
     def status() -> dict[str, Any]:
         """What this instrument is and does now."""
@@ -226,6 +227,8 @@ def _live(app: FastAPI, exam: Exam) -> None:
         """Whether it can take pictures now."""
         return {"ok": exam.problem is None, "state": exam.state, "space_left": exam.store.space_left()}
 
+
+def _live(app: FastAPI, exam: Exam) -> None:
     @app.get("/api/preview")
     def preview(after: int = Query(0, ge=0)) -> Response:
         """The next live picture after number `after`; 204 when none comes in 2 s."""

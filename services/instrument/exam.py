@@ -200,7 +200,8 @@ class Exam:
         made = self._reconstruct(id, frame, dark)
         report = asdict(made.report)
         report["seconds"] = {"expose": exposed_s - begin_s, **made.report.seconds}
-        capture = Capture(id, eye, taken_at, made.simulated, self.head.calibration.id, report, {})
+        plain = json.loads(_json_bytes(report))  # as it will be read back: lists for tuples, floats for numpy's
+        capture = Capture(id, eye, taken_at, made.simulated, self.head.calibration.id, plain, {})
         self._tell_stage(id, "keep", 0.9)
         kept = self.store.keep(capture, self._files(capture, frame, dark, made))
         self.bulletin.tell("kept", id=id)

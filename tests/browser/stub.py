@@ -56,8 +56,8 @@ def encoded(kind: str, blur: int, shift: float = 0.0) -> bytes:
 class Stub:
     """What the pretended instrument does next; tests set the fields, the page sees the answers."""
 
-    expose_s: float = 0.2
-    refine_s: float = 0.6
+    expose_s: float = 0.1
+    refine_s: float = 0.3
     kind: str = "simulated"
     problem: dict[str, str] | None = None
     swept: list[str] = field(default_factory=list)

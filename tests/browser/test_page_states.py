@@ -47,7 +47,7 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
 def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int]) -> None:
-    stub.stub.refine_s = 1.5
+    stub.stub.refine_s = 1.2
     stub.stub.problem = BROKEN
     page = live(open_page(stub.url, size))
     faults = {"problem": look_for_faults(page, SHUTTER)}
@@ -69,18 +69,18 @@ def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, 
 
 
 def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.refine_s = 1.5
+    stub.stub.refine_s = 2.5
     page = live(open_page(stub.url))
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
     expect(page.get_by_role("status")).to_contain_text("Quick look")
+    bar = page.locator("progress").evaluate("bar => bar.value")
     page.get_by_role("button", name="Red-free").tap()
     page.get_by_role("button", name="Zoom in").tap()
     page.get_by_role("button", name="Zoom in").tap()
     assert zoom(page) == 2.25
     assert page.locator(".stage").get_attribute("data-mark") == "quick"
-    bar = page.locator("progress").evaluate("bar => bar.value")
-    page.wait_for_timeout(400)
+    page.wait_for_timeout(300)
     assert page.locator("progress").evaluate("bar => bar.value") > bar
     page.wait_for_selector(".stage[data-mark=final]")
     expect(page.get_by_role("status")).to_contain_text("Final picture, kept")
@@ -166,7 +166,7 @@ def test_a_refusal_is_shown_in_the_instruments_own_words(
 
 
 def test_an_impatient_second_press_costs_the_eye_nothing(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.refine_s = 1.5
+    stub.stub.refine_s = 1.2
     page = live(open_page(stub.url))
     page.locator(SHUTTER).dblclick()
     page.wait_for_timeout(700)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tests import scenes
 
 from device.errors import FrameError, PsfError, SettingError
 from device.recon.reconstructor import Recipe
 from device.values import Psf, Sensor
+from tests import scenes
 
 SHAPE = (60, 84)
 METHODS = ("tikhonov", "gradient")

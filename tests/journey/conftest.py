@@ -5,6 +5,7 @@ import json
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
@@ -23,6 +24,7 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.world import World
 from device.spec import InstrumentSpec, load_head
+from device.values import Calibration
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
@@ -124,24 +126,34 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("plans")
 
 
+@pytest.fixture(scope="session")
+def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """A world whose light is already traced, and its calibration: the same for every test."""
+    world = World(spec, VirtualClock())
+    for colour in (spec.light.colour, spec.light.preview_colour):
+        world.electrons_per_s(colour)
+    return world, simulated_calibration(world)
+
+
 MakeRig = Callable[..., Rig]
 
 
 @pytest.fixture
-def make_rig(tmp_path: Path, spec: InstrumentSpec, plans: Path) -> Iterator[MakeRig]:
-    """Build instruments: `camera` wraps the simulated one, `store` and `world` give options, `max_on_s` the guard's."""
+def make_rig(tmp_path: Path, template: tuple[World, Calibration], plans: Path) -> Iterator[MakeRig]:
+    """Build instruments: `camera` wraps the simulated one, `store` gives its options, `max_on_s` is the guard's."""
+    dark_world, calibration = template
     with ExitStack() as undo:
 
         def made(
             camera: Callable[[Camera], Camera] = lambda camera: camera,
             max_on_s: float = 30.0,
-            world: dict[str, Any] | None = None,
             store: dict[str, Any] | None = None,
         ) -> Rig:
             clock, died = GateClock(), Event()
-            scene = World(spec, clock, **world or {})
+            scene = copy(dark_world)
+            scene.clock, scene.faults = clock, set()
             light = GuardedLight(SimLight(scene), clock, max_on_s)
-            head = Head(spec, camera(SimCamera(scene)), light, simulated_calibration(scene))
+            head = Head(scene.spec, camera(SimCamera(scene)), light, calibration)
             shelf = undo.enter_context(Store(tmp_path / "shelf", **{"reserve_bytes": 0, **(store or {})}))
             bulletin = Bulletin()
             exam = Exam(head, shelf, bulletin, clock, plans, died.set)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests import scenes
-from tests.textbook import deconvolution as textbook
 
 from device.recon.closed import GRADIENT, TIKHONOV, ClosedForm, Prior
 from device.recon.model import Model, wrapped
 from device.recon.prepare import Preparer
 from device.values import Image, Psf
+from tests import scenes
+from tests.textbook import deconvolution as textbook
 
 SIZES = st.sampled_from([7, 8, 13, 16, 31, 48])
 SEEDS = st.integers(0, 2**16)

@@ -1,4 +1,4 @@
-"""The formulas as a textbook writes them: float64, whole arrays, no plans. Slow, plain, and the judge of the fast ones."""
+"""The formulas as a textbook writes them: float64, whole arrays, no plans; slow, plain, the judge of the fast ones."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -4,12 +4,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tests import scenes
 
 from device.clock import Deadline, VirtualClock
 from device.recon.methods import METHODS
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor, Stage
+from tests import scenes
 
 SHAPE = (96, 128)
 QUICK, FULL = Recipe("gradient", 4), Recipe("gradient", 1)

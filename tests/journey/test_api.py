@@ -1,0 +1,368 @@
+"""The instrument over HTTP, in this process: what DESIGN.md fixes, and one shape for everything that is refused."""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from threading import Event
+from typing import Any
+
+import httpx
+import pytest
+from PIL import Image
+
+from device import errors
+from device.errors import DiffuscopeError
+from services.instrument.api import STATUS, refusal
+
+CHOSEN = {  # every leaf has a status that somebody chose
+    "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
+    "CameraMissing": 503, "CameraStalled": 503, "LightFault": 423, "LightLimit": 423,
+    "Busy": 409, "StoreFull": 507, "StoreDamaged": 500, "NotKept": 404,
+}  # fmt: skip
+OD = {"eye": "OD"}
+
+
+def leaves(kind: type[DiffuscopeError]) -> Iterator[type[DiffuscopeError]]:
+    below = kind.__subclasses__()
+    if not below:
+        yield kind
+    for child in below:
+        yield from leaves(child)
+
+
+def refused(answer: httpx.Response, status: int, code: str) -> dict[str, str]:
+    """The words of a refusal, after a look at its status, shape and code."""
+    assert answer.status_code == status, answer.text
+    words: dict[str, str] = answer.json()
+    assert set(words) == {"code", "message", "remedy"}
+    assert words["code"] == code
+    assert all(words.values())
+    return words
+
+
+def test_every_leaf_of_the_error_tree_has_its_status_and_its_words() -> None:
+    ours = [leaf for leaf in leaves(DiffuscopeError) if leaf.__module__ == errors.__name__]
+    assert {leaf.__name__ for leaf in ours} >= set(CHOSEN)
+    for leaf in ours:
+        answer = refusal(leaf("what happened"))
+        words = json.loads(bytes(answer.body))
+        assert words == {"code": leaf.code, "message": "what happened", "remedy": leaf.default_remedy}
+        assert answer.status_code == CHOSEN.get(leaf.__name__, answer.status_code)
+        assert 400 <= answer.status_code < 600
+    assert len({leaf.code for leaf in ours}) == len(ours)
+    assert DiffuscopeError in STATUS  # whatever is added has at least this one
+
+
+def test_a_press_answers_201_with_the_capture_and_links_that_work(rig: Any) -> None:
+    async def story(client: httpx.AsyncClient) -> None:
+        answer = await client.post("/api/captures", json=OD)
+        assert answer.status_code == 201
+        made = answer.json()
+        assert made["eye"] == "OD"
+        assert made["simulated"] is True
+        assert (await client.get(f"/api/captures/{made['id']}")).json() == made
+        media = {"picture": "image/png", "raw": "image/tiff", "quick": "image/jpeg", "report": "application/json"}
+        assert set(made["links"]) == set(media)
+        for name, link in made["links"].items():
+            file = await client.get(link)
+            assert file.status_code == 200
+            assert file.headers["content-type"] == media[name]
+            assert file.content == rig.store.read(made["id"], link.rsplit("/", 1)[1])
+        assert (await client.get(made["links"]["report"])).json() == made["report"] | {"simulated": True}
+
+    rig.ask(story)
+
+
+def test_a_second_press_while_busy_is_409_with_a_remedy(rig: Any) -> None:
+    async def story(client: httpx.AsyncClient) -> None:
+        rig.hang()
+        first = asyncio.create_task(client.post("/api/captures", json=OD))
+        await asyncio.to_thread(rig.wait_for_hanging)
+        assert (await client.get("/api/status")).json()["state"] == "busy"
+        words = refused(await client.post("/api/captures", json={"eye": "OS"}), 409, "busy")
+        assert "Wait" in words["remedy"]
+        rig.clock.gate.set()
+        assert (await first).status_code == 201
+        assert len((await client.get("/api/captures")).json()["captures"]) == 1
+
+    rig.ask(story)
+
+
+def test_a_request_that_the_network_doubles_makes_one_picture(rig: Any) -> None:
+    async def story(client: httpx.AsyncClient) -> None:
+        press = OD | {"key": "0123456789abcdef"}
+        rig.hang()
+        first = asyncio.create_task(client.post("/api/captures", json=press))
+        await asyncio.to_thread(rig.wait_for_hanging)
+        second = asyncio.create_task(client.post("/api/captures", json=press))
+        await asyncio.sleep(0.05)
+        rig.clock.gate.set()
+        answers = [await first, await second, await client.post("/api/captures", json=press)]
+        assert [answer.status_code for answer in answers] == [201] * 3
+        assert len({answer.json()["id"] for answer in answers}) == 1
+        assert len((await client.get("/api/captures")).json()["captures"]) == 1
+
+    rig.ask(story)
+
+
+@pytest.mark.parametrize(("fault", "status"), [("camera.missing", 503), ("camera.stalled", 503), ("light.fault", 423)])
+def test_a_broken_part_is_answered_with_its_own_words(rig: Any, fault: str, status: int) -> None:
+    rig.world.faults.add(fault)
+    refused(rig.request("POST", "/api/captures", json=OD), status, fault)
+    assert rig.world.glow is None
+
+
+def test_a_full_shelf_is_507_and_nothing_is_listed(make_rig: Any) -> None:
+    rig = make_rig(store={"free_bytes": lambda _: 0})
+    words = refused(rig.request("POST", "/api/captures", json=OD), 507, "store.full")
+    assert "Nothing that was kept is lost" in words["remedy"]
+    assert rig.request("GET", "/api/captures").json() == {"captures": []}
+
+
+def test_the_list_is_newest_first_and_can_be_read_in_parts(rig: Any) -> None:
+    ids = [rig.exam.press("OD").result(30).id for _ in range(3)][::-1]
+
+    async def story(client: httpx.AsyncClient) -> None:
+        async def listed(query: str) -> list[str]:
+            answer = await client.get(f"/api/captures{query}")
+            assert answer.status_code == 200
+            return [capture["id"] for capture in answer.json()["captures"]]
+
+        assert await listed("") == ids
+        assert await listed("?limit=2") == ids[:2]
+        assert await listed(f"?limit=2&before={ids[1]}") == ids[2:]
+        assert await listed(f"?before={ids[2]}") == []
+        refused(await client.get("/api/captures?limit=0"), 422, "input")
+        refused(await client.get("/api/captures?limit=501"), 422, "input")
+        refused(await client.get("/api/captures?before=nobody"), 404, "store.unknown")
+
+    rig.ask(story)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/api/captures/nobody", "/api/captures/nobody/picture.png", "/api/captures/..%2f..%2fetc", "/api/captures/%00"],
+)
+def test_what_was_never_kept_is_404(rig: Any, path: str) -> None:
+    answer = rig.request("GET", path)
+    assert answer.status_code == 404
+    assert set(answer.json()) == {"code", "message", "remedy"}
+
+
+def test_a_file_that_no_capture_has_is_404_and_a_strange_name_422(rig: Any) -> None:
+    kept = rig.exam.press("OD").result(30)
+    refused(rig.request("GET", f"/api/captures/{kept.id}/other.png"), 404, "store.unknown")
+    for name in ("shelf.sqlite", "..%5c..%5cpasswd", "RAW.TIFF", "raw.tiff.bak"):
+        refused(rig.request("GET", f"/api/captures/{kept.id}/{name}"), 422, "input")
+
+
+def test_a_damaged_file_is_said_and_its_neighbours_still_come(rig: Any) -> None:
+    kept = rig.exam.press("OD").result(30)
+    (rig.store.folder / "captures" / kept.id / "picture.png").write_bytes(b"not what was kept")
+    refused(rig.request("GET", f"/api/captures/{kept.id}/picture.png"), 500, "store.damaged")
+    assert rig.request("GET", f"/api/captures/{kept.id}/raw.tiff").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "body", [{}, {"eye": "left"}, {"eye": None}, {"eye": "OD", "lamp": 1}, {"eye": "OD", "key": "short"}, [], "OD"]
+)
+def test_a_press_that_no_button_sends_is_422_with_the_place_of_the_mistake(rig: Any, body: Any) -> None:
+    words = refused(rig.request("POST", "/api/captures", json=body), 422, "input")
+    assert words["message"].startswith("body")
+    assert rig.store.captures() == []
+
+
+def test_a_wrong_eye_is_told_which_eyes_there_are(rig: Any) -> None:
+    words = refused(rig.request("POST", "/api/captures", json={"eye": "left"}), 422, "input")
+    assert "body.eye" in words["message"]
+    assert "OD" in words["message"]
+    assert "OS" in words["message"]
+    refused(rig.request("POST", "/api/captures", content=b"{not json"), 422, "input")
+
+
+def test_a_body_too_large_or_of_unknown_length_is_refused_before_it_is_read(rig: Any) -> None:
+    words = refused(rig.request("POST", "/api/captures", content=b" " * 20_000 + b'{"eye": "OD"}'), 422, "input")
+    assert "too large" in words["message"]
+
+    async def drip() -> Any:
+        yield b'{"eye": '
+        raise AssertionError("nobody should read this")
+
+    refused(rig.request("POST", "/api/captures", content=drip()), 422, "input")
+    refused(rig.request("POST", "/api/captures", content=b"{}", headers={"Content-Length": "-1"}), 422, "input")
+    assert rig.store.captures() == []
+
+
+UNKNOWN = [("GET", "/nowhere", 404), ("GET", "/api/nowhere", 404), ("GET", "/web/nowhere.js", 404),
+           ("GET", "/web/../services/cli.py", 404), ("DELETE", "/api/captures", 405), ("POST", "/", 405)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("method", "path", "status"), UNKNOWN)
+def test_an_address_that_does_not_exist_is_refused_in_the_same_shape(
+    rig: Any, method: str, path: str, status: int
+) -> None:
+    answer = rig.request(method, path)
+    refused(answer, status, f"http.{status}")
+    assert ("allow" in answer.headers) == (status == 405)
+
+
+def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> None:
+    kept = rig.exam.press("OD").result(30)
+
+    def broken(_: Any) -> None:
+        raise ZeroDivisionError
+
+    rig.app.get("/api/broken")(broken)  # a mistake in a page of our own
+    quiet = {"raise_app_exceptions": False}
+    answers = {
+        "page": rig.request("GET", "/"),
+        "script": rig.request("GET", "/web/app.js"),
+        "json": rig.request("GET", "/api/status"),
+        "file": rig.request("GET", f"/api/captures/{kept.id}/picture.png"),
+        "preview": rig.request("GET", "/api/preview"),
+        "unknown": rig.request("GET", "/nowhere"),
+        "not kept": rig.request("GET", "/api/captures/nobody"),
+        "wrong": rig.request("POST", "/api/captures", json={}),
+        "too large": rig.request("POST", "/api/captures", content=b" " * 20_000),
+        "unforeseen": rig.ask(lambda client: client.get("/api/broken?_=1"), **quiet),
+    }
+    assert {name: answer.status_code for name, answer in answers.items()} == {
+        "page": 200, "script": 200, "json": 200, "file": 200, "preview": 200, "unknown": 404, "not kept": 404,
+        "wrong": 422, "too large": 422, "unforeseen": 500,
+    }  # fmt: skip
+    for name, answer in answers.items():
+        assert "default-src 'none'" in answer.headers["content-security-policy"], name
+        assert answer.headers["x-content-type-options"] == "nosniff", name
+        assert answer.headers["referrer-policy"] == "no-referrer", name
+        api = name not in ("page", "script", "unknown")
+        assert answer.headers["cache-control"] == ("no-store" if api else "no-cache"), name
+    refused(answers["unforeseen"], 500, "fault")
+
+
+def test_the_page_and_its_scripts_are_served(rig: Any) -> None:
+    page = rig.request("GET", "/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "<script" in page.text
+    assert "javascript" in rig.request("GET", "/web/app.js").headers["content-type"]
+
+
+def test_status_and_health_say_what_it_is_and_whether_it_works(rig: Any, wait_until: Callable[..., None]) -> None:
+    status = rig.request("GET", "/api/status").json()
+    assert status["kind"] == "simulated"
+    assert status["state"] == "aim"
+    assert status["shape"] == [270, 480]
+    assert status["problem"] is None
+    assert status["field_px"] == pytest.approx(33.4 * 3.8956, rel=0.01)
+    assert rig.request("GET", "/api/health").json()["ok"] is True
+    rig.world.faults.add("camera.missing")
+    rig.exam.preview(0, wait_s=0.0)
+    wait_until(lambda: rig.exam.problem is not None)
+    assert rig.request("GET", "/api/status").json()["problem"]["code"] == "camera.missing"
+    assert rig.request("GET", "/api/health").json()["ok"] is False
+    rig.world.faults.clear()
+    assert rig.request("POST", "/api/captures", json=OD).status_code == 201
+    assert rig.request("GET", "/api/health").json()["ok"] is True
+
+
+def test_openapi_describes_what_is_served(rig: Any) -> None:
+    book = rig.request("GET", "/api/openapi.json").json()
+    assert book["openapi"].startswith("3.")
+    fixed = {
+        "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
+        "/api/events": {"get"}, "/api/preview": {"get"}, "/api/health": {"get"}, "/api/status": {"get"},
+    }  # fmt: skip
+    assert {path: set(verbs) for path, verbs in book["paths"].items()} == fixed
+    press = book["paths"]["/api/captures"]["post"]["responses"]
+    assert "201" in press
+    assert press["4XX"]["content"]["application/json"]["schema"]["$ref"].endswith("/Refusal")
+    assert set(book["components"]["schemas"]["Refusal"]["properties"]) == {"code", "message", "remedy"}
+    assert "HTTPValidationError" not in book["components"]["schemas"]  # a shape that is never answered
+
+
+# Live
+
+
+def test_previews_come_with_rising_numbers_and_their_age(rig: Any) -> None:
+    async def story(client: httpx.AsyncClient) -> None:
+        number = 0
+        for _ in range(3):
+            answer = await client.get(f"/api/preview?after={number}")
+            assert answer.status_code == 200
+            assert int(answer.headers["x-frame"]) > number
+            assert int(answer.headers["x-age-ms"]) >= 0
+            number = int(answer.headers["x-frame"])
+            with Image.open(BytesIO(answer.content)) as picture:
+                assert picture.format == "JPEG"
+        refused(await client.get("/api/preview?after=-1"), 422, "input")
+
+    rig.ask(story)
+
+
+def test_a_preview_that_does_not_come_is_204_after_two_seconds(rig: Any) -> None:
+    rig.hang()
+    before = time.monotonic()
+    answer = rig.request("GET", "/api/preview?after=0")
+    assert answer.status_code == 204
+    assert answer.content == b""
+    assert 1.9 < time.monotonic() - before < 6
+
+
+def test_a_press_is_told_in_order_and_its_links_lead_to_it(rig: Any, read_events: Any) -> None:
+    def enough(heard: list[Any]) -> bool:
+        return bool(heard[-1][1:] == ("state", {"state": "aim"}))
+
+    heard = read_events(rig.app, enough, begin=lambda: rig.exam.press("OS"))
+    assert heard[0][:2] == (None, "beat")
+    news = [event for event in heard if event[1] != "beat"]
+    told = [(kind, data.get("state") or data.get("stage")) for _, kind, data in news]
+    assert told == [
+        ("state", "busy"), ("stage", "expose"), ("stage", "quick"), ("stage", "keep"), ("kept", None), ("state", "aim"),
+    ]  # fmt: skip
+    numbers = [number for number, _, _ in news]
+    assert numbers == list(range(numbers[0], numbers[0] + 6))
+    fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
+    assert fractions == sorted(fractions)
+    kept = news[4][2]
+    assert kept == rig.request("GET", f"/api/captures/{kept['id']}").json()
+    assert {data["id"] for _, kind, data in news if kind == "stage"} == {kept["id"]}
+    assert rig.request("GET", news[2][2]["url"]).status_code == 200
+
+
+def test_a_page_that_was_away_hears_what_it_missed_and_nothing_twice(rig: Any, read_events: Any) -> None:
+    kept = rig.exam.press("OD").result(30)
+    news = read_events(rig.app, lambda heard: len(heard) == 7, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6]
+    assert news[4][2]["id"] == kept.id
+    later = read_events(rig.app, lambda heard: len(heard) == 3, {"Last-Event-ID": "4"})[1:]
+    assert [number for number, _, _ in later] == [5, 6]
+    fresh = read_events(rig.app, lambda heard: len(heard) == 1)
+    assert fresh[0][1:] == ("beat", {"number": 6})
+    refused(rig.request("GET", "/api/events", headers={"Last-Event-ID": "yesterday"}), 422, "input")
+
+
+def test_a_page_that_remembers_more_than_was_told_was_here_before_a_restart(rig: Any, read_events: Any) -> None:
+    rig.exam.press("OD").result(30)
+    news = read_events(rig.app, lambda heard: len(heard) == 7, {"Last-Event-ID": "500"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_capture_that_was_damaged_does_not_stop_the_news_after_it(rig: Any, read_events: Any) -> None:
+    kept = rig.exam.press("OD").result(30)
+    (rig.store.folder / "captures" / kept.id).rename(rig.store.folder / "gone")
+    news = read_events(rig.app, lambda heard: heard[-1][0] == 6, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 6]
+
+
+def test_the_heart_beats_every_second_while_nothing_happens(rig: Any, read_events: Any) -> None:
+    before = time.monotonic()
+    heard = read_events(rig.app, lambda heard: len(heard) == 3)
+    assert [(number, kind) for number, kind, _ in heard] == [(None, "beat")] * 3
+    assert 1.9 < time.monotonic() - before < 6
+
+
+def test_a_stream_ends_when_the_bulletin_closes(rig: Any, read_events: Any) -> None:
+    never = Event()
+    heard = read_events(rig.app, lambda _: never.is_set(), begin=rig.bulletin.close)
+    assert [kind for _, kind, _ in heard] == ["beat"]
