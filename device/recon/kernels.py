@@ -22,11 +22,11 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 
 @_jit
 def linearise(
-    counts: Pixels, dark: Pixels, gain: Image, white: float, first: tuple[int, int], n: int, out: Image, good: Image
+    counts: Pixels, dark: Pixels, gain: Image, white_dn: float, first: tuple[int, int], n: int, out: Image, good: Image
 ) -> tuple[int, int]:
     """Counts to linear DN from pixel `first` on, n x n to one: out = mean of (counts - dark) * gain over good pixels.
 
-    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white`.
+    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
     `good` becomes the good share of each block, 0 to 1; a block without a good pixel becomes 0. Returns the numbers of
     saturated and of good pixels.
     """
@@ -41,20 +41,20 @@ def linearise(
         for a in range(first[0] + i * n, first[0] + i * n + n):
             begin, end = first[1], first[1] + wide
             saturated += _add_row(
-                counts[a][begin:end], dark[a][begin:end], gain[a][begin:end], np.float32(white), total, used
+                counts[a][begin:end], dark[a][begin:end], gain[a][begin:end], np.float32(white_dn), total, used
             )
         believed += _bin_row(total, used, n, out[i], good[i])
     return int(saturated), int(believed)
 
 
 @_jit
-def _add_row(counts: Pixels, dark: Pixels, gain: Image, white: Single, total: Image, used: Image) -> Single:
+def _add_row(counts: Pixels, dark: Pixels, gain: Image, white_dn: Single, total: Image, used: Image) -> Single:
     zero, one, lowest = np.float32(0), np.float32(1), np.float32(-3e38)
     saturated = zero
     for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
         value = np.float32(counts[b])
-        ok = (value < white) & (value > lowest) & (gain[b] > zero)
-        saturated += one if value >= white else zero
+        ok = (value < white_dn) & (value > lowest) & (gain[b] > zero)
+        saturated += one if value >= white_dn else zero
         total[b] += (value - np.float32(dark[b])) * gain[b] if ok else zero
         used[b] += one if ok else zero
     return saturated

@@ -36,8 +36,8 @@ class Solver(Protocol):
 class Method:
     """A way from a frame to a picture: its name, one sentence, its cost in real FFT pairs, and how it is built.
 
-    `start_pairs` are those of the first picture, `round_pairs` those of each of `rounds` further rounds; `images` counts
-    the float32 arrays of the grid that it holds.
+    `start_pairs` are those of the first picture, `round_pairs` those of each of `rounds` further rounds; `images`
+    counts the float32 arrays of the grid that it holds.
     """
 
     name: str

@@ -1,8 +1,10 @@
-"""How much a sample may be off: shot, read and quantisation noise from the calibration, or from where the OTF is empty."""
+"""How much a sample may be off: shot, read and quantisation noise, calibrated or seen where the OTF is empty."""
 
 from dataclasses import dataclass
 
 from device.values import Sensor
+
+LEAST_DN2 = 1e-12  # a black frame has no noise to measure, and is still divided by
 
 
 @dataclass(frozen=True)
@@ -28,4 +30,4 @@ class Noise:
             read_dn = (sensor.read_noise_e or 0.0) / sensor.gain_e_per_dn
             return cls(1 / sensor.gain_e_per_dn / pixels, (read_dn**2 + 1 / 12) / pixels)
         shot = 0.8 * measured_dn2 if mean_dn > 0 else 0.0
-        return cls(shot / mean_dn if mean_dn > 0 else 0.0, measured_dn2 - shot)
+        return cls(shot / mean_dn if mean_dn > 0 else 0.0, max(measured_dn2 - shot, LEAST_DN2))

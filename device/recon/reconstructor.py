@@ -49,7 +49,7 @@ def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> 
 
 
 class Cost:
-    """What something took lately, and so may take again: the worst of its last runs, because the slowest press counts."""
+    """What something took lately, and so may take again: the worst of its last runs; the slowest press counts."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=12)

@@ -48,7 +48,7 @@ class Shading:
         return np.asarray(np.linalg.solve(normal + np.diag(ridge * np.diag(normal)), seen * weights), np.float32)
 
     def fit(self, y: Image, out: Image) -> tuple[float, float]:
-        """Write the smooth picture into `out` (the grid); return the mean level in the field and the stray light, in DN."""
+        """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN."""
         coefficients = self._fit @ _blocks(y).ravel()
         top, bottom, left, right = self.box
         out[:] = 0
@@ -74,7 +74,9 @@ def _modes(model: Model) -> "list[Image]":
     u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
     return [
-        (model.mask * _radial(n, abs(m), radius) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))).astype(np.float32)
+        (model.mask * _radial(n, abs(m), radius) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))).astype(
+            np.float32
+        )
         for n in range(DEGREE + 1)
         for m in range(-n, n + 1, 2)
     ]
@@ -84,5 +86,10 @@ def _radial(n: int, m: int, radius: NDArray[np.float64]) -> NDArray[np.float64]:
     total = np.zeros_like(radius)
     for k in range((n - m) // 2 + 1):
         sign, top = (-1) ** k, factorial(n - k)
-        total += sign * top / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k)) * radius ** (n - 2 * k)
+        total += (
+            sign
+            * top
+            / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k))
+            * radius ** (n - 2 * k)
+        )
     return total

@@ -68,7 +68,7 @@ def weigh(
     blurred: Image, y: Image, good: Image, per_dn: float, floor: float, stiffness: float,
     at: tuple[int, int], weighted: Image, inverse: Image,
 ) -> None:  # fmt: skip
-    """W y and 1/(W + r) on the grid, W = good / (noise variance of Hx) inside the window that begins at `at`, else 0."""
+    """W y and 1/(W + r) on the grid; W = good / (noise variance of Hx) in the window that begins at `at`, else 0."""
     p, f, r, zero = np.float32(per_dn), np.float32(floor), np.float32(stiffness), np.float32(0)
     weighted[:], inverse[:] = zero, np.float32(1) / r
     rows, cols = y.shape
@@ -113,9 +113,7 @@ def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> 
 
 
 @_jit
-def ring_levels(
-    seen: Series, power: Series, ring: NDArray[np.int64], noise: float, turns: int, levels: Series
-) -> None:
+def ring_levels(seen: Series, power: Series, ring: NDArray[np.int64], noise: float, turns: int, levels: Series) -> None:
     """The level g of each ring under which seen = power g + noise is most likely, by reweighted least squares."""
     above, below = np.zeros(levels.size), np.zeros(levels.size)
     for turn in range(turns + 1):
@@ -151,3 +149,21 @@ def most_likely_power_law(
         k += min(max((haa * gk - hak * ga) / det, -0.7), 0.7)
         k = min(max(k, 0.5), 4.0)  # pictures lie between 1.5 and 3
     return a, k
+
+
+@_jit
+def chi(blurred: Image, y: Image, good: Image, per_dn: float, floor: float, at: tuple[int, int]) -> float:
+    """The rms misfit of y in units of its own noise: 1 where the picture explains all but the noise."""
+    p, f, zero = np.float32(per_dn), np.float32(floor), np.float32(0)
+    total = weight = np.float64(0)
+    rows, cols = y.shape
+    for i in range(rows):
+        row_total = row_weight = zero
+        for j in range(cols):
+            b = blurred[at[0] + i, at[1] + j]
+            e = y[i, j] - b
+            row_total += good[i, j] * e * e / (p * max(b, zero) + f)
+            row_weight += good[i, j]
+        total += row_total
+        weight += row_weight
+    return np.sqrt(total / weight) if weight > 0 else np.float64(0)

@@ -42,9 +42,7 @@ def to_sensor(picture: Image, grid: Grid) -> Image:
         out[top:bottom, left:right] = picture[top + down : bottom + down, left + across : right + across]
         return out
     first, weights = cubic_weights(grid.n)
-    kernels.stretch(
-        np.ascontiguousarray(picture), first, weights, grid.offset_px, (top, bottom, left, right), out
-    )
+    kernels.stretch(np.ascontiguousarray(picture), first, weights, grid.offset_px, (top, bottom, left, right), out)
     return out
 
 

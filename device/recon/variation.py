@@ -4,8 +4,8 @@
 
 W is one over the noise variance of each sample, 0 where the sensor saw nothing; tau is the rms, in the dual of D, of
 the noise that the evidence-prior Wiener filter would reject, so neither is chosen by eye. ADMM with three splits
-(Antipa et al. 2018 for the crop; here weighted): v = h * x, z = D x, w = x; two real FFT pairs a round. Its start is the
-shading fit plus the Wiener solution of what that leaves, so eight rounds do what a hundred do from zero.
+(Antipa et al. 2018 for the crop; here weighted): v = h * x, z = D x, w = x; two real FFT pairs a round. Its start is
+the shading fit plus the Wiener solution of what that leaves, so eight rounds do what a hundred do from zero.
 """
 
 from typing import Any
@@ -104,6 +104,7 @@ class Variation(EvidenceWiener):
         )
         self._dual = self._dual_norms()
         self.tau = self.rho = self.stiffness = 0.0
+        self._y = self._good = np.zeros(model.grid.window, np.float32)
 
     def _dual_norms(self) -> Image:
         """|H|^2 / |D|^2 per frequency, averaged over the full plane: how loud the data's noise is to the prior."""
@@ -126,10 +127,19 @@ class Variation(EvidenceWiener):
         self.rho = RHO * self.tau / max(abs(self.level), 1e-12)
         self.stiffness = STIFF * typical
         self._blur()
-        y = frame.y - np.float32(self.stray)
+        y = self._y = frame.y - np.float32(self.stray)
+        self._good = frame.good
         noise = self.noise
         sweeps.weigh(
-            self.blurred, y, frame.good, noise.per_dn, noise.floor_dn2, self.stiffness, grid.at, self._weighted, self._inverse
+            self.blurred,
+            y,
+            frame.good,
+            noise.per_dn,
+            noise.floor_dn2,
+            self.stiffness,
+            grid.at,
+            self._weighted,
+            self._inverse,
         )
         for multiplier in (self._ux, self._uy, self._uw, self._a):
             multiplier[:] = 0
@@ -150,3 +160,11 @@ class Variation(EvidenceWiener):
         )  # fmt: skip
         self.x[:] = image.inverse()
         self.blurred[:] = data.inverse()
+
+    def finish(self, out: Image) -> None:
+        """Hand the picture over, and say how well it explains the frame."""
+        super().finish(out)
+        noise = self.noise
+        self.facts["residual"] = sweeps.chi(
+            self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, self.model.grid.at
+        )
