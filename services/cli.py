@@ -11,6 +11,7 @@ import typer
 
 from device.errors import DiffuscopeError
 from device.head import recording
+from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
 from services.instrument.once import Order, reconstruct_file, written
@@ -105,9 +106,9 @@ def methods(
     """List the solvers with their cost in FFT pairs and their memory for a frame size."""
     typer.echo(f"{'method':<12} {'FFT pairs':>9} {'memory':>8}   for {rows} x {cols}")
     for method in METHODS.values():
-        memory = f"{method.memory_bytes((rows, cols)) / 1e6:.0f} MB"
+        memory = f"{method.memory_bytes(Grid.periodic((rows, cols), 1, float('inf'))) / 1e6:.0f} MB"
         mark = " (default)" if method.name == DEFAULT else ""
-        typer.echo(f"{method.name:<12} {method.fft_pairs:>9g} {memory:>8}   {method.sentence}{mark}")
+        typer.echo(f"{method.name:<12} {method.fft_pairs:>9} {memory:>8}   {method.sentence}{mark}")
 
 
 def main(words: list[str] | None = None) -> None:

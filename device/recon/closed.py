@@ -39,42 +39,55 @@ GRADIENT = Prior(slope=1.0, floor=0.02, psf_error=0.1, subtract_flat=True)
 
 
 class ClosedForm:
-    """One planned closed-form solver; `solve` allocates nothing that grows with the image."""
+    """One planned closed-form solver; `start` does it all, and allocates nothing that grows with the image."""
+
+    rounds = 1
 
     def __init__(self, model: Model, prior: Prior, mu: float | None = None) -> None:
         if mu is not None and not 0 < mu < float("inf"):
             raise SettingError(f"a weight mu of {mu} is not a positive number", "Leave mu out: the frame chooses it.")
         self.model, self.prior, self.mu = model, prior, mu
+        self.x: Image = np.zeros(model.grid.shape, np.float32)
+        self.facts: dict[str, Any] = {}
         self.sample = Sample.of(model)
-        self.delta = prior.psf_error * self.sample.passband_power(model.bin)
+        self.delta = prior.psf_error * self.sample.passband_power(model.grid.n)
         self._weights = prior.slope * self.sample.gradient + prior.floor
 
-    def solve(self, frame: Linear, out: Image) -> dict[str, Any]:
-        """Write the picture (rows, cols) of the grid into `out`; return what was chosen and the number that decided.
+    def start(self, frame: Linear) -> None:
+        """Solve: `x` is the picture on the grid, `facts` what was chosen and the number that decided.
 
-        Keys: `mu` (relative to |H|^2), `gcv`, `flat_dn`, `background_dn`, `noise_dn`, `residual` (rms over noise).
+        Facts: `mu` (relative to |H|^2), `gcv`, `flat_dn`, `background_dn`, `noise_dn`, `residual` (rms over noise).
         """
-        model, prior = self.model, self.prior
-        level = background = 0.0
-        if prior.subtract_flat:
-            level, background = flat_fit(kernels.dots(frame.y, model.flat, frame.good))
-        if model.window is not None:
-            np.multiply(frame.good, model.window, out=frame.good)
-        kernels.residual(frame.y, model.flat, frame.good, level, background, model.fft.space)
+        model, prior, size = self.model, self.prior, self.model.grid.size
+        sums = kernels.dots(frame.y, model.flat, frame.good)
+        level, background = flat_fit(sums) if prior.subtract_flat else (0.0, 0.0)
+        if model.fade is not None:
+            np.multiply(frame.good, model.fade, out=frame.good)
+        model.fft.space[:] = 0
+        kernels.residual(frame.y, model.flat, frame.good, level, background, model.grid.at, model.fft.space)
         spectrum = model.fft.forward()
         energies = self.sample.energies(spectrum)
-        noise = self.sample.noise_variance(energies, model.size) ** 0.5
+        share = model.grid.window[0] * model.grid.window[1] / size
+        noise = (self.sample.noise_variance(energies, size) / share) ** 0.5
         mu, score = self._weight_of_the_prior(energies)
-        misfit = self.sample.misfit(mu * self._weights + self.delta, energies, model.size)
+        misfit = self.sample.misfit(mu * self._weights + self.delta, energies, size)
         slope = np.float32(mu * prior.slope)
-        floor = mu * prior.floor + self.delta
         rows, cols = model.row_gradient * slope, model.col_gradient * slope
-        kernels.wiener(spectrum, model.otf, rows, cols, floor, 1 / model.size)
-        kernels.add_flat(model.fft.inverse(), model.mask, level, model.box, out)
-        return {
+        kernels.wiener(spectrum, model.otf, rows, cols, mu * prior.floor + self.delta, 1 / size)
+        kernels.add_flat(model.fft.inverse(), model.mask, level, model.box, self.x)
+        self.facts = {
             "mu": mu, "gcv": score, "psf_error": prior.psf_error, "flat_dn": level, "background_dn": background,
-            "noise_dn": noise, "residual": misfit / noise if noise > 0 else 0.0,
+            "noise_dn": noise, "mean_dn": sums[1] / sums[4] if sums[4] > 0 else 0.0,
+            "residual": misfit / (noise * share**0.5) if noise > 0 else 0.0,
         }  # fmt: skip
+
+    def step(self) -> None:
+        """Nothing more to do: it is a closed form."""
+
+    def finish(self, out: Image) -> None:
+        """Hand the picture over."""
+        top, bottom, left, right = self.model.box
+        out[top:bottom, left:right] = self.x[top:bottom, left:right]
 
     def _weight_of_the_prior(self, energies: Energies) -> tuple[float, float | None]:
         if self.mu is not None:

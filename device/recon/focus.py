@@ -5,7 +5,7 @@ import numpy as np
 from device.recon import kernels
 from device.recon.choose import LADDER, Energies, Sample, flat_fit
 from device.recon.kernels import Pixels
-from device.recon.model import Model, taper
+from device.recon.model import periodic_model, taper
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
 from device.values import Calibration
@@ -28,13 +28,13 @@ def sharpest(calibration: Calibration, counts: Pixels, planner: Planner) -> tupl
     if len(calibration.psfs) == 1:
         return 0, []
     n = 2 if min(shape) >= 600 else 1
-    window = taper((shape[0] // n, shape[1] // n))
     scores = []
     for index in range(len(calibration.psfs)):
-        model = Model(calibration, shape, n, planner, index)
-        linear = Preparer(calibration, shape, n)(frame)
+        model = periodic_model(calibration, shape, n, planner, index)
+        linear = Preparer(calibration, model.grid)(frame)
         level, background = flat_fit(kernels.dots(linear.y, model.flat, linear.good))
-        kernels.residual(linear.y, model.flat, linear.good * window, level, background, model.fft.space)
+        seen = linear.good * taper(model.grid.window)
+        kernels.residual(linear.y, model.flat, seen, level, background, model.grid.at, model.fft.space)
         sample = Sample.of(model)
         scores.append(evidence(sample, sample.energies(model.fft.forward())))
     return int(np.argmin(scores)), scores

@@ -22,11 +22,11 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 
 @_jit
 def linearise(
-    counts: Pixels, dark: Pixels, gain: Image, white: float, n: int, out: Image, good: Image
+    counts: Pixels, dark: Pixels, gain: Image, white_dn: float, first: tuple[int, int], n: int, out: Image, good: Image
 ) -> tuple[int, int]:
-    """Counts to linear DN, n x n pixels to one: out = mean of (counts - dark) * gain over the good pixels.
+    """Counts to linear DN from pixel `first` on, n x n to one: out = mean of (counts - dark) * gain over good pixels.
 
-    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white`.
+    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
     `good` becomes the good share of each block, 0 to 1; a block without a good pixel becomes 0. Returns the numbers of
     saturated and of good pixels.
     """
@@ -38,20 +38,23 @@ def linearise(
         if n == 1:
             total, used = out[i], good[i]
         total[:], used[:] = 0, 0
-        for a in range(i * n, i * n + n):
-            saturated += _add_row(counts[a], dark[a], gain[a], np.float32(white), total, used)
+        for a in range(first[0] + i * n, first[0] + i * n + n):
+            begin, end = first[1], first[1] + wide
+            saturated += _add_row(
+                counts[a][begin:end], dark[a][begin:end], gain[a][begin:end], np.float32(white_dn), total, used
+            )
         believed += _bin_row(total, used, n, out[i], good[i])
     return int(saturated), int(believed)
 
 
 @_jit
-def _add_row(counts: Pixels, dark: Pixels, gain: Image, white: Single, total: Image, used: Image) -> Single:
+def _add_row(counts: Pixels, dark: Pixels, gain: Image, white_dn: Single, total: Image, used: Image) -> Single:
     zero, one, lowest = np.float32(0), np.float32(1), np.float32(-3e38)
     saturated = zero
     for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
         value = np.float32(counts[b])
-        ok = (value < white) & (value > lowest) & (gain[b] > zero)
-        saturated += one if value >= white else zero
+        ok = (value < white_dn) & (value > lowest) & (gain[b] > zero)
+        saturated += one if value >= white_dn else zero
         total[b] += (value - np.float32(dark[b])) * gain[b] if ok else zero
         used[b] += one if ok else zero
     return saturated
@@ -100,13 +103,13 @@ def dots(y: Image, flat: Image, good: Image) -> Sums:
 
 
 @_jit
-def residual(y: Image, flat: Image, good: Image, a: float, b: float, out: Image) -> None:
-    """out = (y - a flat - b) * good: what the flat model leaves, with silence where nothing was seen."""
+def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[int, int], out: Image) -> None:
+    """out = (y - a flat - b) * good from sample `at` on: what the flat model leaves, silent where nothing was seen."""
     a32, b32 = np.float32(a), np.float32(b)
     rows, cols = y.shape
     for i in range(rows):
         for j in range(cols):
-            out[i, j] = (y[i, j] - a32 * flat[i, j] - b32) * good[i, j]
+            out[at[0] + i, at[1] + j] = (y[i, j] - a32 * flat[i, j] - b32) * good[i, j]
 
 
 @_jit
@@ -151,25 +154,34 @@ def cross_validation(
 
 
 @_jit
-def stretch(image: Image, first: NDArray[np.int64], weights: Image, box: Box, out: Image) -> None:
-    """Fill `box` (top, bottom, left, right) of `out` from four by four of `image`; pixel j lies in block j // n."""
+def stretch(
+    image: Image, first: NDArray[np.int64], weights: Image, offset: tuple[int, int], box: Box, out: Image
+) -> None:
+    """Fill `box` (top, bottom, left, right) of `out` from four by four of `image`.
+
+    Pixel (i, j) lies in block ((i + offset[0]) // n, (j + offset[1]) // n) of the image.
+    """
     n = first.size
     rows, cols = image.shape
     top, bottom, left, right = box
-    low, high = max(left // n - 2, 0), min((right - 1) // n + 3, cols)  # the columns that the box needs
-    tall = np.empty(cols + 4, np.float32)  # one stretched row, its ends repeated twice on either side
+    begin, end = left + offset[1], right + offset[1]
+    low, high = max(begin // n - 2, 0), min((end - 1) // n + 3, cols)  # the columns that the box needs
+    tall = np.zeros(cols + 4, np.float32)  # one stretched row, its ends repeated twice on either side
     for i in range(top, bottom):
-        k = i // n + first[i % n]
+        p = (i + offset[0]) % n
+        k = (i + offset[0]) // n + first[p]
         a, b = image[min(max(k, 0), rows - 1)], image[min(max(k + 1, 0), rows - 1)]
         c, d = image[min(max(k + 2, 0), rows - 1)], image[min(max(k + 3, 0), rows - 1)]
-        wa, wb, wc, wd = weights[i % n]
+        wa, wb, wc, wd = weights[p]
         for j in range(low, high):
             tall[j + 2] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
         tall[:2], tall[cols + 2 :] = tall[2], tall[cols + 1]
         line = out[i]
-        for p in range(n):
-            va, vb, vc, vd = weights[p]
-            shift = first[p] + 2
-            for k in range((left - p + n - 1) // n, (right - p + n - 1) // n):
-                m = min(k + shift, cols)
-                line[k * n + p] = va * tall[m] + vb * tall[m + 1] + vc * tall[m + 2] + vd * tall[min(m + 3, cols + 3)]
+        for q in range(n):
+            va, vb, vc, vd = weights[q]
+            shift = first[q] + 2
+            for k in range((begin - q + n - 1) // n, (end - q + n - 1) // n):
+                m = min(max(k + shift, 0), cols)
+                line[k * n + q - offset[1]] = (
+                    va * tall[m] + vb * tall[m + 1] + vc * tall[m + 2] + vd * tall[min(m + 3, cols + 3)]
+                )

@@ -6,6 +6,7 @@ import numpy as np
 
 from device.errors import FrameError
 from device.recon import kernels
+from device.recon.geometry import Grid
 from device.recon.kernels import Pixels
 from device.values import Calibration, Image
 
@@ -14,7 +15,7 @@ MOST_BAD = 0.3  # share of pixels that may be missing (optics.md 5.4: at 30 % a 
 
 @dataclass(frozen=True)
 class Linear:
-    """A frame in linear DN above dark, (rows, cols), and the good share of each pixel, 0 to 1."""
+    """A frame in linear DN above dark on a grid's window, (rows, cols), and the good share of each sample, 0 to 1."""
 
     y: Image
     good: Image
@@ -23,10 +24,10 @@ class Linear:
 
 
 class Preparer:
-    """Knows one sensor: its dark level, its response, its bad pixels; owns the buffers of one bin."""
+    """Knows one sensor: its dark level, its response, its bad pixels; owns the buffers of one grid's window."""
 
-    def __init__(self, calibration: Calibration, shape: tuple[int, int], n: int) -> None:
-        self.shape, self.n = shape, n
+    def __init__(self, calibration: Calibration, grid: Grid) -> None:
+        self.grid, shape = grid, grid.sensor
         self.white = calibration.sensor.white_dn
         self.dark = np.full(shape, calibration.sensor.black_dn, np.float32)
         if calibration.dark_dn is not None:
@@ -47,27 +48,26 @@ class Preparer:
                 f"{missing:.0%} of the sensor's pixels are marked bad",
                 "Calibrate the head again; the sensor may be broken.",
             )
-        grid = (shape[0] // n, shape[1] // n)
-        if min(grid) < 1:
-            raise FrameError(f"a frame of {shape[0]} x {shape[1]} pixels is too small to bin by {n}")
-        self._out = Linear(np.empty(grid, np.float32), np.empty(grid, np.float32), 0.0, 0.0)
+        if min(grid.window) < 1:
+            raise FrameError(f"a frame of {shape[0]} x {shape[1]} pixels is too small to bin by {grid.n}")
+        self._out = Linear(np.empty(grid.window, np.float32), np.empty(grid.window, np.float32), 0.0, 0.0)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Linear:
         """Linear DN of one frame (rows, cols), uint16 or float32; `dark` is this shot's own dark frame.
 
         NaN counts as missing. The result lives in buffers that the next call overwrites.
         """
-        _fitting("frame", counts, self.shape)
-        offset = self.dark if dark is None else _fitting("dark frame", dark, self.shape)
-        y, good = self._out.y, self._out.good
-        saturated, believed = kernels.linearise(counts, offset, self.gain, self.white, self.n, y, good)
-        mean_good = believed / (good.size * self.n**2)
+        _fitting("frame", counts, self.grid.sensor)
+        offset = self.dark if dark is None else _fitting("dark frame", dark, self.grid.sensor)
+        y, good, grid = self._out.y, self._out.good, self.grid
+        saturated, believed = kernels.linearise(counts, offset, self.gain, self.white, grid.first_px, grid.n, y, good)
+        mean_good = believed / (good.size * grid.n**2)
         if mean_good < 1 - MOST_BAD:
             raise FrameError(
                 f"{1 - mean_good:.0%} of the frame cannot be used (saturated, bad or not numbers)",
                 "Too bright. Move back a little, or lower the exposure; then take it again.",
             )
-        return Linear(y, good, saturated / counts.size, 1 - mean_good)
+        return Linear(y, good, saturated / (good.size * grid.n**2), 1 - mean_good)
 
 
 def _fitting(name: str, array: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -1,5 +1,6 @@
-"""From counts to a picture in stages of rising cost: each shown at once, none begun that cannot finish in time."""
+"""From counts to a picture: a quick look at once, then rounds that make it better, none begun that cannot finish."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -8,27 +9,27 @@ import numpy as np
 
 from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
-from device.recon.closed import ClosedForm
 from device.recon.kernels import Pixels
-from device.recon.methods import DEFAULT, method_named
-from device.recon.model import Model
+from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
-from device.recon.upsample import upsample
+from device.recon.resolution import working_bin
+from device.recon.upsample import to_sensor
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One rung of the ladder: a method and how many sensor pixels make one sample, n x n."""
+    """One rung of the ladder: a method and how many sensor pixels make one sample, n x n; at most `rounds` rounds."""
 
     method: str = DEFAULT
     bin: int = 1
+    rounds: int | None = None
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A picture on the way: the recipe that made it, (rows, cols) on its own binned grid, linear."""
+    """A picture on the way: the recipe that made it, and the part that people look at, linear, on its own samples."""
 
     recipe: Recipe
     picture: Image
@@ -36,36 +37,56 @@ class Stage:
 
 
 Watcher = Callable[[Stage], None]
-QUICK, FULL = Recipe(bin=4), Recipe(bin=1)
+
+
+def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
+    """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives."""
+    n = working_bin(calibration.psfs[index])
+    while n > 1 and min(shape) // n < 64:
+        n -= 1
+    coarse = 2 * n if min(shape) // (2 * n) >= 16 else n
+    return Recipe("evidence", coarse), Recipe("variation", n)
+
+
+class Cost:
+    """What something took lately, and so may take again: the worst of its last runs; the slowest press counts."""
+
+    def __init__(self) -> None:
+        self._seen: deque[float] = deque(maxlen=12)
+
+    def add(self, seconds: float) -> None:
+        """Remember one run."""
+        self._seen.append(seconds)
+
+    @property
+    def seconds(self) -> float:
+        """The worst of the last dozen; nothing is known to be free."""
+        return max(self._seen, default=0.0)
 
 
 class _Rung:
-    """Everything that one recipe needs, planned: its preparer, its solver, its output."""
+    """Everything that one recipe needs, planned: its preparer, its solver, its output, its cost."""
 
     def __init__(self, recipe: Recipe, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int):
+        method = method_named(recipe.method)
         self.recipe = recipe
-        self.preparer = Preparer(calibration, shape, recipe.bin)
-        self.model = Model(calibration, shape, recipe.bin, planner, index)
-        self.solver = ClosedForm(self.model, method_named(recipe.method).prior)
-        self.planes: Image = np.zeros((1, *self.model.grid), np.float32)
-        self.cost_s = 0.0
-
-    def solve(self, counts: Pixels, dark: Pixels | None) -> dict[str, Any]:
-        """Solve channel by channel into `planes`; one plan serves all, and the last one's facts are told."""
-        channels = 1 if counts.ndim == 2 else counts.shape[2]
-        if len(self.planes) != channels:
-            self.planes = np.zeros((channels, *self.model.grid), np.float32)
-        facts: dict[str, Any] = {}
-        for c, plane in enumerate(self.planes):
-            frame = self.preparer(_channel(counts, c), None if dark is None else _channel(dark, c))
-            seen = {"saturated": frame.saturated, "missing": frame.missing, "mean_dn": float(frame.y.mean())}
-            facts = self.solver.solve(frame, plane) | seen
-        return facts
+        self.model = method.model(calibration, shape, recipe.bin, planner, index)
+        self.grid = self.model.grid
+        self.preparer = Preparer(calibration, self.grid)
+        self.solver: Solver = method.build(self.model, calibration, planner)
+        self.most = self.solver.rounds if recipe.rounds is None else recipe.rounds
+        self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
+        self.start_cost, self.round_cost, self.finish_cost = Cost(), Cost(), Cost()
 
     @property
     def picture(self) -> Image:
         """What was solved last: (rows, cols) or (rows, cols, 3) of the grid."""
         return self.planes[0] if len(self.planes) == 1 else np.moveaxis(self.planes, 0, -1)
+
+    @property
+    def shown(self) -> Image:
+        """The part of it that people look at."""
+        return self.picture[self.grid.shown]
 
 
 class Reconstructor:
@@ -76,66 +97,125 @@ class Reconstructor:
 
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
-        recipes: tuple[Recipe, ...] = (QUICK, FULL), psf_index: int = 0,
+        recipes: tuple[Recipe, ...] = (), psf_index: int = 0,
     ) -> None:  # fmt: skip
-        if not recipes or min(recipe.bin for recipe in recipes) < 1:
-            raise SettingError("a reconstruction needs a recipe, with a bin of 1 or more")
+        recipes = recipes or ladder(calibration, shape, psf_index)
+        if min(recipe.bin for recipe in recipes) < 1:
+            raise SettingError("a sample is made of at least one pixel")
         self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
         self.rungs = [_Rung(recipe, calibration, shape, planner, psf_index) for recipe in recipes]
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Run once on noise, so that the first press meets compiled code, touched memory and a known cost."""
-        noise = np.random.default_rng(0).integers(0, 200, self.shape, dtype=np.uint16)
-        self(noise)
-        self(noise)
+        """Run on noise, so that the first press meets compiled code, touched memory and a known cost."""
+        noise = np.random.default_rng(0).integers(100, 200, self.shape, dtype=np.uint16)
+        self(noise, rounds=1)  # compiles, where no compiled code is kept
+        for rung in self.rungs:
+            rung.start_cost, rung.round_cost, rung.finish_cost = Cost(), Cost(), Cost()
+        self(noise, rounds=2)
 
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False,
-        deadline: Deadline | None = None, watch: Watcher | None = None,
+        deadline: Deadline | None = None, watch: Watcher | None = None, rounds: int | None = None,
     ) -> Reconstruction:  # fmt: skip
         """The best picture that fits: linear float32, rows x cols (x 3) of the sensor.
 
         `counts` and `dark` are uint16 or float32 (rows, cols) or (rows, cols, 3). The first rung always runs.
         """
+        self._refuse_other_shapes(counts)
+        climb = _Climb(self, counts, dark, deadline, rounds)
+        begin_s = self.clock.now_s()
+        for rung in self.rungs:
+            if not climb.up(rung):
+                break
+            if watch is not None:
+                watch(Stage(rung.recipe, rung.shown, last=rung is self.rungs[-1]))
+        solved_s = self.clock.now_s()
+        picture = to_sensor(climb.done.picture, climb.done.grid)
+        finished_s = self.clock.now_s()
+        climb.done.finish_cost.add(finished_s - solved_s)
+        seconds = {"solve": solved_s - begin_s, "upsample": finished_s - solved_s}
+        return Reconstruction(picture, self._report(climb, seconds), simulated)
+
+    def _refuse_other_shapes(self, counts: Pixels) -> None:
         check_image_shape(counts.shape)
         if counts.shape[:2] != self.shape:
             raise FrameError(
                 f"the frame has {counts.shape[:2]} pixels, the calibration {self.shape}", "Use the head's own PSF."
             )
-        begin_s, done, stopped, report = self.clock.now_s(), None, "done", {}
-        for rung in self.rungs:
-            if done is not None and deadline is not None and not deadline.fits(rung.cost_s):
-                stopped = "deadline"
-                break
-            start_s = self.clock.now_s()
-            report = rung.solve(counts, dark)
-            rung.cost_s = self.clock.now_s() - start_s
-            done = rung
-            if watch is not None:
-                watch(Stage(rung.recipe, rung.picture, last=rung is self.rungs[-1]))
-        assert done is not None
-        solved_s = self.clock.now_s()
-        picture = upsample(done.picture, done.recipe.bin, self.shape, done.model.box)
-        seconds = {"solve": solved_s - begin_s, "upsample": self.clock.now_s() - solved_s}
-        return Reconstruction(picture, self._report(done, report, stopped, seconds), simulated)
 
-    def _report(self, rung: _Rung, facts: dict[str, Any], stopped: str, seconds: dict[str, float]) -> Report:
-        quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")}
+    def _report(self, climb: "_Climb", seconds: dict[str, float]) -> Report:
+        recipe, facts = climb.done.recipe, climb.facts
         warnings = []
-        if facts["noise_dn"] == 0:
+        if not facts["mean_dn"] > 0 or facts["noise_dn"] == 0:
             warnings.append("There is no signal in this frame.")
         if facts["saturated"] > 0.001:
             warnings.append(f"{facts['saturated']:.1%} of the pixels are too bright.")
-        chosen = {key: facts[key] for key in ("mu", "gcv", "psf_error", "flat_dn", "background_dn")}
+        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual")
         return Report(
-            method=rung.recipe.method, bin=rung.recipe.bin, stopped=stopped, seconds=seconds,
-            psf_index=self.psf_index, regularisation=chosen, noise_dn=facts["noise_dn"] * rung.recipe.bin,
-            residual=facts["residual"], quality=quality, warnings=tuple(warnings),
+            method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
+            psf_index=self.psf_index, regularisation={k: v for k, v in facts.items() if k not in apart},
+            noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
+            quality={key: facts[key] for key in ("saturated", "missing", "mean_dn")}, warnings=tuple(warnings),
         )  # fmt: skip
 
 
-def _channel(image: Pixels, c: int) -> Pixels:
+class _Climb:
+    """One frame's way up the ladder, and what it met."""
+
+    def __init__(
+        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
+    ) -> None:
+        self.clock, self.counts, self.dark = owner.clock, counts, dark
+        self.deadline, self.most = deadline, most
+        self.channels = 1 if counts.ndim == 2 else counts.shape[2]
+        self.done: _Rung = owner.rungs[0]
+        self.facts: dict[str, Any] = {}
+        self.rounds_done, self.stopped = 0, "done"
+
+    def up(self, rung: _Rung) -> bool:
+        """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""
+        cost_s = self.channels * (rung.start_cost.seconds + rung.round_cost.seconds) + rung.finish_cost.seconds
+        if self.facts and self.deadline is not None and not self.deadline.fits(cost_s):
+            self.stopped = "deadline"
+            return False
+        if len(rung.planes) != self.channels:
+            rung.planes = np.zeros((self.channels, *rung.grid.shape), np.float32)
+        for c in range(self.channels):
+            self._channel(rung, c)
+        self.done = rung
+        return True
+
+    def _channel(self, rung: _Rung, c: int) -> None:
+        begin_s = self.clock.now_s()
+        frame = rung.preparer(_plane(self.counts, c), None if self.dark is None else _plane(self.dark, c))
+        rung.solver.start(frame)
+        now_s = self.clock.now_s()
+        rung.start_cost.add(now_s - begin_s)
+        self.stopped = "done"
+        most = rung.most if self.most is None else min(self.most, rung.most)
+        self.rounds_done = 0
+        while self.rounds_done < most - (rung.solver.rounds == 1):
+            if not self._fits_another(rung, self.channels - c):
+                self.stopped = "deadline"
+                break
+            begin_s = now_s
+            rung.solver.step()
+            now_s = self.clock.now_s()
+            rung.round_cost.add(now_s - begin_s)
+            self.rounds_done += 1
+        rung.solver.finish(rung.planes[c])
+        self.facts = rung.solver.facts | {"saturated": frame.saturated, "missing": frame.missing}
+
+    def _fits_another(self, rung: _Rung, channels_left: int) -> bool:
+        """Whether one more round fits, when the channels that are still to come get as much time as this one."""
+        if self.deadline is None:
+            return True
+        others_s = (channels_left - 1) * (rung.start_cost.seconds + (self.rounds_done + 1) * rung.round_cost.seconds)
+        return self.deadline.fits(rung.round_cost.seconds + others_s + rung.finish_cost.seconds)
+
+
+def _plane(image: Pixels, c: int) -> Pixels:
     image = image if image.ndim == 2 else image[..., c]
     if image.dtype == np.uint16:
         return np.ascontiguousarray(image, np.uint16)

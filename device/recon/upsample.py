@@ -3,7 +3,7 @@
 import numpy as np
 
 from device.recon import kernels
-from device.recon.kernels import Box
+from device.recon.geometry import Grid
 from device.values import Image
 
 
@@ -28,20 +28,31 @@ def cubic_weights(n: int) -> tuple[np.ndarray, Image]:
     return first - 1, weights.astype(np.float32)
 
 
-def upsample(picture: Image, n: int, shape: tuple[int, int], box: Box | None = None) -> Image:
-    """A picture on blocks of n x n pixels as (rows, cols) = `shape` pixels; beyond the last whole block it repeats.
+def to_sensor(picture: Image, grid: Grid) -> Image:
+    """A picture on a grid as (rows, cols) of its sensor, dark outside the field.
 
-    `box` (top, bottom, left, right, in blocks) is where the picture is not dark; nothing outside it is computed.
+    Only the shown part is computed. Beyond the last whole block of an odd-sized sensor the picture repeats its edge.
     """
     if picture.ndim == 3:
-        return np.stack([upsample(picture[..., c], n, shape, box) for c in range(picture.shape[2])], axis=-1)
-    if n == 1:
-        return np.array(picture, np.float32)
-    first, weights = cubic_weights(n)
-    out = np.zeros(shape, np.float32)
-    rows, cols = picture.shape
-    top, bottom, left, right = box or (0, rows, 0, cols)
-    bottom_px = shape[0] if bottom == rows else bottom * n
-    right_px = shape[1] if right == cols else right * n
-    kernels.stretch(np.ascontiguousarray(picture), first, weights, (top * n, bottom_px, left * n, right_px), out)
+        return np.stack([to_sensor(picture[..., c], grid) for c in range(picture.shape[2])], axis=-1)
+    out = np.zeros(grid.sensor, np.float32)
+    (top, bottom), (left, right) = (_pixels(part, axis, grid) for axis, part in enumerate(grid.shown))
+    down, across = grid.offset_px
+    if grid.n == 1:
+        out[top:bottom, left:right] = picture[top + down : bottom + down, left + across : right + across]
+        return out
+    first, weights = cubic_weights(grid.n)
+    kernels.stretch(np.ascontiguousarray(picture), first, weights, grid.offset_px, (top, bottom, left, right), out)
     return out
+
+
+def _pixels(part: slice, axis: int, grid: Grid) -> tuple[int, int]:
+    """The sensor pixels under a span of samples; a window that holds all whole blocks takes the sensor's rest along."""
+    whole = grid.window[axis] == grid.sensor[axis] // grid.n
+    low = max(part.start * grid.n - grid.offset_px[axis], 0)
+    high = min(part.stop * grid.n - grid.offset_px[axis], grid.sensor[axis])
+    if whole and part.start == grid.at[axis]:
+        low = 0
+    if whole and part.stop == grid.at[axis] + grid.window[axis]:
+        high = grid.sensor[axis]
+    return low, high

@@ -24,7 +24,7 @@ from device.head import Head
 from device.recon.focus import sharpest
 from device.recon.model import field_box
 from device.recon.plan import Planner
-from device.recon.reconstructor import FULL, QUICK, Reconstructor, Stage
+from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.values import Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.records import picture
@@ -61,8 +61,9 @@ class Exam:
         self._died = died
         planner = Planner(plans)
         index = self._best_psf(planner)
-        self._full = Reconstructor(head.calibration, head.camera.shape, planner, clock, (QUICK, FULL), index)
-        self._small = Reconstructor(head.calibration, head.camera.shape, planner, clock, (QUICK,), index)
+        recipes = ladder(head.calibration, head.camera.shape, index)
+        self._full = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes, index)
+        self._small = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes[:1], index)
         self.planned = planner.planned
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
@@ -220,7 +221,7 @@ class Exam:
     def _reconstruct(self, id: str, frame: Frame, dark: Frame) -> Reconstruction:
         def show(stage: Stage) -> None:
             if not stage.last:
-                self._quick[id] = picture.to_jpeg(self._eye(stage.picture, stage.recipe.bin), QUICK_PX, frame.simulated)
+                self._quick[id] = picture.to_jpeg(stage.picture, QUICK_PX, frame.simulated)
                 self._tell_stage(id, "quick", 0.4, f"/api/captures/{id}/quick.jpg")
 
         deadline = Deadline.after(self.clock, BUDGET_S)
@@ -243,9 +244,9 @@ class Exam:
             "report.json": _json_bytes(capture.report | {"simulated": made.simulated}),
         }
 
-    def _eye(self, image: Image, n: int = 1) -> Image:
+    def _eye(self, image: Image) -> Image:
         """The part of a picture that people look at: the illuminated field."""
-        return image[field_box(self.head.calibration, self.head.camera.shape, n)]
+        return image[field_box(self.head.calibration, self.head.camera.shape)]
 
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""

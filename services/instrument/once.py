@@ -12,10 +12,11 @@ from device.errors import FrameError, SettingError, SpecError, StoreError, Store
 from device.images import Raw, as_raw, read_image, read_psf, refuse_other_sizes, says_simulated, write_linear
 from device.recon.evenness import even_out
 from device.recon.focus import sharpest
+from device.recon.geometry import disc
 from device.recon.methods import method_named
-from device.recon.model import disc, field_radius_px
+from device.recon.model import field_radius_px
 from device.recon.plan import Planner
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Geometry, Image, Reconstruction, Sensor
 from services.records.picture import to_png
@@ -51,8 +52,7 @@ def reconstruct_file(order: Order) -> Reconstruction:
     planner = Planner(order.plans)
     index, _ = sharpest(calibration, raw.pixels, planner)
     shape = (raw.pixels.shape[0], raw.pixels.shape[1])
-    quick = (Recipe(order.method, 4),) if order.budget_s is not None and min(shape) >= 16 else ()
-    reconstructor = Reconstructor(calibration, shape, planner, clock, (*quick, Recipe(order.method, 1)), index)
+    reconstructor = Reconstructor(calibration, shape, planner, clock, _recipes(order, calibration, shape, index), index)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
     made = reconstructor(raw.pixels, simulated=calibration.simulated, deadline=deadline)
     picture = made.picture
@@ -79,6 +79,13 @@ def written(path: Path, write: Callable[[], object]) -> None:
     except OSError as error:
         full = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else StoreError
         raise full(f"{path} cannot be written: {error.strerror or error}", "Choose another folder.") from error
+
+
+def _recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
+    """The wanted method at the resolution that the optics gives; before it, where time is short, a quick look."""
+    quick, full = ladder(calibration, shape, index)
+    wanted = Recipe(order.method, 1 if order.method == "tikhonov" else full.bin)
+    return (wanted,) if order.budget_s is None else (quick, wanted)
 
 
 def calibrated(order: Order, raw: Raw) -> Calibration:

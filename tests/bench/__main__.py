@@ -15,7 +15,8 @@ from skimage.restoration import wiener
 
 from device.clock import SystemClock, VirtualClock
 from device.head import Head, open_head
-from device.recon.model import disc, field_radius_px
+from device.recon.geometry import disc
+from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.spec import load_head
@@ -23,7 +24,14 @@ from device.values import Counts, Frame, Glow, Image, Shot
 
 SHAPE = (1080, 1920)
 ROUNDS = 15
-RECIPES = (Recipe("tikhonov"), Recipe("gradient"), Recipe("gradient", 2), Recipe("gradient", 4))
+RECIPES = (
+    Recipe("tikhonov"),
+    Recipe("gradient"),
+    Recipe("gradient", 2),
+    Recipe("evidence", 4),
+    Recipe("evidence", 2),
+    Recipe("variation", 2),
+)
 PLANS = Path.home() / ".cache" / "diffuscope"
 
 

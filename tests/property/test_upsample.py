@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from device.recon.upsample import cubic_weights, upsample
+from device.recon.geometry import Grid
+from device.recon.upsample import cubic_weights, to_sensor
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
@@ -12,7 +13,7 @@ def test_a_ramp_stays_the_ramp_that_it_was(n: int) -> None:
     fine = np.arange(rows)[:, None] * 2.0 + np.arange(cols)[None] * 3.0
     whole = fine[: rows // n * n, : cols // n * n]
     binned = whole.reshape(rows // n, n, cols // n, n).mean(axis=(1, 3)).astype(np.float32)
-    back = upsample(binned, n, (rows, cols))
+    back = to_sensor(binned, Grid.periodic((rows, cols), n, float("inf")))
     inner = (slice(2 * n, rows - 3 * n), slice(2 * n, cols - 2 * n))
     assert back[inner] == pytest.approx(fine[inner], abs=1e-3)
 
@@ -26,6 +27,21 @@ def test_weights_are_an_interpolation(n: int) -> None:
 def test_colour_is_kept_apart() -> None:
     picture = np.zeros((6, 6, 3), np.float32)
     picture[..., 1] = 5
-    back = upsample(picture, 2, (12, 12))
+    back = to_sensor(picture, Grid.periodic((12, 12), 2, float("inf")))
     assert back[..., 1] == pytest.approx(5)
     assert not back[..., 0].any()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_tight_grid_gives_every_pixel_its_own_place(n: int) -> None:
+    sensor, radius = (61 * n, 80 * n + 1), 15.0 * n
+    grid = Grid.tight(sensor, n, radius, psf_radius_px=12 * n)
+    rows, cols = (
+        np.arange(size)[:, None] if axis == 0 else np.arange(size)[None] for axis, size in enumerate(grid.shape)
+    )
+    ramp = (rows - grid.centre[0]) * 2 + (cols - grid.centre[1]) * 3
+    back = to_sensor(ramp.astype(np.float32), grid)
+    i, j = np.indices(sensor)
+    truth = ((i - (sensor[0] - 1) / 2) * 2 + (j - (sensor[1] - 1) / 2) * 3) / n
+    inside = np.hypot(i - (sensor[0] - 1) / 2, j - (sensor[1] - 1) / 2) < radius - 2
+    assert back[inside] == pytest.approx(truth[inside], abs=1e-3)

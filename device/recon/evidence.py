@@ -1,0 +1,84 @@
+"""The prior that the frame itself supports: empirical Bayes over a power law, no knob (optics.md 5.2, 6.2).
+
+A retina's residual power falls like g(f) = A f^-k. The frame's spectrum then is |H|^2 g + s2, with the noise s2 known;
+A and k are those under which the spectrum that was seen is most likely. s2/g is the Wiener filter's regularisation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.recon import sweeps
+from device.recon.model import Model
+from device.values import Image
+
+BINS = 12
+TURNS = 6
+STEPS = 5
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """g(f) = exp(log_power) (f / reference)^-slope, in the square of the residual spectrum's units."""
+
+    log_power: float
+    slope: float
+
+
+class Evidence:
+    """The frequencies of one model on which a prior can be judged, and the fit itself.
+
+    Band: from 16 cycles across the window, below which crop and shading live, to where the mean |H|^2 has fallen to a
+    twentieth of its best; at most 0.45 cycles per sample. f is in cycles per sample.
+    """
+
+    def __init__(self, model: Model) -> None:
+        rows, cols = model.grid.shape
+        frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
+        power = np.abs(model.otf.astype(np.complex128)) ** 2
+        self.low, self.high = _band(frequency, power, model.grid.window)
+        self.where = np.flatnonzero((frequency > self.low) & (frequency < self.high))
+        chosen = frequency.ravel()[self.where]
+        self.power = power.ravel()[self.where]
+        edges = np.geomspace(self.low, self.high, BINS + 1)
+        self.bins = np.clip(np.digitize(chosen, edges) - 1, 0, BINS - 1)
+        self.reference = float(np.sqrt(self.low * self.high))
+        self.middles = np.log(np.sqrt(edges[1:] * edges[:-1]) / self.reference)
+        self.logs = np.log(chosen / self.reference)
+        floor = np.maximum(frequency, self.low / 5)  # a power law has no end at f = 0, a picture has
+        self.all_logs: Image = np.log(floor / self.reference).astype(np.float32)
+
+    def fit(self, spectrum: NDArray[np.complex64], noise_power: float) -> PowerLaw:
+        """The power law under which |spectrum|^2 is most likely, given the noise power per frequency.
+
+        First a level per ring of frequencies by reweighted least squares, a line through their logarithms, then Fisher
+        scoring on all frequencies of the band.
+        """
+        seen = np.abs(spectrum.ravel()[self.where].astype(np.complex128)) ** 2
+        levels = np.empty(BINS)
+        sweeps.ring_levels(seen, self.power, self.bins, noise_power, TURNS, levels)
+        sound = levels > 1e-4 * levels.max()
+        slope, log_power = -2.0, float(np.log(max(levels.max(), 1e-300)))
+        if sound.sum() > 2:
+            slope, log_power = np.polyfit(self.middles[sound], np.log(levels[sound]), 1)
+        law = sweeps.most_likely_power_law(seen, self.power, self.logs, noise_power, log_power, -slope, STEPS)
+        return PowerLaw(*law)
+
+    def regularisation(self, law: PowerLaw, noise_power: float) -> Image:
+        """s2 / g for every frequency of the half plane: float32."""
+        exponent = np.float32(law.slope) * self.all_logs + np.float32(np.log(noise_power) - law.log_power)
+        reg: Image = np.exp(np.clip(exponent, -80, 80))
+        return reg
+
+
+def _band(frequency: NDArray[np.float64], power: NDArray[np.float64], window: tuple[int, int]) -> tuple[float, float]:
+    low = min(16 / max(window), 0.1)
+    edges = np.linspace(low, 0.45, 24)
+    rings = np.digitize(frequency.ravel(), edges)
+    sums = np.bincount(rings, power.ravel(), edges.size + 1)[1:-1]
+    means = sums / np.maximum(np.bincount(rings, minlength=edges.size + 1)[1:-1], 1)
+    best = int(np.argmax(means))
+    weak = np.flatnonzero(means[best:] < 0.05 * means[best])
+    high = edges[best + weak[0]] if weak.size else edges[-1]
+    return low, float(max(high, 2 * low))

@@ -1,0 +1,169 @@
+"""The sweeps of the iterative solvers: what would be dozens of numpy passes per round, in one visit to each sample."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from device.recon.kernels import Series, Spectrum
+from device.values import Image
+
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
+
+
+@_jit
+def shrink(
+    x: Image, ux: Image, uy: Image, uw: Image, mask: Image, threshold: float, px: Image, py: Image, out: Image
+) -> None:
+    """One visit of ADMM's two simple splits: z = D x with |z| shrunk (isotropic TV), w = x made positive in the field.
+
+    ux, uy, uw are the scaled multipliers, renewed in place; px, py are scratch. out = D^T(z - u) + (w - uw), the image
+    part of the next x. D is the periodic forward difference.
+    """
+    rows, cols = x.shape
+    t, zero, one, tiny = np.float32(threshold), np.float32(0), np.float32(1), np.float32(1e-30)
+    for i in range(rows):
+        here, below = x[i], x[i + 1 if i + 1 < rows else 0]
+        for j in range(cols):
+            gx = (here[j + 1] if j + 1 < cols else here[0]) - here[j] + ux[i, j]
+            gy = below[j] - here[j] + uy[i, j]
+            keep = max(zero, one - t / np.sqrt(gx * gx + gy * gy + tiny))
+            ux[i, j] = gx - gx * keep
+            uy[i, j] = gy - gy * keep
+            px[i, j] = (keep + keep - one) * gx
+            py[i, j] = (keep + keep - one) * gy
+            v = here[j] + uw[i, j]
+            w = max(v, zero) * mask[i, j]
+            uw[i, j] = v - w
+            out[i, j] = w + w - v
+        above = py[i - 1 if i > 0 else rows - 1]
+        row_x, row_y, row = px[i], py[i], out[i]
+        row[0] += row_x[cols - 1] - row_x[0]
+        for j in range(1, cols):
+            row[j] += row_x[j - 1] - row_x[j]
+        if i > 0:
+            for j in range(cols):
+                row[j] += above[j] - row_y[j]
+        else:
+            for j in range(cols):
+                row[j] -= row_y[j]
+    for j in range(cols):
+        out[0, j] += py[rows - 1, j]
+
+
+@_jit
+def fit_data(blurred: Image, a: Image, weighted: Image, inverse: Image, stiffness: float, out: Image) -> None:
+    """ADMM's data split: v = (W y + r (Hx + a)) / (W + r); a is renewed, out = v - a."""
+    r = np.float32(stiffness)
+    rows, cols = blurred.shape
+    for i in range(rows):
+        for j in range(cols):
+            q = blurred[i, j] + a[i, j]
+            v = (weighted[i, j] + r * q) * inverse[i, j]
+            a[i, j] = q - v
+            out[i, j] = v + v - q
+
+
+@_jit
+def weigh(
+    blurred: Image, y: Image, good: Image, per_dn: float, floor: float, stiffness: float,
+    at: tuple[int, int], weighted: Image, inverse: Image,
+) -> None:  # fmt: skip
+    """W y and 1/(W + r) on the grid; W = good / (noise variance of Hx) in the window that begins at `at`, else 0."""
+    p, f, r, zero = np.float32(per_dn), np.float32(floor), np.float32(stiffness), np.float32(0)
+    weighted[:], inverse[:] = zero, np.float32(1) / r
+    rows, cols = y.shape
+    for i in range(rows):
+        for j in range(cols):
+            w = good[i, j] / (p * max(blurred[at[0] + i, at[1] + j], zero) + f)
+            weighted[at[0] + i, at[1] + j] = w * y[i, j]
+            inverse[at[0] + i, at[1] + j] = np.float32(1) / (w + r)
+
+
+@_jit
+def join(
+    data: Spectrum, image: Spectrum, otf: Spectrum, row_g: Image, col_g: Image,
+    stiffness: float, rho: float, scale: float, x: Spectrum, blurred: Spectrum,
+) -> None:  # fmt: skip
+    """ADMM's x in Fourier space: (r conj(H) data + rho image) / (r |H|^2 + rho |D|^2 + rho), and H times it."""
+    rows, cols = data.shape
+    r, q, s, one = np.float32(stiffness), np.float32(rho), np.float32(scale), np.float32(1)
+    for i in range(rows):
+        for j in range(cols):
+            h, d, m = otf[i, j], data[i, j], image[i, j]
+            power = h.real * h.real + h.imag * h.imag
+            weight = s / (r * power + q * (row_g[i] + col_g[j] + one))
+            real = (r * (h.real * d.real + h.imag * d.imag) + q * m.real) * weight
+            imag = (r * (h.real * d.imag - h.imag * d.real) + q * m.imag) * weight
+            x[i, j] = complex(real, imag)
+            blurred[i, j] = complex(real * h.real - imag * h.imag, real * h.imag + imag * h.real)
+
+
+@_jit
+def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> None:
+    """Multiply a spectrum in place by scale conj(H) / (|H|^2 + reg)."""
+    rows, cols = spectrum.shape
+    s = np.float32(scale)
+    for i in range(rows):
+        for j in range(cols):
+            h, y = otf[i, j], spectrum[i, j]
+            weight = s / (h.real * h.real + h.imag * h.imag + reg[i, j])
+            spectrum[i, j] = complex(
+                (y.real * h.real + y.imag * h.imag) * weight, (y.imag * h.real - y.real * h.imag) * weight
+            )
+
+
+@_jit
+def ring_levels(seen: Series, power: Series, ring: NDArray[np.int64], noise: float, turns: int, levels: Series) -> None:
+    """The level g of each ring under which seen = power g + noise is most likely, by reweighted least squares."""
+    above, below = np.zeros(levels.size), np.zeros(levels.size)
+    for turn in range(turns + 1):
+        above[:], below[:] = 0, 0
+        for k in range(seen.size):
+            w = 1.0 if turn == 0 else 1 / (power[k] * levels[ring[k]] + noise) ** 2
+            above[ring[k]] += (seen[k] - noise) * power[k] * w
+            below[ring[k]] += power[k] * power[k] * w
+        for b in range(levels.size):
+            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * noise)
+
+
+@_jit
+def most_likely_power_law(
+    seen: Series, power: Series, logs: Series, noise: float, a: float, k: float, steps: int
+) -> tuple[float, float]:
+    """Fisher scoring of (a, k) in S = power exp(a - k log f) + noise, likelihood sum(log S + seen / S)."""
+    for _ in range(steps):
+        ga = gk = hak = 0.0
+        haa = hkk = 1e-9
+        for n in range(seen.size):
+            m = power[n] * np.exp(a - k * logs[n])
+            s = m + noise
+            t = m / s
+            e = t * (seen[n] / s - 1)
+            ga += e
+            gk -= e * logs[n]
+            haa += t * t
+            hak -= t * t * logs[n]
+            hkk += t * t * logs[n] * logs[n]
+        det = max(haa * hkk - hak * hak, 1e-30)
+        a += min(max((hkk * ga - hak * gk) / det, -1.5), 1.5)
+        k += min(max((haa * gk - hak * ga) / det, -0.7), 0.7)
+        k = min(max(k, 0.5), 4.0)  # pictures lie between 1.5 and 3
+    return a, k
+
+
+@_jit
+def chi(blurred: Image, y: Image, good: Image, per_dn: float, floor: float, at: tuple[int, int]) -> float:
+    """The rms misfit of y in units of its own noise: 1 where the picture explains all but the noise."""
+    p, f, zero = np.float32(per_dn), np.float32(floor), np.float32(0)
+    total = weight = np.float64(0)
+    rows, cols = y.shape
+    for i in range(rows):
+        row_total = row_weight = zero
+        for j in range(cols):
+            b = blurred[at[0] + i, at[1] + j]
+            e = y[i, j] - b
+            row_total += good[i, j] * e * e / (p * max(b, zero) + f)
+            row_weight += good[i, j]
+        total += row_total
+        weight += row_weight
+    return np.sqrt(total / weight) if weight > 0 else np.float64(0)
