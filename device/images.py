@@ -21,9 +21,10 @@ from device.values import Image, Mask, Psf, check_image_shape
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")
 MOST_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
+DENSEST = 1100  # no deflated black frame is larger than this many times its file (zlib: 1032)
 _BROKEN = (  # what the decoders let through, wherever a file is cut off or damaged
     ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError, AssertionError,
-    UnidentifiedImageError, tifffile.TiffFileError,
+    NotImplementedError,    UnidentifiedImageError, tifffile.TiffFileError,
     Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
 )  # fmt: skip
 
@@ -59,10 +60,7 @@ def _decode(path: Path, data: bytes) -> NDArray[Any]:
             case ".npy":
                 return np.asarray(np.load(BytesIO(data), allow_pickle=False))
             case ".tif" | ".tiff":
-                with tifffile.TiffFile(BytesIO(data)) as tiff:
-                    if not 0 < tiff.series[0].size <= 3 * MOST_PIXELS:  # before a damaged header costs all our time
-                        raise ValueError(f"it says that it holds {tiff.series[0].size} values")
-                    return np.asarray(tiff.asarray())
+                return _decode_tiff(data)
             case ".png":
                 _refuse_what_would_lose_bits(path, data)
                 with Pillow.open(BytesIO(data)) as picture:
@@ -71,6 +69,15 @@ def _decode(path: Path, data: bytes) -> NDArray[Any]:
     except _BROKEN as error:
         raise FrameError(f"{path} is not a whole {path.suffix[1:]} image: {error or 'too large'}") from error
     raise FrameError(f"{path}: the ending '{path.suffix}' is not one of {', '.join(SUFFIXES)}")
+
+
+def _decode_tiff(data: bytes) -> NDArray[Any]:
+    """Refuse first what the file cannot hold: a damaged header would cost minutes and all the memory."""
+    with tifffile.TiffFile(BytesIO(data)) as tiff:
+        promised_bytes = tiff.series[0].nbytes
+        if promised_bytes > DENSEST * len(data) or tiff.series[0].size > 3 * MOST_PIXELS:
+            raise ValueError(f"{len(data)} bytes cannot hold the {promised_bytes} that it promises")
+        return np.asarray(tiff.asarray())
 
 
 def _refuse_what_would_lose_bits(path: Path, data: bytes) -> None:

@@ -59,7 +59,9 @@ def reconstruct(
     raw: Annotated[Path, typer.Argument(help="Raw frame: tiff, png or npy; 2-D or three channels.")],
     psf: Annotated[list[Path], typer.Option(help="Measured PSF; several are a stack, the best is chosen.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
-    method: Annotated[str, typer.Option(help="A name of `diffuscope methods`.")] = DEFAULT,
+    method: Annotated[
+        str | None, typer.Option(help="A name of `diffuscope methods`; by default what suits the frame.")
+    ] = None,
     budget_s: Annotated[float | None, typer.Option(help="Seconds from the loaded frame to the result.")] = None,
     dark: Annotated[Path | None, typer.Option(help="Dark frame of the same exposure.")] = None,
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isinf
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
 from device.recon.kernels import Pixels
 from device.recon.methods import DEFAULT, Solver, method_named
+from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
 from device.recon.resolution import working_bin
@@ -40,11 +42,16 @@ Watcher = Callable[[Stage], None]
 
 
 def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
-    """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives."""
+    """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives.
+
+    Where no field is known the object may be anywhere, and the closed form with its doubt in the PSF is the better one.
+    """
     n = working_bin(calibration.psfs[index])
     while n > 1 and min(shape) // n < 64:
         n -= 1
     coarse = 2 * n if min(shape) // (2 * n) >= 16 else n
+    if isinf(field_radius_px(calibration)):
+        return Recipe("gradient", coarse), Recipe("gradient", n)
     return Recipe("evidence", coarse), Recipe("variation", n)
 
 

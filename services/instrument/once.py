@@ -29,7 +29,7 @@ class Order:
     raw: Path
     psfs: tuple[Path, ...]
     output: Path
-    method: str
+    method: str | None
     budget_s: float | None
     dark: Path | None
     flat: Path | None
@@ -43,7 +43,8 @@ class Order:
 def reconstruct_file(order: Order) -> Reconstruction:
     """Read, reconstruct, write; everything that can be refused is refused before anything is computed."""
     _refuse_places(order)
-    method_named(order.method)
+    if order.method is not None:
+        method_named(order.method)
     clock = SystemClock()
     if order.budget_s is not None:
         Deadline.after(clock, order.budget_s)  # refuses what is not a time
@@ -84,7 +85,8 @@ def written(path: Path, write: Callable[[], object]) -> None:
 def _recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
     """The wanted method at the resolution that the optics gives; before it, where time is short, a quick look."""
     quick, full = ladder(calibration, shape, index)
-    wanted = Recipe(order.method, 1 if order.method == "tikhonov" else full.bin)
+    name = order.method or full.method
+    wanted = Recipe(name, 1 if name == "tikhonov" else full.bin)
     return (wanted,) if order.budget_s is None else (quick, wanted)
 
 

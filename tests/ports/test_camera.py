@@ -58,7 +58,8 @@ def test_it_is_dark_when_the_lamp_is_off_and_says_so(rig):
     assert dark.counts.mean() < lit.counts.mean()
 
 
-def test_twice_the_exposure_gives_twice_the_light(rig):
+def test_twice_the_exposure_gives_twice_the_light(live_rig):
+    rig = live_rig
     dark = rig.camera.expose(SHOT).counts.astype(np.float64).mean()
     with rig.light.on(Glow("green", 0.5)):
         once = rig.camera.expose(Shot(0.03)).counts.mean() - dark

@@ -38,7 +38,8 @@ def test_off_ends_the_light_at_once_and_is_harmless_twice(rig):
     assert rig.light.glow is None
 
 
-def test_the_colours_are_different_pictures(rig):
+def test_the_colours_are_different_pictures(live_rig):
+    rig = live_rig
     frames = {}
     for colour in ("green", "red"):
         with rig.light.on(Glow(colour, 0.5)):

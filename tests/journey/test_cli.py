@@ -1,0 +1,404 @@
+"""The `diffuscope` command: real processes where they matter, the same `main` in this process where only words do."""
+
+import http.client
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from device.errors import InputError
+from device.images import read_image
+from services.cli import main
+from services.instrument.once import Order, reconstruct_file
+from services.instrument.serve import bound
+
+ROOT = Path(__file__).parents[2]
+COMMAND = str(Path(sys.executable).parent / "diffuscope")
+REPORT_KEYS = {  # DESIGN.md, "Fixed interfaces"
+    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
+    "noise_dn", "residual", "quality", "warnings",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The processes' own: caches and captures of a test do not go to the home of whoever runs it."""
+    home = tmp_path_factory.mktemp("home")
+    return os.environ | {"XDG_CACHE_HOME": str(home / "cache"), "XDG_DATA_HOME": str(home / "data")}
+
+
+Diffuscope = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def diffuscope(environment: dict[str, str]) -> Diffuscope:
+    """Run one command as a process."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [COMMAND, *map(str, words)]
+        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def scene(diffuscope: Diffuscope, head_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small simulated frame with its truth and PSF."""
+    folder = tmp_path_factory.mktemp("scene")
+    done = diffuscope("simulate", head_file, "-o", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """What the command says when it refuses its words: a sentence and a remedy, and nothing else."""
+
+    def run(*words: object) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main([str(word) for word in words])
+        said = capsys.readouterr()
+        assert ended.value.code == 2
+        assert said.out == ""
+        lines = said.err.strip().splitlines()
+        assert lines[0].startswith("error: "), said.err
+        assert len(lines) == 2, said.err
+        return said.err
+
+    return run
+
+
+def test_methods_are_listed_with_their_cost(diffuscope: Diffuscope) -> None:
+    done = diffuscope("methods", "--rows", 270, "--cols", 480)
+    assert done.returncode == 0
+    assert "270 x 480" in done.stdout
+    assert "tikhonov" in done.stdout
+    assert done.stdout.count("(default)") == 1
+    assert done.stderr == ""
+
+
+def test_what_simulate_writes_is_the_simulated_frame(scene: Path) -> None:
+    assert {path.name for path in scene.iterdir()} >= {"raw.tiff", "truth.npy", "psf.tiff", "plan.json"}
+    for name in ("raw.tiff", "truth.npy", "psf.tiff"):
+        assert read_image(scene / name).shape == (270, 480)
+    assert read_image(scene / "raw.tiff").dtype == np.uint16
+    plan = json.loads((scene / "plan.json").read_text())
+    assert plan["shot_noise"]["simulated"] is True
+
+
+def test_a_frame_becomes_a_picture_and_a_report(
+    diffuscope: Diffuscope, scene: Path, head_file: Path, tmp_path: Path
+) -> None:
+    out, report = tmp_path / "x.npy", tmp_path / "r.json"
+    done = diffuscope(
+        "reconstruct", scene / "raw.tiff", "--psf", scene / "psf.tiff", "--head", head_file, "-o", out, "--report", report
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert str(out) in done.stdout
+    picture, truth = read_image(out), read_image(scene / "truth.npy")
+    assert picture.dtype == np.float32
+    assert picture.shape == truth.shape
+    seen = truth > 0
+    assert np.corrcoef(picture[seen], truth[seen])[0, 1] > 0.8
+    facts = json.loads(report.read_text())
+    assert set(facts) == REPORT_KEYS
+    assert facts["stopped"] == "done"
+    assert all(seconds >= 0 for seconds in facts["seconds"].values())
+
+
+def order(scene: Path, plans: Path, output: Path, **changes: Any) -> Order:
+    asked: dict[str, Any] = {
+        "raw": scene / "raw.tiff", "psfs": (scene / "psf.tiff",), "output": output, "method": "gradient", "budget_s": None,
+        "dark": None, "flat": None, "head": None, "field_deg": None, "even": False, "plans": plans,
+    }  # fmt: skip
+    return Order(**asked | changes)
+
+
+def test_a_tiff_holds_what_an_npy_holds_and_a_png_the_same_picture_for_eyes(
+    scene: Path, plans: Path, tmp_path: Path
+) -> None:
+    for ending in ("npy", "tiff", "png"):
+        reconstruct_file(order(scene, plans, tmp_path / f"x.{ending}"))
+    exact, tiff = read_image(tmp_path / "x.npy"), read_image(tmp_path / "x.tiff")
+    assert tiff.dtype == np.float32
+    assert np.allclose(tiff, exact, rtol=1e-5, atol=1e-5 * np.abs(exact).max())
+    eyes = read_image(tmp_path / "x.png").astype(float)
+    assert eyes.shape == exact.shape == (270, 480)
+    assert np.corrcoef(eyes.ravel(), exact.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize("ending", ["npy", "tiff"])
+def test_three_channels_stay_three(scene: Path, plans: Path, tmp_path: Path, ending: str) -> None:
+    grey = read_image(scene / "raw.tiff")
+    colour = np.stack([grey, grey // 2 + 32, grey // 4 + 48], axis=2)
+    np.save(tmp_path / "raw.npy", colour)
+    out = tmp_path / f"x.{ending}"
+    reconstruct_file(order(scene, plans, out, raw=tmp_path / "raw.npy"))
+    picture = read_image(out)
+    assert picture.shape == (270, 480, 3)
+    means = picture.reshape(-1, 3).mean(axis=0)
+    assert means[0] > means[1] > means[2]
+
+
+def test_a_budget_is_kept_and_what_is_not_a_time_refused(scene: Path, plans: Path, tmp_path: Path, refused: Refused) -> None:
+    made = reconstruct_file(order(scene, plans, tmp_path / "x.npy", budget_s=1e-6))
+    assert made.report.stopped == "deadline"
+    assert made.report.bin > 1
+    assert read_image(tmp_path / "x.npy").shape == (270, 480)
+    for budget in ("0", "-1", "nan", "inf"):
+        words = refused(*reconstruct(scene, tmp_path), "--budget-s", budget)
+        assert f"a budget of {float(budget)} s is not a time" in words
+        assert "positive" in words
+
+
+def test_that_a_frame_was_simulated_is_not_lost_on_the_way(scene: Path, head_file: Path, plans: Path, tmp_path: Path) -> None:
+    made = reconstruct_file(order(scene, plans, tmp_path / "x.png", head=head_file))
+    assert made.simulated is True
+    with Image.open(tmp_path / "x.png") as picture:
+        assert picture.text["simulated"] == "true"  # type: ignore[attr-defined]
+
+
+def reconstruct(scene: Path, tmp_path: Path) -> list[object]:
+    return ["reconstruct", scene / "raw.tiff", "--psf", scene / "psf.tiff", "-o", tmp_path / "out.npy"]
+
+
+@pytest.fixture(scope="module")
+def broken(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of files that are not what their names say."""
+    folder = tmp_path_factory.mktemp("broken")
+    psf = read_image(scene / "psf.tiff").astype(np.float64)
+    raw = read_image(scene / "raw.tiff")
+    nan = psf.copy()
+    nan[5, 5] = np.nan
+    for name, array in {
+        "nan": nan, "zero": 0 * psf, "negative": -psf, "small": psf[::2, ::2], "line": psf[0], "stack": psf[None, None],
+        "half": raw[::2], "signed": raw.astype(np.int32) - 1000, "allnan": np.full(raw.shape, np.nan),
+        "full": np.full(raw.shape, 65535, np.uint16),
+    }.items():  # fmt: skip
+        np.save(folder / f"{name}.npy", array)
+    whole = (scene / "raw.tiff").read_bytes()
+    (folder / "cut.tiff").write_bytes(whole[: len(whole) // 2])
+    (folder / "empty.tiff").touch()
+    (folder / "text.png").write_text("a letter, not a picture\n" * 50)
+    (folder / "old.bmp").write_bytes(b"BM")
+    return folder
+
+
+BAD_RAWS = {
+    "none.tiff": "No such file", "cut.tiff": "is not a whole tiff", "empty.tiff": "is empty", "text.png": "is not a whole png",
+    "old.bmp": "'.bmp' is not one of", "line.npy": "rows and columns", "stack.npy": "rows and columns",
+    "signed.npy": "negative", "allnan.npy": "cannot be used|marked bad", "half.npy": "the raw 135 x 480",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_RAWS)
+def test_a_raw_that_cannot_be_used_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
+    words = reconstruct(scene, tmp_path)
+    words[1] = broken / name
+    said = refused(*words)
+    assert any(part in said for part in BAD_RAWS[name].split("|")), said
+    assert not (tmp_path / "out.npy").exists()
+
+
+BAD_PSFS = {
+    "none.tiff": "No such file", "nan.npy": "not numbers", "zero.npy": "positive sum", "negative.npy": "positive sum",
+    "small.npy": "small.npy has 135 x 240 pixels, the raw 270 x 480", "line.npy": "rows and columns",
+    "stack.npy": "rows and columns", "empty.tiff": "is empty", "text.png": "is not a whole png", "signed.npy": "negative",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_PSFS)
+def test_a_psf_that_cannot_be_one_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
+    words = reconstruct(scene, tmp_path)
+    words[3] = broken / name
+    assert BAD_PSFS[name] in refused(*words)
+    words[3] = scene / "psf.tiff"
+    assert BAD_PSFS[name] in refused(*words, "--psf", broken / name)  # also as one of a stack
+
+
+@pytest.mark.parametrize("option", ["--dark", "--flat"])
+def test_a_companion_of_another_size_is_refused(
+    scene: Path, broken: Path, tmp_path: Path, refused: Refused, option: str
+) -> None:
+    said = refused(*reconstruct(scene, tmp_path), option, broken / "half.npy")
+    assert "half.npy has 135 x 480 pixels, the raw 270 x 480" in said
+    assert "same camera mode" in said
+
+
+WRONG_OPTIONS: dict[str, tuple[list[str], str]] = {
+    "unknown method": (["--method", "magic"], "Choose one of: "),
+    "field without head": (["--field-deg", "30"], "--head"),
+    "missing head": (["--head", "nowhere.toml"], "nowhere.toml cannot be read"),
+    "no folder": (["-o", "nowhere/x.npy"], "folder that does not exist"),
+    "a folder": (["-o", "/tmp"], "written as"),
+    "no such kind": (["-o", "x.jpeg"], "written as .npy, .tiff or .png"),
+    "no folder for the report": (["--report", "nowhere/r.json"], "folder that does not exist"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_OPTIONS)
+def test_an_option_that_cannot_be_is_refused_with_what_can(scene: Path, tmp_path: Path, refused: Refused, what: str) -> None:
+    options, words = WRONG_OPTIONS[what]
+    assert words in refused(*reconstruct(scene, tmp_path), *options)
+
+
+@pytest.mark.parametrize("field_deg", ["0", "-5", "nan", "180"])
+def test_a_field_that_cannot_be_lit_is_refused(
+    scene: Path, head_file: Path, tmp_path: Path, refused: Refused, field_deg: str
+) -> None:
+    words = refused(*reconstruct(scene, tmp_path), "--head", head_file, "--field-deg", field_deg)
+    assert "cannot be lit" in words
+
+
+def test_a_typo_in_a_head_names_key_and_line_and_what_was_meant(head_file: Path, tmp_path: Path, refused: Refused) -> None:
+    text = head_file.read_text().replace("pitch_um", "pich_um")
+    typo = tmp_path / "typo.toml"
+    typo.write_text(text)
+    line = 1 + text.splitlines().index("pich_um = 20.16")
+    for words in (["run", "--head"], ["simulate", "-o", tmp_path / "out"]):
+        said = refused(*words, typo)
+        assert f"line {line}" in said
+        assert "'camera.pich_um' is not a known key; did you mean 'pitch_um'?" in said
+
+
+def test_a_refusal_in_a_process_of_its_own_is_two_lines_and_code_2(
+    diffuscope: Diffuscope, scene: Path, tmp_path: Path
+) -> None:
+    done = diffuscope(*reconstruct(scene, tmp_path), "--method", "magic")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "error: there is no method 'magic'\nChoose one of: " + done.stderr.split(": ", 2)[2]
+
+
+def test_a_port_that_somebody_has_is_said_before_anything_is_opened(
+    head_file: Path, refused: Refused, tmp_path: Path
+) -> None:
+    with bound("127.0.0.1", 0) as taken:  # like another one of us that is still getting ready
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match="cannot be served") as error:
+            bound("127.0.0.1", port)
+    assert f"--port {port + 1}" in error.value.remedy
+
+
+def test_an_address_that_is_not_ours_has_another_remedy() -> None:
+    for host in ("192.0.2.1", "no.such.host.invalid"):
+        with pytest.raises(InputError, match="cannot be served") as error:
+            bound(host, 8000)
+        assert "--host" in error.value.remedy
+        assert "Another program" not in error.value.remedy
+
+
+# The server as a process
+
+
+class Server:
+    """`diffuscope run` on the small head, and ways to talk to it."""
+
+    def __init__(self, head: Path, data: Path, environment: dict[str, str]) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self._command = [COMMAND, "run", "--head", str(head), "--port", str(self.port), "--data", str(data)]
+        self._log = data.with_suffix(".log")
+        self._environment = environment
+
+    @contextmanager
+    def running(self) -> Iterator[subprocess.Popen[bytes]]:
+        with self._log.open("ab") as log:
+            process = subprocess.Popen(self._command, cwd=ROOT, env=self._environment, stdout=log, stderr=log)
+        try:
+            self._wait(process)
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+    def said(self) -> str:
+        return self._log.read_text()
+
+    def _wait(self, process: subprocess.Popen[bytes]) -> None:
+        end = time.monotonic() + 40
+        while time.monotonic() < end:
+            assert process.poll() is None, self.said()
+            try:
+                self.ask("GET", "/api/status")
+                return
+            except OSError:
+                time.sleep(0.05)
+        raise AssertionError(f"no answer in 40 s: {self.said()}")
+
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{self.port}{path}", data, {"Content-Type": "application/json"}, method=method
+        )
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            content = answer.read()
+        return json.loads(content) if answer.headers["content-type"] == "application/json" else content
+
+    def listed(self) -> list[str]:
+        return [capture["id"] for capture in self.ask("GET", "/api/captures")["captures"]]
+
+    @contextmanager
+    def listening(self) -> Iterator[http.client.HTTPResponse]:
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)) as connection:
+            connection.request("GET", "/api/events")
+            stream = connection.getresponse()
+            assert stream.readline() == b"event: beat\n"
+            yield stream
+
+
+def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_told(
+    head_file: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
+) -> None:
+    server = Server(head_file, tmp_path / "data", environment)
+    with server.running() as process:
+        kept = [server.ask("POST", "/api/captures", {"eye": eye})["id"] for eye in ("OD", "OS")]
+        second = diffuscope("run", "--head", head_file, "--port", server.port, "--data", tmp_path / "other")
+        assert second.returncode == 2
+        assert "cannot be served" in second.stderr
+        assert f"--port {server.port + 1}" in second.stderr
+        assert not (tmp_path / "other").exists()
+        with ThreadPoolExecutor(1) as aside:
+            pressed = aside.submit(server.ask, "POST", "/api/captures", {"eye": "OD"})
+            while server.ask("GET", "/api/status")["state"] != "busy" and not pressed.done():
+                time.sleep(0.002)
+            process.send_signal(signal.SIGKILL)
+            interrupted = pressed.exception(20)
+        assert isinstance(interrupted, (OSError, http.client.HTTPException))
+    with server.running() as process:
+        listed = server.listed()
+        assert listed[-2:] == kept[::-1]
+        for id in listed:  # also a third, if it was killed after it had been kept
+            for name in ("raw.tiff", "picture.png", "quick.jpg", "report.json"):
+                assert server.ask("GET", f"/api/captures/{id}/{name}")
+            assert tifffile.imread(BytesIO(server.ask("GET", f"/api/captures/{id}/raw.tiff"))).shape == (270, 480)
+        assert server.ask("POST", "/api/captures", {"eye": "OD"})["id"] not in listed
+        with ExitStack() as undo:
+            streams = [undo.enter_context(server.listening()) for _ in range(3)]
+            before = time.monotonic()
+            process.send_signal(signal.SIGTERM)
+            process.wait(10)
+            assert time.monotonic() - before < 3
+            for stream in streams:
+                stream.read()  # ended, not cut off: a chunked body that was cut off raises
+    assert "Traceback" not in server.said()
+    assert "Cancel" not in server.said()
