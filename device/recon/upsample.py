@@ -43,6 +43,9 @@ def to_sensor(picture: Image, grid: Grid) -> Image:
         return out
     first, weights = cubic_weights(grid.n)
     kernels.stretch(np.ascontiguousarray(picture), first, weights, grid.offset_px, (top, bottom, left, right), out)
+    if picture[grid.shown].min() >= 0:  # a cubic rings at the field's rim, and light does not
+        shown = out[top:bottom, left:right]
+        np.maximum(shown, 0, out=shown)
     return out
 
 

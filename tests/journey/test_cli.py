@@ -51,7 +51,9 @@ def diffuscope(environment: dict[str, str]) -> Diffuscope:
 
     def run(*words: object) -> subprocess.CompletedProcess[str]:
         command = [COMMAND, *map(str, words)]
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False)
+        return subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
 
     return run
 
@@ -158,7 +160,9 @@ def test_three_channels_stay_three(scene: Path, plans: Path, tmp_path: Path, end
     assert means[0] > means[1] > means[2]
 
 
-def test_a_budget_is_kept_and_what_is_not_a_time_refused(scene: Path, plans: Path, tmp_path: Path, refused: Refused) -> None:
+def test_a_budget_is_kept_and_what_is_not_a_time_refused(
+    scene: Path, plans: Path, tmp_path: Path, refused: Refused
+) -> None:
     made = reconstruct_file(order(scene, plans, tmp_path / "x.npy", budget_s=1e-6))
     assert made.report.stopped == "deadline"
     assert made.report.bin > 1
@@ -169,7 +173,9 @@ def test_a_budget_is_kept_and_what_is_not_a_time_refused(scene: Path, plans: Pat
         assert "positive" in words
 
 
-def test_that_a_frame_was_simulated_is_not_lost_on_the_way(scene: Path, head_file: Path, plans: Path, tmp_path: Path) -> None:
+def test_that_a_frame_was_simulated_is_not_lost_on_the_way(
+    scene: Path, head_file: Path, plans: Path, tmp_path: Path
+) -> None:
     made = reconstruct_file(order(scene, plans, tmp_path / "x.png", head=head_file))
     assert made.simulated is True
     with Image.open(tmp_path / "x.png") as picture:
@@ -210,7 +216,9 @@ BAD_RAWS = {
 
 
 @pytest.mark.parametrize("name", BAD_RAWS)
-def test_a_raw_that_cannot_be_used_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
+def test_a_raw_that_cannot_be_used_is_refused(
+    scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str
+) -> None:
     words = reconstruct(scene, tmp_path)
     words[1] = broken / name
     said = refused(*words)
@@ -226,7 +234,9 @@ BAD_PSFS = {
 
 
 @pytest.mark.parametrize("name", BAD_PSFS)
-def test_a_psf_that_cannot_be_one_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
+def test_a_psf_that_cannot_be_one_is_refused(
+    scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str
+) -> None:
     words = reconstruct(scene, tmp_path)
     words[3] = broken / name
     assert BAD_PSFS[name] in refused(*words)
@@ -255,7 +265,9 @@ WRONG_OPTIONS: dict[str, tuple[list[str], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG_OPTIONS)
-def test_an_option_that_cannot_be_is_refused_with_what_can(scene: Path, tmp_path: Path, refused: Refused, what: str) -> None:
+def test_an_option_that_cannot_be_is_refused_with_what_can(
+    scene: Path, tmp_path: Path, refused: Refused, what: str
+) -> None:
     options, words = WRONG_OPTIONS[what]
     assert words in refused(*reconstruct(scene, tmp_path), *options)
 
@@ -268,7 +280,9 @@ def test_a_field_that_cannot_be_lit_is_refused(
     assert "cannot be lit" in words
 
 
-def test_a_typo_in_a_head_names_key_and_line_and_what_was_meant(head_file: Path, tmp_path: Path, refused: Refused) -> None:
+def test_a_typo_in_a_head_names_key_and_line_and_what_was_meant(
+    head_file: Path, tmp_path: Path, refused: Refused
+) -> None:
     text = head_file.read_text().replace("pitch_um", "pich_um")
     typo = tmp_path / "typo.toml"
     typo.write_text(text)

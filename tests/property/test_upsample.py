@@ -45,3 +45,9 @@ def test_a_tight_grid_gives_every_pixel_its_own_place(n: int) -> None:
     truth = ((i - (sensor[0] - 1) / 2) * 2 + (j - (sensor[1] - 1) / 2) * 3) / n
     inside = np.hypot(i - (sensor[0] - 1) / 2, j - (sensor[1] - 1) / 2) < radius - 2
     assert back[inside] == pytest.approx(truth[inside], abs=1e-3)
+
+
+def test_a_picture_without_negative_light_stays_so() -> None:
+    picture = np.zeros((12, 12), np.float32)
+    picture[4:8, 4:8] = 100
+    assert to_sensor(picture, Grid.periodic((36, 36), 3, float("inf"))).min() == 0
