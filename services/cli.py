@@ -101,6 +101,27 @@ def simulate(
 
 
 @app.command()
+def frontier(
+    json_file: Annotated[Path, typer.Option("--json", help="Where to write every point, as JSON.")],
+    plot: Annotated[Path, typer.Option(help="Where to draw accuracy against time, as SVG.")],
+    scene: Annotated[Path | None, typer.Option(help="Scene file; its truth is known.")] = None,
+    raw: Annotated[Path | None, typer.Option(help="Raw frame, with --psf and --truth.")] = None,
+    psf: Annotated[Path | None, typer.Option(help="Measured PSF of the raw frame.")] = None,
+    truth: Annotated[Path | None, typer.Option(help="What the picture should be, on the raw's own pixels.")] = None,
+    head: Annotated[Path | None, typer.Option(help="Head file, for the geometry of a raw frame.")] = None,
+    field_deg: Annotated[float | None, typer.Option(help="Illuminated disc of a raw frame, in degrees.")] = None,
+    budget_s: Annotated[float, typer.Option(help="The time within which the instrument chooses.")] = 0.26,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed turns of every point; the median counts.")] = 7,
+) -> None:
+    """Measure accuracy against time: every method, bin and number of rounds, on this machine."""
+    from services.instrument import frontier as measured  # the simulator, which a picture does not need
+
+    wish = measured.Wish(scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, _cache())
+    typer.echo(measured.table(measured.frontier(wish, lambda line: typer.echo(line, err=True))))
+    typer.echo(f"{json_file}, {plot}")
+
+
+@app.command()
 def methods(
     rows: Annotated[int, typer.Option(min=1, help="Rows of the frame.")] = 1080,
     cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,

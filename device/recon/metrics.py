@@ -45,6 +45,8 @@ class Judge:
     def __init__(self, truth: Image, inside: Mask, detail_px: float, vessels: Mask | None = None) -> None:
         if truth.shape != inside.shape or truth.ndim != 2:
             raise FrameError(f"a truth of the shape {truth.shape} does not fit a region of {inside.shape}")
+        self._shape, self._box = truth.shape, _around(inside)
+        truth, inside = truth[self._box], inside[self._box]  # what lies outside costs time and says nothing
         self.inside = inside & np.isfinite(truth)
         values = truth[self.inside].astype(np.float64)
         span = float(np.ptp(values)) if values.size else 0.0
@@ -55,7 +57,8 @@ class Judge:
             )
         self.detail_px, self._low, self.span = detail_px, float(values.min()), span
         self.truth: Plane = np.where(self.inside, (np.nan_to_num(truth) - self._low) / span, 0)
-        self.vessels = None if vessels is None else vessels & self.inside
+        self.vessels = None if vessels is None else vessels[self._box] & self.inside
+        self.truth_variance = float(self.truth[self.inside].var())
         self.core = ndimage.binary_erosion(self.inside, np.ones((3, 3), np.bool_), iterations=SSIM_REACH_PX)
 
     @cached_property
@@ -64,9 +67,9 @@ class Judge:
 
     def __call__(self, picture: Image) -> Scores:
         """Score one picture (rows, cols), linear, in any units."""
-        if picture.shape != self.truth.shape:
-            raise FrameError(f"a picture of the shape {picture.shape} does not fit a truth of {self.truth.shape}")
-        x = np.where(self.inside, picture, 0).astype(np.float64)
+        if picture.shape != self._shape:
+            raise FrameError(f"a picture of the shape {picture.shape} does not fit a truth of {self._shape}")
+        x = np.where(self.inside, picture[self._box], 0).astype(np.float64)
         fitted = np.where(self.inside, matched(x, self.truth, self.inside), 0)
         return Scores(
             pcc=pcc(x, self.truth, self.inside),
@@ -87,11 +90,23 @@ class Judge:
         return vessel_contrast(fitted * self.span + self._low, self.vessels, self.inside, self.detail_px)
 
 
+def _around(inside: Mask) -> tuple[slice, slice]:
+    """The rows and columns that hold the region, and the six pixels around it that its erosion looks at."""
+    spans = []
+    for axis, size in enumerate(inside.shape):
+        there = np.flatnonzero(inside.any(axis=1 - axis))
+        low, high = (int(there[0]), int(there[-1]) + 1) if there.size else (0, size)
+        spans.append(slice(max(low - SSIM_REACH_PX - 1, 0), min(high + SSIM_REACH_PX + 1, size)))
+    return spans[0], spans[1]
+
+
 def pcc(x: Plane, truth: Plane, inside: Mask) -> float:
     """Pearson's correlation over the region; 0 where one of the two does not vary."""
     a, b = x[inside] - x[inside].mean(), truth[inside] - truth[inside].mean()
     norm = float(np.sqrt((a @ a) * (b @ b)))
-    varies = norm > 1e-12 * inside.sum() * max(float(np.abs(x[inside]).max()) * float(np.abs(truth[inside]).max()), 1e-300)
+    varies = norm > 1e-12 * inside.sum() * max(
+        float(np.abs(x[inside]).max()) * float(np.abs(truth[inside]).max()), 1e-300
+    )
     return float(np.clip(a @ b / norm, -1, 1)) if varies else 0.0
 
 

@@ -74,7 +74,7 @@ class Planner:
 
     @staticmethod
     def _file(folder: Path) -> Path:
-        machine = f"{platform.machine()} {_processor()} {pyfftw.__version__} {pyfftw.fftw_version}"
+        machine = f"{platform.machine()} {processor()} {pyfftw.__version__} {pyfftw.fftw_version}"
         return folder / f"fftw-{hashlib.sha256(machine.encode()).hexdigest()[:12]}.wisdom"
 
     @staticmethod
@@ -101,7 +101,8 @@ class Planner:
         return fft
 
 
-def _processor() -> str:
+def processor() -> str:
+    """What the computer calls its processor; empty where it does not say."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -68,9 +68,15 @@ def _refuse_places(order: Order) -> None:
     if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
         raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png", "Choose one of these.")
     for place in (order.output, order.report):
-        if place is not None and (place.is_dir() or not place.parent.is_dir()):
-            what = "is a folder" if place.is_dir() else "is in a folder that does not exist"
-            raise SettingError(f"{place} {what}", "Give the name of a file in a folder that exists.")
+        if place is not None:
+            refuse_place(place)
+
+
+def refuse_place(place: Path) -> None:
+    """Refuse to write where there is a folder, or where there is none."""
+    if place.is_dir() or not place.parent.is_dir():
+        what = "is a folder" if place.is_dir() else "is in a folder that does not exist"
+        raise SettingError(f"{place} {what}", "Give the name of a file in a folder that exists.")
 
 
 def written(path: Path, write: Callable[[], object]) -> None:

@@ -1,0 +1,85 @@
+"""The frontier as a picture: what `frontier.py` found, handed to the plot."""
+
+from math import log10
+from typing import Any
+
+from device.recon.methods import METHODS
+from services.instrument.plot import Mark, Plot, Series, svg, time_axis, value_axis
+
+Found = dict[str, Any]
+
+
+def drawn(found: Found) -> str:
+    """The SVG of what a frontier run found."""
+    points, choice, budget_s = found["points"], found["choice"], found["budget_s"]
+    edge = sorted((p["seconds_median"], p["psnr_db"]) for p in points if p["pareto"])
+    seconds = [p["seconds_median"] for p in points] + [choice["seconds_median"], budget_s]
+    worths = [p["psnr_db"] for p in points] + [choice["psnr_db"]]
+    y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
+    plot = Plot(
+        title=f"What accuracy costs in time: {found['scene']}",
+        under=_under(found),
+        says=_says(found, edge),
+        x=time_axis(seconds, "time from counts in memory to the picture on the sensor grid"),
+        y=y,
+        series=tuple(_series(points, name) for name in METHODS if any(p["method"] == name for p in points)),
+        edge=tuple(edge),
+        limit=(budget_s, f"budget {budget_s:g} s"),
+        ring=(choice["seconds_median"], choice["psnr_db"], "what the instrument chooses"),
+        right=_correlations(y.low, y.high, found["region"]["truth_variance"]),
+        right_title="the same as correlation (PCC)",
+    )
+    return svg(plot)
+
+
+def _under(found: Found) -> str:
+    machine, frame = found["machine"], found["frame"]
+    kind = "simulated" if found["simulated"] else "recorded"
+    return (
+        f"{frame['rows']} x {frame['cols']} pixels, {kind}; {machine['cpu'] or 'unknown processor'}, "
+        f"one FFT thread; {found['region']['what']}"
+    )
+
+
+def _says(found: Found, edge: list[tuple[float, float]]) -> str:
+    choice = found["choice"]
+    best = ", ".join(f"{value:.1f} dB in {seconds * 1e3:.0f} ms" for seconds, value in edge)
+    return (
+        f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
+        f"truth. The best within each time: {best}. Within {found['budget_s']:g} s the instrument chooses "
+        f"{choice['method']}, bin {choice['bin']}, {choice['rounds']} rounds: {choice['psnr_db']:.1f} dB in "
+        f"{choice['seconds_median'] * 1e3:.0f} ms."
+    )
+
+
+def _series(points: list[dict[str, Any]], method: str) -> Series:
+    """One trail over the bins of a closed form; of a method with rounds, one trail over the rounds of each bin."""
+    own = [p for p in points if p["method"] == method]
+    if METHODS[method].round_pairs == 0:
+        return Series(method, (tuple(_mark(p, f"bin {p['bin']}") for p in own),))
+    trails = []
+    for n in sorted({p["bin"] for p in own}):
+        rounds = [p for p in own if p["bin"] == n]
+        labels = [f"bin {n}, {rounds[0]['rounds']} rounds", *(str(p["rounds"]) for p in rounds[1:])]
+        trails.append(tuple(_mark(p, label) for p, label in zip(rounds, labels, strict=True)))
+    return Series(method, tuple(trails))
+
+
+def _mark(point: dict[str, Any], label: str) -> Mark:
+    ms = point["seconds_median"] * 1e3
+    rounds = f", {point['rounds']} rounds" if METHODS[point["method"]].round_pairs else ""
+    says = (
+        f"{point['method']}, bin {point['bin']}{rounds}: {ms:.1f} ms, {point['psnr_db']:.2f} dB, PCC {point['pcc']:.3f}"
+    )
+    return Mark(point["seconds_median"], point["psnr_db"], label, says, 1.0 if point["pareto"] else 0.75)
+
+
+def _correlations(low_db: float, high_db: float, truth_variance: float) -> tuple[tuple[float, str], ...]:
+    """Round correlations at the PSNR that says the same: mse = var (1 - PCC^2) after the best affine fit."""
+    ladder = (0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.92, 0.94, 0.95, 0.96, 0.97, 0.975, 0.98, 0.985, 0.99, 0.995, 0.999)
+    places = [(-10 * log10(max(truth_variance * (1 - pcc**2), 1e-20)), f"{pcc:g}") for pcc in ladder]
+    apart: list[tuple[float, str]] = []
+    for place in places:
+        if low_db <= place[0] <= high_db and (not apart or place[0] - apart[-1][0] > 0.04 * (high_db - low_db)):
+            apart.append(place)
+    return tuple(apart)

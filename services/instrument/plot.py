@@ -1,0 +1,283 @@
+"""Small SVG plots: one log time axis, one accuracy axis, marks that differ in shape as well as in colour.
+
+No fonts, scripts or files from elsewhere; readable on light and on dark; every mark speaks its numbers to a pointer and
+to a screen reader.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from math import ceil, cos, floor, log10, pi, sin
+
+STYLE = """
+  .ground { fill: #ffffff; } .frame { fill: none; stroke: #8a8f98; } .grid { stroke: #e3e5e9; }
+  text { fill: #1d2330; font: 14px system-ui, -apple-system, "Segoe UI", "Noto Sans", Arial, sans-serif; }
+  .title { font-size: 20px; font-weight: 600; } .small { font-size: 12px; } .quiet { fill: #59606d; }
+  .s0 { --ink: #8a5a00; } .s1 { --ink: #0067a3; } .s2 { --ink: #00795c; } .s3 { --ink: #a8327f; }
+  .s4 { --ink: #555b66; }
+  .mark { fill: var(--ink); stroke: #ffffff; stroke-width: 1.2; }
+  .trail { fill: none; stroke: var(--ink); opacity: .55; }
+  .label { fill: var(--ink); } .edge { fill: none; stroke: #1d2330; stroke-width: 1.6; }
+  .limit { stroke: #b3261e; stroke-width: 1.5; stroke-dasharray: 6 4; } .limit-word { fill: #b3261e; }
+  .ring { fill: none; stroke: #1d2330; stroke-width: 2.4; }
+  @media (prefers-color-scheme: dark) {
+    .ground { fill: #12161d; } .frame { stroke: #7a818d; } .grid { stroke: #272d37; }
+    text { fill: #eceff4; } .quiet { fill: #a9b1bf; } .mark { stroke: #12161d; }
+    .s0 { --ink: #f0b14a; } .s1 { --ink: #6cbcf5; } .s2 { --ink: #4fd1a5; } .s3 { --ink: #f18fcb; }
+    .s4 { --ink: #b6bdc9; }
+    .edge, .ring { stroke: #eceff4; } .limit { stroke: #ff8a80; } .limit-word { fill: #ff8a80; }
+  }
+"""
+LETTER_PX, LINE_PX = 6.6, 13.0  # of a 12 px label
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One measured point: where, in which series, what its label and its tooltip say; `weight` scales it."""
+
+    x: float
+    y: float
+    label: str = ""
+    says: str = ""
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Series:
+    """Marks of one shape and colour; those of one `trail` are joined by a thin line."""
+
+    name: str
+    trails: tuple[tuple[Mark, ...], ...]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A scale from data to pixels, its ticks, and what they say."""
+
+    low: float
+    high: float
+    title: str
+    ticks: tuple[tuple[float, str], ...]
+    log: bool = False
+
+    def at(self, value: float) -> float:
+        """Where a value lies, 0 at the low end, 1 at the high."""
+        if self.log:
+            return (log10(value) - log10(self.low)) / (log10(self.high) - log10(self.low))
+        return (value - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Everything that one picture shows."""
+
+    title: str
+    under: str
+    says: str
+    x: Axis
+    y: Axis
+    series: tuple[Series, ...]
+    edge: tuple[tuple[float, float], ...] = ()
+    limit: tuple[float, str] | None = None
+    ring: tuple[float, float, str] | None = None
+    right: tuple[tuple[float, str], ...] = ()
+    right_title: str = ""
+    width: int = field(default=960, kw_only=True)
+    height: int = field(default=600, kw_only=True)
+
+
+LEFT, RIGHT, TOP, BOTTOM = 74, 78, 96, 62
+
+
+def time_axis(seconds: Iterable[float], title: str) -> Axis:
+    """A log axis of times with ticks at 1, 2 and 5 of each decade, in the unit that people say."""
+    values = list(seconds)
+    low, high = min(values) / 1.25, max(values) * 1.45
+    ticks = [(m * 10.0**k, _time(m * 10.0**k)) for k in range(-6, 5) for m in (1, 2, 5)]
+    return Axis(low, high, title, tuple(tick for tick in ticks if low <= tick[0] <= high), log=True)
+
+
+def _time(duration_s: float) -> str:
+    return f"{duration_s:g} s" if duration_s >= 0.0999 else f"{duration_s * 1e3:g} ms"
+
+
+def value_axis(values: Iterable[float], title: str, room: float = 0.06) -> Axis:
+    """A linear axis a little wider than its values, with five to ten round ticks."""
+    every = list(values)
+    span = max(max(every) - min(every), 1e-6)
+    low, high = min(every) - room * span, max(every) + room * span
+    step = next(s for k in range(-9, 9) for s in (10.0**k, 2 * 10.0**k, 5 * 10.0**k) if (high - low) / s <= 8)
+    first = ceil(low / step)
+    ticks = [(k * step, f"{k * step:.6g}") for k in range(first, floor(high / step) + 1)]
+    return Axis(low, high, title, tuple(ticks))
+
+
+def svg(plot: Plot) -> str:
+    """The plot as a whole SVG document."""
+    wide, tall = plot.width, plot.height
+    inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot), *_labels(plot)]
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
+            'role="img" aria-labelledby="plot-title plot-desc">',
+            f'<title id="plot-title">{escape(plot.title)}</title>',
+            f'<desc id="plot-desc">{escape(plot.says)}</desc>',
+            f"<style>{STYLE}</style>",
+            f'<rect class="ground" width="{wide}" height="{tall}"/>',
+            _text(LEFT, 32, plot.title, "title"),
+            _text(LEFT, 54, plot.under, "quiet small"),
+            *inner,
+            "</svg>\n",
+        ]
+    )
+
+
+def _x(plot: Plot, value: float) -> float:
+    return LEFT + plot.x.at(value) * (plot.width - LEFT - RIGHT)
+
+
+def _y(plot: Plot, value: float) -> float:
+    return plot.height - BOTTOM - plot.y.at(value) * (plot.height - TOP - BOTTOM)
+
+
+def _text(x: float, y: float, words: str, kind: str = "", anchor: str = "start") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" class="{kind}" text-anchor="{anchor}">{escape(words)}</text>'
+
+
+def _line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
+    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
+
+
+def _upright(x: float, y: float, words: str) -> str:
+    return f'<text transform="translate({x:.1f} {y:.1f}) rotate(-90)" text-anchor="middle">{escape(words)}</text>'
+
+
+def _frame(plot: Plot) -> list[str]:
+    low, high = plot.height - BOTTOM, plot.width - RIGHT
+    out = []
+    for value, words in plot.x.ticks:
+        at = _x(plot, value)
+        out += [_line(at, TOP, at, low, "grid"), _text(at, low + 19, words, "small", "middle")]
+    for value, words in plot.y.ticks:
+        at = _y(plot, value)
+        out += [_line(LEFT, at, high, at, "grid"), _text(LEFT - 8, at + 4, words, "small", "end")]
+    for value, words in plot.right:
+        at = _y(plot, value)
+        if TOP <= at <= low:
+            out += [_line(high, at, high + 5, at, "frame"), _text(high + 8, at + 4, words, "small")]
+    middle = (TOP + low) / 2
+    out.append(f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{high - LEFT}" height="{low - TOP}"/>')
+    out.append(_text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
+    out.append(_upright(24, middle, plot.y.title))
+    if plot.right_title:
+        out.append(_upright(plot.width - 14, middle, plot.right_title))
+    return out
+
+
+def _edge(plot: Plot) -> list[str]:
+    """What can be had within a time: flat until the next point, then up to it, then flat to the end."""
+    if not plot.edge:
+        return []
+    path = [f"M {_x(plot, plot.edge[0][0]):.1f} {_y(plot, plot.edge[0][1]):.1f}"]
+    path += [f"H {_x(plot, x):.1f} V {_y(plot, y):.1f}" for x, y in plot.edge[1:]]
+    path.append(f"H {plot.width - RIGHT}")
+    return [f'<path class="edge" d="{" ".join(path)}"><title>Pareto edge: the best within each time</title></path>']
+
+
+def _limit(plot: Plot) -> list[str]:
+    if plot.limit is None or not plot.x.low < plot.limit[0] < plot.x.high:
+        return []
+    at = _x(plot, plot.limit[0])
+    return [
+        _line(at, TOP, at, plot.height - BOTTOM, "limit"),
+        _text(at + 6, plot.height - BOTTOM - 8, plot.limit[1], "small limit-word"),
+    ]
+
+
+def _series(plot: Plot) -> list[str]:
+    out = []
+    for k, series in enumerate(plot.series):
+        out.append(f'<g class="s{k % 5}">')
+        for trail in series.trails:
+            places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
+            if len(places) > 1:
+                out.append(f'<polyline class="trail" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+            for mark, (x, y) in zip(trail, places, strict=True):
+                shape = _shape(k, x, y, 6.5 * mark.weight)
+                out.append(f"{shape}<title>{escape(mark.says)}</title></path>" if mark.says else f"{shape}</path>")
+        out.append("</g>")
+    return out
+
+
+def _shape(k: int, x: float, y: float, r: float) -> str:
+    """Circle, square, triangle, diamond, down triangle: told apart without colour."""
+    if k % 5 == 0:
+        d = f"M {x - r:.1f} {y:.1f} a {r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0 a {r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0 Z"
+        return f'<path class="mark" d="{d}">'
+    corners, turn, grow = ((4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3))[k % 5 - 1]
+    around = [turn + 2 * pi * c / corners for c in range(corners)]
+    places = " L ".join(f"{x + grow * r * cos(a):.1f} {y + grow * r * sin(a):.1f}" for a in around)
+    return f'<path class="mark" d="M {places} Z">'
+
+
+def _ring(plot: Plot) -> list[str]:
+    if plot.ring is None:
+        return []
+    x, y, words = plot.ring
+    ring = f'<circle class="ring" cx="{_x(plot, x):.1f}" cy="{_y(plot, y):.1f}" r="13">'
+    return [f"{ring}<title>{escape(words)}</title></circle>"]
+
+
+def _legend(plot: Plot) -> list[str]:
+    """One row above the frame: shape and name of each series, then the lines."""
+    out, at = [], float(LEFT + 6)
+    for k, series in enumerate(plot.series):
+        out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', _text(at + 13, TOP - 15, series.name)]
+        at += 13 + 7.8 * len(series.name) + 26
+    if plot.edge:
+        out += [_line(at, TOP - 20, at + 24, TOP - 20, "edge"), _text(at + 31, TOP - 15, "Pareto edge")]
+        at += 31 + 7.8 * 11 + 22
+    if plot.ring is not None:
+        out += [
+            f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',
+            _text(at + 24, TOP - 15, plot.ring[2]),
+        ]
+    return out
+
+
+def _labels(plot: Plot) -> list[str]:
+    """Every label beside its mark, where it covers no other; a label that finds no room is left to the tooltip."""
+    taken: list[Box] = [
+        (_x(plot, m.x) - 6, _y(plot, m.y) - 6, _x(plot, m.x) + 6, _y(plot, m.y) + 6) for m in _marks(plot)
+    ]
+    if plot.ring is not None:
+        x, y = _x(plot, plot.ring[0]), _y(plot, plot.ring[1])
+        taken.append((x - 13, y - 13, x + 13, y + 13))
+    out = []
+    for k, series in enumerate(plot.series):
+        for mark in (mark for trail in series.trails for mark in trail if mark.label):
+            place = _free(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
+            if place is not None:
+                taken.append(place)
+                out.append(f'<g class="s{k % 5}">{_text(place[0], place[3] - 3, mark.label, "label small")}</g>')
+    return out
+
+
+def _marks(plot: Plot) -> list[Mark]:
+    return [mark for series in plot.series for trail in series.trails for mark in trail]
+
+
+def _free(x: float, y: float, wide: float, taken: Sequence[Box], plot: Plot) -> Box | None:
+    for near in (0, 7, 14):
+        right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
+        over, under, level = y - 9 - near - LINE_PX, y + 9 + near, y - LINE_PX / 2
+        for a, b in ((right, level), (middle, over), (middle, under), (left, level), (right, over), (left, under),
+                     (right, under), (left, over)):  # fmt: skip
+            box = (a, b, a + wide, b + LINE_PX)
+            fits = (
+                a > LEFT + 2 and a + wide < plot.width - RIGHT - 2 and b > TOP + 2 and box[3] < plot.height - BOTTOM - 2
+            )
+            if fits and not any(box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken):
+                return box
+    return None
