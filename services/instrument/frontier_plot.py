@@ -53,16 +53,16 @@ def _says(found: Found, edge: list[tuple[float, float]]) -> str:
 
 
 def _series(points: list[dict[str, Any]], method: str) -> Series:
-    """One trail over the bins of a closed form; of a method with rounds, one trail over the rounds of each bin."""
+    """One trail over the bins of a closed form; of a method with rounds, one over the rounds of each bin."""
     own = [p for p in points if p["method"] == method]
     if METHODS[method].round_pairs == 0:
         return Series(method, (tuple(_mark(p, f"bin {p['bin']}") for p in own),))
     trails = []
     for n in sorted({p["bin"] for p in own}):
         rounds = [p for p in own if p["bin"] == n]
-        labels = [f"bin {n}, {rounds[0]['rounds']} rounds", *(str(p["rounds"]) for p in rounds[1:])]
+        labels = [f"bin {n}", *(str(p["rounds"]) if p["pareto"] else "" for p in rounds[1:])]
         trails.append(tuple(_mark(p, label) for p, label in zip(rounds, labels, strict=True)))
-    return Series(method, tuple(trails))
+    return Series(f"{method} (rounds)", tuple(trails))
 
 
 def _mark(point: dict[str, Any], label: str) -> Mark:

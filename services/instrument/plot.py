@@ -17,12 +17,13 @@ STYLE = """
   .s4 { --ink: #555b66; }
   .mark { fill: var(--ink); stroke: #ffffff; stroke-width: 1.2; }
   .trail { fill: none; stroke: var(--ink); opacity: .55; }
-  .label { fill: var(--ink); } .edge { fill: none; stroke: #1d2330; stroke-width: 1.6; }
+  .label { fill: var(--ink); paint-order: stroke; stroke: #ffffff; stroke-width: 4px; stroke-linejoin: round; }
+  .edge { fill: none; stroke: #1d2330; stroke-width: 1.6; }
   .limit { stroke: #b3261e; stroke-width: 1.5; stroke-dasharray: 6 4; } .limit-word { fill: #b3261e; }
   .ring { fill: none; stroke: #1d2330; stroke-width: 2.4; }
   @media (prefers-color-scheme: dark) {
     .ground { fill: #12161d; } .frame { stroke: #7a818d; } .grid { stroke: #272d37; }
-    text { fill: #eceff4; } .quiet { fill: #a9b1bf; } .mark { stroke: #12161d; }
+    text { fill: #eceff4; } .quiet { fill: #a9b1bf; } .mark, .label { stroke: #12161d; }
     .s0 { --ink: #f0b14a; } .s1 { --ink: #6cbcf5; } .s2 { --ink: #4fd1a5; } .s3 { --ink: #f18fcb; }
     .s4 { --ink: #b6bdc9; }
     .edge, .ring { stroke: #eceff4; } .limit { stroke: #ff8a80; } .limit-word { fill: #ff8a80; }
@@ -269,11 +270,11 @@ def _marks(plot: Plot) -> list[Mark]:
 
 
 def _free(x: float, y: float, wide: float, taken: Sequence[Box], plot: Plot) -> Box | None:
-    for near in (0, 7, 14):
+    for near in (0, 6, 12, 20):
         right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
-        over, under, level = y - 9 - near - LINE_PX, y + 9 + near, y - LINE_PX / 2
-        for a, b in ((right, level), (middle, over), (middle, under), (left, level), (right, over), (left, under),
-                     (right, under), (left, over)):  # fmt: skip
+        over, under, level = y - 7 - near - LINE_PX, y + 8 + near, y - LINE_PX / 2
+        for a, b in ((middle, over), (middle, under), (right, under), (left, over), (right, over), (left, under),
+                     (right, level), (left, level)):  # fmt: skip
             box = (a, b, a + wide, b + LINE_PX)
             fits = (
                 a > LEFT + 2 and a + wide < plot.width - RIGHT - 2 and b > TOP + 2 and box[3] < plot.height - BOTTOM - 2

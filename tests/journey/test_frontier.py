@@ -1,0 +1,121 @@
+"""`diffuscope frontier` as a process: a small scene in, points and a plot out; what cannot be measured is said."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from services.cli import main
+
+ROOT = Path(__file__).parents[2]
+COMMAND = str(Path(sys.executable).parent / "diffuscope")
+DIABETIC = ROOT / "device" / "sim" / "scenes" / "diabetic.toml"
+POINT = {
+    "method", "bin", "rounds", "seconds_median", "seconds_p95", "pcc", "psnr_db", "ssim", "highpass_pcc",
+    "vessel_contrast", "pareto",
+}  # fmt: skip
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def diffuscope(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [COMMAND, *map(str, words)]
+        return subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=150, check=False
+        )
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The diabetic scene on pixels that are twelve times as wide."""
+    text = DIABETIC.read_text()
+    for old, new in (("rows = 1080", "rows = 90"), ("cols = 1920", "cols = 160"), ("5.04", "60.48")):
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path_factory.mktemp("scene") / "tiny.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
+    found, plot = tmp_path / "f.json", tmp_path / "f.svg"
+    done = diffuscope(
+        "frontier", "--scene", tiny, "--json", found, "--plot", plot, "--repeats", 5, "--budget-s", 5
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(found.read_text())
+    assert {"machine", "versions", "scene", "region", "points", "budget_s", "choice", "dominated"} <= set(facts)
+    assert {"cpu", "cores"} <= set(facts["machine"])
+    assert facts["simulated"] is True
+    assert {"what", "intensity_fit", "psnr_range"} <= set(facts["region"])
+    assert all(set(point) == POINT for point in facts["points"])
+    assert {point["method"] for point in facts["points"]} == {"tikhonov", "gradient", "evidence", "variation"}
+    assert {p["rounds"] for p in facts["points"] if p["method"] == "variation"} == {0, 1, 2, 4, 8, 12, 20}
+    edge = sorted((p["seconds_median"], p["psnr_db"]) for p in facts["points"] if p["pareto"])
+    assert edge == sorted(edge, key=lambda place: place[1])
+    assert {"method", "bin", "rounds", "seconds_median"} <= set(facts["choice"])
+    assert facts["choice"]["method"] == "variation", "five seconds are enough for everything"
+    root = ElementTree.parse(plot).getroot()
+    assert root.tag.endswith("svg")
+    assert "Diabetic scene" in done.stderr
+    assert "the instrument chooses variation" in done.stdout
+    assert len([line for line in done.stderr.splitlines() if " dB, PCC " in line]) == len(facts["points"])
+
+
+def test_files_are_measured_as_a_scene_is(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
+    """With the head's geometry the same; the PSF file has no noise, so the figures may only be better."""
+    assert diffuscope("simulate", tiny, "-o", tmp_path).returncode == 0
+    files = ("--raw", tmp_path / "raw.tiff", "--psf", tmp_path / "psf.tiff", "--truth", tmp_path / "truth.npy")
+    out = ("--json", tmp_path / "f.json", "--plot", tmp_path / "f.svg", "--repeats", 1)
+    done = diffuscope("frontier", *files, "--head", tiny, *out)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads((tmp_path / "f.json").read_text())
+    assert facts["region"]["shift_px"] == [0, 0]
+    assert "field" in facts["region"]["what"]
+    assert facts["choice"]["pcc"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ((), "--raw, --psf, --truth and --scene are missing"),
+        (("--raw", "raw.npy", "--psf", "psf.npy"), "--truth and --scene are missing"),
+        (("--raw", "raw.npy", "--psf", "psf.npy", "--truth", "none.npy"), "No such file"),
+        (("--raw", "raw.npy", "--psf", "psf.npy", "--truth", "small.npy"), "8 x 8 pixels, the raw 16 x 24"),
+        (("--raw", "raw.npy", "--psf", "small.npy", "--truth", "raw.npy"), "small.npy has 8 x 8 pixels"),
+        (("--raw", "raw.npy", "--psf", "psf.npy", "--truth", "dull.npy"), "the same everywhere"),
+        (("--scene", DIABETIC, "--raw", "raw.npy"), "--raw has no place"),
+        (("--scene", DIABETIC, "--budget-s", "0"), "is not a time"),
+        (("--scene", "none.toml"), "none.toml"),
+        (("--scene", DIABETIC, "--plot", "nowhere/f.svg"), "a folder that does not exist"),
+    ],
+)
+def test_what_cannot_be_measured_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[object, ...], says: str
+) -> None:
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "raw.npy", rng.integers(1, 999, (16, 24)).astype(np.uint16))
+    np.save(tmp_path / "psf.npy", np.pad(np.ones((4, 4), np.float32), ((6, 6), (10, 10))))
+    np.save(tmp_path / "small.npy", np.ones((8, 8), np.float32))
+    np.save(tmp_path / "dull.npy", np.ones((16, 24), np.float32))
+    files = ("raw.npy", "psf.npy", "small.npy", "dull.npy", "none.npy", "none.toml", "nowhere/f.svg")
+    asked = [tmp_path / str(word) if word in files else word for word in words]
+    if "--plot" not in words:
+        asked += ["--plot", tmp_path / "f.svg"]
+    with pytest.raises(SystemExit) as stop:
+        main(["frontier", *map(str, asked), "--json", str(tmp_path / "f.json")])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert not (tmp_path / "f.json").exists()
