@@ -5,10 +5,10 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test browser lint bench lock clean
+.PHONY: help run test browser lint bench bench-peers lock clean
 
 help: ## List the words that make knows.
-	@sed -nE 's/^([a-z]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
+	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
 
 .venv/ready: requirements.lock pyproject.toml
 	@echo "Setting up .venv (a minute, once)"
@@ -36,6 +36,13 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
+# Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
+bench-peers: .venv/ready ## Install LenslessPiCam beside, in .bench-venv, for make bench to compare with.
+	@$(BIN)/python -m venv .bench-venv
+	@.bench-venv/bin/pip install --quiet --disable-pip-version-check --no-deps lensless==1.0.8 && \
+		.bench-venv/bin/pip install --quiet --disable-pip-version-check numpy scipy matplotlib opencv-python-headless pillow \
+		|| { rm -rf .bench-venv; echo "LenslessPiCam could not be installed (is there a network?): make bench leaves it out"; }
+
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
 lock: .venv/ready ## Write requirements.lock anew.
 	@$(BIN)/pip install --quiet --disable-pip-version-check uv
@@ -43,5 +50,5 @@ lock: .venv/ready ## Write requirements.lock anew.
 		--extra test --group lock pyproject.toml -o requirements.lock
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .bench-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

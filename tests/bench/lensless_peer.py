@@ -1,0 +1,33 @@
+"""Runs in `.bench-venv`, which knows nothing of this repository: LenslessPiCam's ADMM as its authors set it up.
+
+Their loader scales the PSF to unit L2 norm and the data to a maximum of 1; so does this. argv: a folder with in.npz.
+"""
+
+import json
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from lensless.recon.admm import ADMM  # type: ignore[import-not-found]
+
+
+def main(folder: Path) -> None:
+    with np.load(folder / "in.npz") as given:
+        y, psf, every = given["y"], given["psf"], given["rounds"]
+    psf = np.maximum(psf, 0)
+    solver = ADMM((psf / np.linalg.norm(psf)).astype(np.float32)[None, :, :, None])
+    solver.set_data((np.maximum(y, 0) / y.max()).astype(np.float32)[None, :, :, None])
+    found = []
+    for k, rounds in enumerate(every):
+        begin = time.perf_counter()
+        picture = solver.apply(n_iter=int(rounds), disp_iter=None, plot=False)
+        ms = (time.perf_counter() - begin) * 1e3
+        np.save(folder / f"{k}.npy", np.asarray(picture, np.float32).reshape(y.shape))
+        found.append({"rounds": int(rounds), "ms": ms, "version": version("lensless")})
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,135 @@
+"""What others do with the same frame, on the same pixels, judged by the same judge: for the bench only, not shipped."""
+
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy import fft, ndimage
+from skimage.restoration import wiener
+
+from device.clock import SystemClock
+from device.recon.geometry import Grid, disc
+from device.recon.metrics import Judge
+from device.recon.model import field_radius_px
+from device.recon.plan import Planner
+from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.upsample import to_sensor
+from device.sim.staged import Staged
+from device.values import Image
+from tests.bench import timing
+
+N = 2
+PEER_PYTHON = Path(".bench-venv/bin/python")
+Convolve = Callable[[Image], Image]
+
+
+def binned(image: Image, n: int = N) -> Image:
+    rows, cols = (size // n for size in image.shape)
+    return image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float32)
+
+
+def centred(psf: Image, n: int = N) -> Image:
+    """The PSF moved by part of a pixel, so that its centre is a block's centre: no peer pays for a half pixel."""
+    half = (n - 1) / 2
+    return np.asarray(fft.ifft2(ndimage.fourier_shift(fft.fft2(psf), (half, half))).real, np.float32)
+
+
+def blurs(psf: Image) -> tuple[Convolve, Convolve, float]:
+    """Periodic h * x, its adjoint, and the largest |H|^2."""
+    otf = fft.rfft2(np.fft.ifftshift(psf / psf.sum()))
+    shape = psf.shape
+    forward = lambda x: fft.irfft2(fft.rfft2(x) * otf, shape)  # noqa: E731
+    adjoint = lambda x: fft.irfft2(fft.rfft2(x) * otf.conj(), shape)  # noqa: E731
+    return forward, adjoint, float(np.abs(otf).max() ** 2)
+
+
+def fista(y: Image, psf: Image, rounds: int) -> Image:
+    """Accelerated projected gradient with non-negativity: Beck and Teboulle 2009; two FFT pairs a round."""
+    forward, adjoint, lipschitz = blurs(psf)
+    x = z = np.full_like(y, max(float(y.mean()), 0))
+    t = 1.0
+    for _ in range(rounds):
+        new = np.maximum(z - adjoint(forward(z) - y) / lipschitz, 0).astype(np.float32)
+        t, before = (1 + (1 + 4 * t * t) ** 0.5) / 2, t
+        x, z = new, new + np.float32((before - 1) / t) * (new - x)
+    return x
+
+
+def richardson_lucy(y: Image, psf: Image, rounds: int) -> Image:
+    """Multiplicative rounds for Poisson light: Richardson 1972, Lucy 1974; two FFT pairs a round."""
+    forward, adjoint, _ = blurs(np.maximum(psf, 0))
+    y = np.maximum(y, 0)
+    x = np.full_like(y, max(float(y.mean()), 1e-6))
+    for _ in range(rounds):
+        x = (x * adjoint(y / np.maximum(forward(x), 1e-6))).astype(np.float32)
+    return np.maximum(x, 0)
+
+
+def skimage_wiener(y: Image, psf: Image, _: int) -> Image:
+    """scikit-image's Wiener filter, its default prior, at the balance of its own example, on [0, 1]."""
+    return np.asarray(wiener(y / y.max(), psf, balance=1e-3, clip=False), np.float32)
+
+
+PEERS: tuple[tuple[str, Callable[[Image, Image, int], Image], tuple[int, ...]], ...] = (
+    ("scikit-image restoration.wiener", skimage_wiener, (1,)),
+    ("FISTA, non-negative", fista, (10, 50, 150)),
+    ("Richardson-Lucy", richardson_lucy, (10, 50, 150)),
+)
+LENSLESS_ROUNDS = (10, 40, 100)
+
+
+def judge_of(scene: Staged) -> Judge:
+    shape = scene.truth.shape
+    middle = ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
+    inside = disc(shape, middle, field_radius_px(scene.calibration) - 2) > 0.5
+    geometry = scene.calibration.geometry
+    return Judge(scene.truth, inside, 2 * geometry.px_per_deg if geometry else 32.0, scene.vessels)
+
+
+def peers(scene: Staged, planner: Planner) -> None:
+    """Ours and theirs in one table; theirs at bin 2, on black-subtracted counts, no shading model, no crop model."""
+    shape = (scene.truth.shape[0], scene.truth.shape[1])
+    judge = judge_of(scene)
+    timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "PSNR dB", "PCC", "SSIM", "detail")
+    for recipe in (Recipe("gradient", N), Recipe("variation", N)):
+        make = Reconstructor(scene.calibration, shape, planner, SystemClock(), (recipe,))
+        (ms,) = timing.side_by_side_ms(lambda make=make: make(scene.counts), rounds=3)
+        scored(f"ours: {recipe.method}", ms, judge, make(scene.counts).picture)
+    y = binned(scene.counts.astype(np.float32) - np.float32(scene.calibration.sensor.black_dn))
+    psf = binned(centred(scene.calibration.psfs[0].pixels)) * N**2
+    grid = Grid.periodic(shape, N, float("inf"))
+    for name, solve, some in PEERS:
+        for rounds in some:
+            repeats = 3 if rounds <= 10 else 1
+            begin = time.perf_counter()
+            for _ in range(repeats):
+                picture = solve(y, psf, rounds)
+            ms = (time.perf_counter() - begin) / repeats * 1e3
+            scored(f"{name}{f', {rounds} rounds' if rounds > 1 else ''}", ms, judge, to_sensor(picture, grid))
+    lensless(y, psf, grid, judge)
+
+
+def scored(name: str, ms: float, judge: Judge, picture: Image) -> None:
+    scores = judge(picture)
+    timing.row(name, ms, scores.psnr_db, scores.pcc, scores.ssim, scores.highpass_pcc)
+
+
+def lensless(y: Image, psf: Image, grid: Grid, judge: Judge) -> None:
+    """LenslessPiCam's ADMM in its own environment, which `make bench-peers` makes."""
+    if not PEER_PYTHON.exists():
+        print("LenslessPiCam is left out: `make bench-peers` installs it into .bench-venv")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        np.savez(Path(folder) / "in.npz", y=y, psf=psf, rounds=LENSLESS_ROUNDS)
+        script = Path(__file__).with_name("lensless_peer.py")
+        done = subprocess.run([PEER_PYTHON, script, folder], capture_output=True, text=True, check=False)
+        if done.returncode:
+            print(f"LenslessPiCam is left out, it ended with: {(done.stderr.splitlines() or ['nothing'])[-1]}")
+            return
+        for k, found in enumerate(json.loads(done.stdout.splitlines()[-1])):
+            picture = to_sensor(np.load(Path(folder) / f"{k}.npy"), grid)
+            scored(f"LenslessPiCam {found['version']} ADMM, {found['rounds']} rounds", found["ms"], judge, picture)

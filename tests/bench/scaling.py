@@ -1,0 +1,92 @@
+"""How time and memory of the closed form grow with the sensor: 0.25 to 8 megapixels, each in a process of its own.
+
+`python -m tests.bench.scaling MPX` measures one size and prints it as JSON; the table and the plot are `scaling()`.
+"""
+
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from device.clock import SystemClock
+from device.recon.plan import Planner
+from device.recon.reconstructor import Recipe, Reconstructor
+from device.values import Calibration, Geometry, Psf, Sensor
+from services.instrument.plot import Mark, Plot, Series, svg, time_axis, value_axis
+from tests.bench import timing
+from tests.scenes import speckle
+
+SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+CASES = (Recipe("gradient", 1), Recipe("gradient", 2))
+STEEPEST = 1.25  # N log N over this range is N^1.05; the rest is what leaves the caches
+OUT = Path("out")
+
+
+def shape_of(megapixels: float) -> tuple[int, int]:
+    """A 9:16 sensor of about so many pixels, its sides divisible by 24."""
+    rows = round((megapixels * 1e6 * 9 / 16) ** 0.5 / 24) * 24
+    return rows, round(rows * 16 / 9 / 24) * 24
+
+
+def measure(megapixels: float, plans: Path) -> dict[str, float]:
+    """One size: milliseconds of each case, and how much the process grew from its imports to its last picture."""
+    shape = shape_of(megapixels)
+    pitch_um = 5.04 * 1080 / shape[0]  # the same optics on finer or coarser pixels
+    psf = Psf(speckle(shape, grain_px=2 * shape[0] / 1080))
+    calibration = Calibration((psf,), Sensor(), Geometry(pitch_um, 6000, 0.75), 33.4)
+    counts = np.random.default_rng(0).integers(100, 3000, shape, dtype=np.uint16)
+    before_mb = peak_mb()
+    planner = Planner(plans, effort="FFTW_MEASURE" if megapixels <= 2.5 else "FFTW_ESTIMATE")
+    found = {}
+    for recipe in CASES:
+        make = Reconstructor(calibration, shape, planner, SystemClock(), (recipe,))
+        (found[f"bin {recipe.bin}"],) = timing.side_by_side_ms(lambda make=make: make(counts), rounds=7)
+    return found | {"pixels": shape[0] * shape[1], "grown_mb": peak_mb() - before_mb, "peak_mb": peak_mb()}
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def scaling(plans: Path) -> None:
+    """The table, the fitted power law, and out/scaling.svg."""
+    timing.head("closed form from 0.25 to 8 megapixels", "bin 1 ms", "bin 2 ms", "peak MB", "grown MB")
+    found = []
+    for size in SIZES:
+        command = [sys.executable, "-m", "tests.bench.scaling", str(size), str(plans)]
+        found.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+        at = found[-1]
+        name = f"{at['pixels'] / 1e6:.2f} megapixels"
+        timing.row(name, at["bin 1"], at["bin 2"], at["peak_mb"], at["grown_mb"])
+    logs = np.log([at["pixels"] for at in found])
+    for case in ("bin 1", "bin 2"):
+        power, _ = np.polyfit(logs, np.log([at[case] for at in found]), 1)
+        timing.row(f"{case}: time ~ pixels^k, k", power, limit=STEEPEST, value=float(power))
+    OUT.mkdir(exist_ok=True)
+    (OUT / "scaling.svg").write_text(drawn(found), encoding="utf-8")
+    print(f"{OUT / 'scaling.svg'}")
+
+
+def drawn(found: list[dict[str, float]]) -> str:
+    """Megapixels upward, time to the right: the same axis as the frontier's."""
+    trails = {
+        case: tuple(
+            Mark(at[case] / 1e3, float(np.log2(at["pixels"] / 1e6)), f"{at['peak_mb']:.0f} MB", f"{at[case]:.1f} ms")
+            for at in found
+        )
+        for case in ("bin 1", "bin 2")
+    }
+    series = tuple(Series(f"gradient, {case}", (marks,)) for case, marks in trails.items())
+    marks = [mark for own in trails.values() for mark in own]
+    y = value_axis([mark.y for mark in marks], "sensor: log2 of its megapixels")
+    says = "; ".join(f"{at['pixels'] / 1e6:.2f} Mpx in {at['bin 1']:.0f} ms" for at in found)
+    x = time_axis([mark.x for mark in marks], "time from counts in memory to the picture")
+    under = "each size in a process of its own; the label is its peak memory"
+    return svg(Plot("What a larger sensor costs: closed form", under, says, x, y, series))
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(float(sys.argv[1]), Path(sys.argv[2]))))
