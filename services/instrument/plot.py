@@ -4,7 +4,7 @@ No fonts, scripts or files from elsewhere; readable on light and on dark; every 
 to a screen reader.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from math import ceil, cos, floor, log10, pi, sin
@@ -92,15 +92,20 @@ LEFT, RIGHT, TOP, BOTTOM = 74, 78, 96, 62
 
 
 def time_axis(seconds: Iterable[float], title: str) -> Axis:
-    """A log axis of times with ticks at 1, 2 and 5 of each decade, in the unit that people say."""
-    values = list(seconds)
-    low, high = min(values) / 1.25, max(values) * 1.45
-    ticks = [(m * 10.0**k, _time(m * 10.0**k)) for k in range(-6, 5) for m in (1, 2, 5)]
-    return Axis(low, high, title, tuple(tick for tick in ticks if low <= tick[0] <= high), log=True)
+    """A log axis of times, in the unit that people say."""
+    return log_axis(seconds, title, _time)
+
+
+def log_axis(values: Iterable[float], title: str, say: Callable[[float], str]) -> Axis:
+    """A log axis with ticks at 1, 2 and 5 of each decade, each in the words of `say`."""
+    every = list(values)
+    low, high = min(every) / 1.25, max(every) * 1.45
+    ticks = [m * 10.0**k for k in range(floor(log10(low)), ceil(log10(high)) + 1) for m in (1, 2, 5)]
+    return Axis(low, high, title, tuple((tick, say(tick)) for tick in ticks if low <= tick <= high), log=True)
 
 
 def _time(duration_s: float) -> str:
-    return f"{duration_s:g} s" if duration_s >= 0.0999 else f"{duration_s * 1e3:g} ms"
+    return f"{duration_s:.3g} s" if duration_s >= 0.0999 else f"{duration_s * 1e3:.3g} ms"
 
 
 def value_axis(values: Iterable[float], title: str, room: float = 0.06) -> Axis:

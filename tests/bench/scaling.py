@@ -15,7 +15,7 @@ from device.clock import SystemClock
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Calibration, Geometry, Psf, Sensor
-from services.instrument.plot import Mark, Plot, Series, svg, time_axis, value_axis
+from services.instrument.plot import Mark, Plot, Series, log_axis, svg, time_axis
 from tests.bench import timing
 from tests.scenes import speckle
 
@@ -71,21 +71,21 @@ def scaling(plans: Path) -> None:
 
 
 def drawn(found: list[dict[str, float]]) -> str:
-    """Megapixels upward, time to the right: the same axis as the frontier's."""
+    """Sensor size to the right, time upward, both logarithmic."""
     trails = {
         case: tuple(
-            Mark(at[case] / 1e3, float(np.log2(at["pixels"] / 1e6)), f"{at['peak_mb']:.0f} MB", f"{at[case]:.1f} ms")
+            Mark(at["pixels"] / 1e6, at[case] / 1e3, f"{at['peak_mb']:.0f} MB" if case == "bin 1" else "",
+                 f"{at['pixels'] / 1e6:.2f} megapixels, {case}: {at[case]:.1f} ms")
             for at in found
         )
         for case in ("bin 1", "bin 2")
-    }
+    }  # fmt: skip
     series = tuple(Series(f"gradient, {case}", (marks,)) for case, marks in trails.items())
-    marks = [mark for own in trails.values() for mark in own]
-    y = value_axis([mark.y for mark in marks], "sensor: log2 of its megapixels")
+    x = log_axis([at["pixels"] / 1e6 for at in found], "sensor, megapixels", lambda value: f"{value:g}")
+    y = time_axis([mark.y for own in trails.values() for mark in own], "time from counts in memory to the picture")
     says = "; ".join(f"{at['pixels'] / 1e6:.2f} Mpx in {at['bin 1']:.0f} ms" for at in found)
-    x = time_axis([mark.x for mark in marks], "time from counts in memory to the picture")
-    under = "each size in a process of its own; the label is its peak memory"
-    return svg(Plot("What a larger sensor costs: closed form", under, says, x, y, series))
+    under = "each size in a process of its own, one FFT thread; beside each the peak memory of that process"
+    return svg(Plot("What a larger sensor costs: the closed form", under, says, x, y, series))
 
 
 if __name__ == "__main__":

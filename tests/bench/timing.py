@@ -41,4 +41,4 @@ def _cell(cell: float | str | None) -> str:
         case str():
             return cell
         case _:
-            return f"{cell:.3g}" if abs(cell) < 0.1 else f"{cell:.2f}" if abs(cell) < 100 else f"{cell:.0f}"
+            return f"{cell:.3f}" if abs(cell) < 1 else f"{cell:.2f}" if abs(cell) < 100 else f"{cell:.0f}"
