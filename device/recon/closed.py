@@ -63,7 +63,7 @@ class ClosedForm:
         level, background = flat_fit(sums) if prior.subtract_flat else (0.0, 0.0)
         if model.fade is not None:
             np.multiply(frame.good, model.fade, out=frame.good)
-        model.fft.space[:] = 0
+        model.grid.clear_outside(model.fft.space)
         kernels.residual(frame.y, model.flat, frame.good, level, background, model.grid.at, model.fft.space)
         spectrum = model.fft.forward()
         energies = self.sample.energies(spectrum)

@@ -69,6 +69,12 @@ class Grid:
             slice(self.at[1], self.at[1] + self.window[1]),
         )
 
+    def clear_outside(self, image: Image) -> None:
+        """Zero what lies outside the window of an image on the torus; the window itself stays."""
+        rows, cols = self.slices
+        image[: rows.start], image[rows.stop :] = 0, 0
+        image[rows, : cols.start], image[rows, cols.stop :] = 0, 0
+
     @property
     def offset_px(self) -> Pair:
         """What to add to a sensor pixel's place so that n of them make one sample of the torus."""

@@ -1,25 +1,42 @@
 """Acts that take turns, and a table of figures with their limits and a verdict."""
 
-import statistics
 import time
 from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
 
 ROUNDS = 15
 
 
-def side_by_side_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
-    """Median times of several acts that take turns, after two turns that warm up.
+def turns_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> NDArray[np.float64]:
+    """Times of several acts that take turns, (rounds, acts), after two turns that warm up.
 
-    A neighbour's burst then hits all of them alike, and the ratio of two medians is about the code.
+    Each is run twice and its second run counts: the first one's caches are full of what ran before it, which would
+    charge the shortest act most.
     """
-    times: list[list[float]] = [[] for _ in acts]
-    for k in range(rounds + 2):
-        for act, own in zip(acts, times, strict=True):
+    times = np.empty((rounds + 2, len(acts)))
+    for turn in times:
+        for k, act in enumerate(acts):
+            act()
             begin = time.perf_counter()
             act()
-            if k >= 2:
-                own.append(time.perf_counter() - begin)
-    return [statistics.median(own) * 1e3 for own in times]
+            turn[k] = time.perf_counter() - begin
+    return times[2:] * 1e3
+
+
+def side_by_side_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
+    """The median time of each of several acts that take turns."""
+    return [float(ms) for ms in np.median(turns_ms(*acts, rounds=rounds), axis=0)]
+
+
+def against_the_first(*acts: Callable[[], object], rounds: int = 31) -> tuple[list[float], list[float]]:
+    """Median times, and the median over the turns of each act's ratio to the first one.
+
+    A neighbour's burst lasts longer than a turn: it slows both sides of a turn's ratio, and leaves the ratio alone.
+    """
+    times = turns_ms(*acts, rounds=rounds)
+    return [float(v) for v in np.median(times, axis=0)], [float(v) for v in np.median(times / times[:, :1], axis=0)]
 
 
 def head(title: str, *columns: str) -> None:
