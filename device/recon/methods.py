@@ -78,12 +78,12 @@ METHODS = {
         ),
         Method(
             "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
-            2, 0, 0, 12, False, lambda model, calibration, _: EvidenceWiener(model, calibration.sensor),
+            2, 0, 0, 12, False, lambda model, calibration, _: EvidenceWiener(model, calibration),
         ),
         Method(
             "variation", "crop-aware, noise-weighted total variation, positive; starts from `evidence`",
             3, 2, Variation.rounds, 22, False,
-            lambda model, calibration, planner: Variation(model, calibration.sensor, planner),
+            lambda model, calibration, planner: Variation(model, calibration, planner),
         ),
     )
 }  # fmt: skip

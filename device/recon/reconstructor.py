@@ -15,6 +15,7 @@ from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
+from device.recon.quality import complaints
 from device.recon.resolution import working_bin
 from device.recon.upsample import to_sensor
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
@@ -156,14 +157,14 @@ class Reconstructor:
         warnings = []
         if not facts["mean_dn"] > 0 or facts["noise_dn"] == 0:
             warnings.append("There is no signal in this frame.")
-        if facts["saturated"] > 0.001:
-            warnings.append(f"{facts['saturated']:.1%} of the pixels are too bright.")
-        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual")
+        quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
+        warnings.extend(complaints(quality))
+        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
             psf_index=self.psf_index, regularisation={k: v for k, v in facts.items() if k not in apart},
             noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
-            quality={key: facts[key] for key in ("saturated", "missing", "mean_dn")}, warnings=tuple(warnings),
+            quality=quality, warnings=tuple(warnings),
         )  # fmt: skip
 
 
