@@ -20,8 +20,8 @@ Pair = tuple[int, int]
 class Grid:
     """A torus of `shape` samples, each n x n sensor pixels; `window` samples of it are what the sensor saw.
 
-    The window begins at sample `at` of the grid and at pixel `first_px` of the (rows, cols) `sensor`. `radius_samples` is the
-    field's, around `centre`; infinite where it is not known.
+    The window begins at sample `at` of the grid and at pixel `first_px` of the (rows, cols) `sensor`.
+    `radius_samples` is the field's, around `centre`; infinite where it is not known.
     """
 
     n: int
