@@ -254,9 +254,9 @@ def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wai
     status = old_rig.request("GET", "/api/status").json()
     assert status["kind"] == "simulated"
     assert status["state"] == "aim"
-    assert status["shape"] == [270, 480]
+    assert status["shape"] == [135, 240]
     assert status["problem"] is None
-    assert status["field_px"] == pytest.approx(33.4 * 3.8956, rel=0.01)
+    assert status["field_px"] == pytest.approx(33.4 * 1.9478, rel=0.01)
     assert old_rig.request("GET", "/api/health").json()["ok"] is True
     old_rig.world.faults.add("camera.missing")
     old_rig.exam.preview(0, wait_s=0.0)
