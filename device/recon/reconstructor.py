@@ -154,17 +154,15 @@ class Reconstructor:
 
     def _report(self, climb: "_Climb", seconds: dict[str, float]) -> Report:
         recipe, facts = climb.done.recipe, climb.facts
-        warnings = []
-        if not facts["mean_dn"] > 0 or facts["noise_dn"] == 0:
-            warnings.append("There is no signal in this frame.")
+        dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
         quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
-        warnings.extend(complaints(quality))
+        warnings = ("There is no signal in this frame.",) if dark else complaints(quality)
         apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
             psf_index=self.psf_index, regularisation={k: v for k, v in facts.items() if k not in apart},
             noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
-            quality=quality, warnings=tuple(warnings),
+            quality=quality, warnings=warnings,
         )  # fmt: skip
 
 
