@@ -87,7 +87,7 @@ METHODS = {
             lambda model, calibration, planner: Variation(model, calibration.sensor, planner),
         ),
         Method(
-            "open", "the same where no field is known: weights and tau from the frame's own misfit, dark beyond the sensor",
+            "open", "the same where no field is known: weights and tau from what the frame itself leaves open",
             4, 2, OpenField.rounds, 22, False,
             lambda model, calibration, planner: OpenField(model, calibration.sensor, planner),
         ),

@@ -5,7 +5,7 @@ import numpy as np
 from device.values import Psf
 
 EMPTY = 1e-3  # of the best ring's mean |H|^2: thirty times less amplitude than where the optics passes most
-EMPTY_OPEN = 5e-3  # the same for a PSF that is only roughly right: half or twice of it gives the same bins (dlmd: 2)
+EMPTY_OPEN = 5e-3  # the same for a PSF that is only roughly right; half or twice of it: the same bins
 LARGEST = 8
 
 
@@ -13,8 +13,8 @@ def working_bin(psf: Psf, empty: float = EMPTY) -> int:
     """The largest n for which n x n pixels still sample everything that the OTF passes.
 
     Frequencies at which the mean |H|^2 has fallen to `empty` (a thousandth) of its best carry no picture at any light
-    that a retina gives; the caustic of the paper ends near 40 cycles/mm, so its 5 um pixels may be summed two by two, an
-    IMX296's three by three. A PSF without an end (a few pixels wide) keeps every pixel.
+    that a retina gives; the caustic of the paper ends near 40 cycles/mm, so its 5 um pixels may be summed two by two,
+    an IMX296's three by three. A PSF without an end (a few pixels wide) keeps every pixel.
     """
     rows, cols = psf.shape
     if min(rows, cols) < 32:
