@@ -13,6 +13,8 @@ KAPPA and RHO are 1 by construction. Halving or doubling KAPPA moves the three d
 15.26 dB) by -0.09, -0.38, -0.43 and -0.12, +0.23, +0.15 dB; RHO by +0.03, +0.01, -0.10 and -0.08, -0.26, 0.00; STIFF by
 -0.11, -0.05, -0.03 and -0.04, -0.16, -0.08; RENEWED by 0.00, 0.00, +0.02 and -0.04, +0.04, -0.03; 80 or 120 rounds
 instead of 60 by -0.01, -0.13, +0.14 and -0.02, -0.22, +0.12. None of these falls behind 100 rounds of LenslessPiCam.
+On nine simulated scenes (PSF off by 1 % in scale, by a blur of 1.2 px, or of another depth) that decided nothing, the
+best of KAPPA 1/4, 1/2, 1, 2, 4 is 1/2, 1 or 2 for seven, and 1 costs at most 0.3 dB against it; 4 for a smooth retina.
 """
 
 import numpy as np
