@@ -5,7 +5,7 @@ import numpy as np
 from device.values import Psf
 
 EMPTY = 1e-3  # of the best ring's mean |H|^2: thirty times less amplitude than where the optics passes most
-EMPTY_OPEN = 5e-3  # for a PSF that is only roughly right; half or twice of it moves one of three recordings, from 4 to 5
+EMPTY_OPEN = 5e-3  # for a PSF that is only roughly right; of three recordings, twice of it moves one, from bin 4 to 5
 LARGEST = 8
 
 
