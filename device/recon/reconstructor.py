@@ -16,7 +16,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
 from device.recon.quality import complaints
-from device.recon.resolution import working_bin
+from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
@@ -45,14 +45,15 @@ Watcher = Callable[[Stage], None]
 def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
     """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives.
 
-    Where no field is known the object may be anywhere, and the closed form with its doubt in the PSF is the better one.
+    Where no field is known the object may be anywhere: then the solver is the one that doubts its model.
     """
-    n = working_bin(calibration.psfs[index])
+    is_open = isinf(field_radius_px(calibration))
+    n = working_bin(calibration.psfs[index], EMPTY_OPEN if is_open else EMPTY)
     while n > 1 and min(shape) // n < 64:
         n -= 1
     coarse = 2 * n if min(shape) // (2 * n) >= 16 else n
-    if isinf(field_radius_px(calibration)):
-        return Recipe("gradient", coarse), Recipe("gradient", n)
+    if is_open:
+        return Recipe("gradient", coarse), Recipe("open", n)
     return Recipe("evidence", coarse), Recipe("variation", n)
 
 
