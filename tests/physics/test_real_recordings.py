@@ -56,7 +56,7 @@ def test_any_round_may_be_the_last() -> None:
     assert by_round[0] > psnr_db(butterfly("im43", Recipe("gradient", 2)), "im43")
 
 
-@pytest.mark.parametrize("scale", [0.1, 1e4])
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
 def test_the_units_of_the_frame_do_not_matter(scale: float) -> None:
     unit, scaled = butterfly("im65", Recipe("open", 4)), butterfly("im65", Recipe("open", 4), scale=scale)
     assert np.abs(scaled / scale - unit).max() < 0.02 * unit.max()
