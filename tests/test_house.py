@@ -162,7 +162,7 @@ def test_the_pages_files_and_functions_are_short() -> None:
     judge(long_js_functions, modules, {}, "a long function is two")
 
 
-UNITS = set(re.findall(r"\w+", "um mm m s ms min deg rad dpt dn e px hz bytes percent"))
+UNITS = set(re.findall(r"\w+", "um mm m s ms min deg rad dpt dn dn2 e px samples hz bytes percent"))
 QUANTITIES = set(
     re.findall(
         r"\w+",

@@ -26,6 +26,15 @@ class PowerLaw:
     slope: float
 
 
+@dataclass(frozen=True)
+class Fit:
+    """The law, and what it was fitted to: |spectrum|^2 in the band, and the level of each ring."""
+
+    law: PowerLaw
+    seen: NDArray[np.float64]
+    levels: NDArray[np.float64]
+
+
 class Evidence:
     """The frequencies of one model on which a prior can be judged, and the fit itself.
 
@@ -49,7 +58,7 @@ class Evidence:
         floor = np.maximum(frequency, self.low / 5)  # a power law has no end at f = 0, a picture has
         self.all_logs: Image = np.log(floor / self.reference).astype(np.float32)
 
-    def fit(self, spectrum: NDArray[np.complex64], noise_power: float) -> PowerLaw:
+    def fit(self, spectrum: NDArray[np.complex64], noise_dn2: float) -> "Fit":
         """The power law under which |spectrum|^2 is most likely, given the noise power per frequency.
 
         First a level per ring of frequencies by reweighted least squares, a line through their logarithms, then Fisher
@@ -57,17 +66,17 @@ class Evidence:
         """
         seen = np.abs(spectrum.ravel()[self.where].astype(np.complex128)) ** 2
         levels = np.empty(BINS)
-        sweeps.ring_levels(seen, self.power, self.bins, noise_power, TURNS, levels)
+        sweeps.ring_levels(seen, self.power, self.bins, noise_dn2, TURNS, levels)
         sound = levels > 1e-4 * levels.max()
         slope, log_power = -2.0, float(np.log(max(levels.max(), 1e-300)))
         if sound.sum() > 2:
             slope, log_power = np.polyfit(self.middles[sound], np.log(levels[sound]), 1)
-        law = sweeps.most_likely_power_law(seen, self.power, self.logs, noise_power, log_power, -slope, STEPS)
-        return PowerLaw(*law)
+        law = sweeps.most_likely_power_law(seen, self.power, self.logs, noise_dn2, log_power, -slope, STEPS)
+        return Fit(PowerLaw(*law), seen, levels)
 
-    def regularisation(self, law: PowerLaw, noise_power: float) -> Image:
+    def regularisation(self, law: PowerLaw, noise_dn2: float) -> Image:
         """s2 / g for every frequency of the half plane: float32."""
-        exponent = np.float32(law.slope) * self.all_logs + np.float32(np.log(noise_power) - law.log_power)
+        exponent = np.float32(law.slope) * self.all_logs + np.float32(np.log(noise_dn2) - law.log_power)
         reg: Image = np.exp(np.clip(exponent, -80, 80))
         return reg
 

@@ -20,8 +20,8 @@ Pair = tuple[int, int]
 class Grid:
     """A torus of `shape` samples, each n x n sensor pixels; `window` samples of it are what the sensor saw.
 
-    The window begins at sample `at` of the grid and at pixel `first_px` of the (rows, cols) `sensor`. `radius` is the
-    field's, in samples, around `centre`; infinite where it is not known.
+    The window begins at sample `at` of the grid and at pixel `first_px` of the (rows, cols) `sensor`.
+    `radius_samples` is the field's, around `centre`; infinite where it is not known.
     """
 
     n: int
@@ -30,7 +30,7 @@ class Grid:
     window: Pair
     at: Pair
     first_px: Pair
-    radius: float
+    radius_samples: float
 
     @classmethod
     def periodic(cls, sensor: Pair, n: int, field_radius_px: float) -> "Grid":
@@ -92,17 +92,17 @@ class Grid:
     @property
     def shown(self) -> tuple[slice, slice]:
         """The part of the torus that people look at: the field, or the window where no field is known."""
-        if not isfinite(self.radius):
+        if not isfinite(self.radius_samples):
             return self.slices
         spans = []
         for middle, at, window in zip(self.centre, self.at, self.window, strict=True):
-            low, high = round(middle - self.radius - 1), round(middle + self.radius + 2)
+            low, high = round(middle - self.radius_samples - 1), round(middle + self.radius_samples + 2)
             spans.append(slice(max(low, at, 0), max(min(high, at + window), max(low, at, 0) + 1)))
         return spans[0], spans[1]
 
     def field(self) -> Image:
         """The field as a mask on the torus, float32, 0 to 1."""
-        return disc(self.shape, self.centre, self.radius)
+        return disc(self.shape, self.centre, self.radius_samples)
 
 
 def disc(shape: Pair, centre: tuple[float, float], radius_px: float) -> Image:

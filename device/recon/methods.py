@@ -8,6 +8,7 @@ from device.errors import SettingError
 from device.recon.closed import GRADIENT, TIKHONOV, ClosedForm
 from device.recon.geometry import Grid, Pair
 from device.recon.model import Model, periodic_model, tight_model
+from device.recon.openfield import OpenField
 from device.recon.plan import Planner, RealFft
 from device.recon.prepare import Linear
 from device.recon.variation import EvidenceWiener, Variation
@@ -78,12 +79,17 @@ METHODS = {
         ),
         Method(
             "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
-            2, 0, 0, 12, False, lambda model, calibration, _: EvidenceWiener(model, calibration.sensor),
+            2, 0, 0, 12, False, lambda model, calibration, _: EvidenceWiener(model, calibration),
         ),
         Method(
             "variation", "crop-aware, noise-weighted total variation, positive; starts from `evidence`",
             3, 2, Variation.rounds, 22, False,
-            lambda model, calibration, planner: Variation(model, calibration.sensor, planner),
+            lambda model, calibration, planner: Variation(model, calibration, planner),
+        ),
+        Method(
+            "open", "the same where no field is known: weights and tau from what the frame itself leaves open",
+            4, 2, OpenField.rounds, 22, False,
+            lambda model, calibration, planner: OpenField(model, calibration, planner),
         ),
     )
 }  # fmt: skip

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from device.values import Sensor
 
-LEAST_DN2 = 1e-12  # a black frame has no noise to measure, and is still divided by
+LEAST_DN2 = 1e-20  # a black frame has no noise to measure, and is still divided by; float frames may be tiny
 
 
 @dataclass(frozen=True)

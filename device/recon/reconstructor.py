@@ -15,7 +15,8 @@ from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
-from device.recon.resolution import working_bin
+from device.recon.quality import complaints
+from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
@@ -44,14 +45,15 @@ Watcher = Callable[[Stage], None]
 def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
     """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives.
 
-    Where no field is known the object may be anywhere, and the closed form with its doubt in the PSF is the better one.
+    Where no field is known the object may be anywhere: then the solver is the one that doubts its model.
     """
-    n = working_bin(calibration.psfs[index])
+    is_open = isinf(field_radius_px(calibration))
+    n = working_bin(calibration.psfs[index], EMPTY_OPEN if is_open else EMPTY)
     while n > 1 and min(shape) // n < 64:
         n -= 1
     coarse = 2 * n if min(shape) // (2 * n) >= 16 else n
-    if isinf(field_radius_px(calibration)):
-        return Recipe("gradient", coarse), Recipe("gradient", n)
+    if is_open:
+        return Recipe("gradient", coarse), Recipe("open", n)
     return Recipe("evidence", coarse), Recipe("variation", n)
 
 
@@ -153,17 +155,15 @@ class Reconstructor:
 
     def _report(self, climb: "_Climb", seconds: dict[str, float]) -> Report:
         recipe, facts = climb.done.recipe, climb.facts
-        warnings = []
-        if not facts["mean_dn"] > 0 or facts["noise_dn"] == 0:
-            warnings.append("There is no signal in this frame.")
-        if facts["saturated"] > 0.001:
-            warnings.append(f"{facts['saturated']:.1%} of the pixels are too bright.")
-        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual")
+        dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
+        quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
+        warnings = ("There is no signal in this frame.",) if dark else complaints(quality)
+        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
             psf_index=self.psf_index, regularisation={k: v for k, v in facts.items() if k not in apart},
             noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
-            quality={key: facts[key] for key in ("saturated", "missing", "mean_dn")}, warnings=tuple(warnings),
+            quality=quality, warnings=warnings,
         )  # fmt: skip
 
 

@@ -29,11 +29,11 @@ class Shading:
     def __init__(self, model: Model) -> None:
         self._model = model
         self.box: Box = model.box
-        modes = list(_modes(model)) if isfinite(model.grid.radius) else [model.mask]
+        modes = list(_modes(model)) if isfinite(model.grid.radius_samples) else [model.mask]
         seen = [_blocks(model.blur(mode)[model.grid.slices]).ravel() for mode in modes]
         top, bottom, left, right = self.box
         self._modes = np.stack([mode[top:bottom, left:right].ravel() for mode in modes])
-        if isfinite(model.grid.radius):
+        if isfinite(model.grid.radius_samples):
             seen.append(np.full_like(seen[0], float(seen[0].max())))  # stray light, at home in the same scale
         ridge = np.full(len(seen), RIDGE)
         ridge[len(modes) :] = STRAY_RIDGE
@@ -70,8 +70,8 @@ def _blocks(image: Image) -> Image:
 def _modes(model: Model) -> "list[Image]":
     """Zernike polynomials up to DEGREE on the field's disc, the even field first."""
     rows, cols = model.grid.shape
-    v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius
-    u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius
+    v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
+    u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius_samples
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
     return [
         (model.mask * _radial(n, abs(m), radius) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))).astype(

@@ -113,30 +113,32 @@ def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> 
 
 
 @_jit
-def ring_levels(seen: Series, power: Series, ring: NDArray[np.int64], noise: float, turns: int, levels: Series) -> None:
-    """The level g of each ring under which seen = power g + noise is most likely, by reweighted least squares."""
+def ring_levels(
+    seen: Series, power: Series, ring: NDArray[np.int64], noise_dn2: float, turns: int, levels: Series
+) -> None:
+    """The level g of each ring under which seen = power g + noise_dn2 is most likely, by reweighted least squares."""
     above, below = np.zeros(levels.size), np.zeros(levels.size)
     for turn in range(turns + 1):
         above[:], below[:] = 0, 0
         for k in range(seen.size):
-            w = 1.0 if turn == 0 else 1 / (power[k] * levels[ring[k]] + noise) ** 2
-            above[ring[k]] += (seen[k] - noise) * power[k] * w
+            w = 1.0 if turn == 0 else 1 / (power[k] * levels[ring[k]] + noise_dn2) ** 2
+            above[ring[k]] += (seen[k] - noise_dn2) * power[k] * w
             below[ring[k]] += power[k] * power[k] * w
         for b in range(levels.size):
-            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * noise)
+            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * noise_dn2)
 
 
 @_jit
 def most_likely_power_law(
-    seen: Series, power: Series, logs: Series, noise: float, a: float, k: float, steps: int
+    seen: Series, power: Series, logs: Series, noise_dn2: float, a: float, k: float, steps: int
 ) -> tuple[float, float]:
-    """Fisher scoring of (a, k) in S = power exp(a - k log f) + noise, likelihood sum(log S + seen / S)."""
+    """Fisher scoring of (a, k) in S = power exp(a - k log f) + noise_dn2, likelihood sum(log S + seen / S)."""
     for _ in range(steps):
         ga = gk = hak = 0.0
         haa = hkk = 1e-9
         for n in range(seen.size):
             m = power[n] * np.exp(a - k * logs[n])
-            s = m + noise
+            s = m + noise_dn2
             t = m / s
             e = t * (seen[n] / s - 1)
             ga += e

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from device.recon import sweeps
+from device.recon import quality, sweeps
 from device.recon.choose import Sample
-from device.recon.evidence import Evidence, PowerLaw
+from device.recon.evidence import Evidence, Fit, PowerLaw
 from device.recon.model import Model, taper
 from device.recon.noise import Noise
 from device.recon.plan import Planner, RealFft
 from device.recon.prepare import Linear
 from device.recon.shading import Shading
-from device.values import Image, Sensor
+from device.values import Calibration, Image
 
 KAPPA = 1.8  # of tau: within 0.03 dB of the oracle's over 1 to 120 ke-, bins 2 and 3, three diffusers, four retinas
 RHO = 5.0  # stiffness of z and w, in units of tau per level
@@ -33,15 +33,15 @@ class EvidenceWiener:
 
     rounds = 1
 
-    def __init__(self, model: Model, sensor: Sensor) -> None:
-        self.model, self.sensor = model, sensor
+    def __init__(self, model: Model, calibration: Calibration) -> None:
+        self.model, self.sensor, self.geometry = model, calibration.sensor, calibration.geometry
         self.shading, self.evidence, self.sample = Shading(model), Evidence(model), Sample.of(model)
         self.fade = taper(model.grid.window, min(0.5, TAPER_PX / model.grid.n / min(model.grid.window)))
         self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.blurred: Image = np.zeros(model.grid.shape, np.float32)
         self.facts: dict[str, Any] = {}
         self.noise, self.law, self.level, self.stray = Noise(0, 1), PowerLaw(0, 2), 0.0, 0.0
-        self.noise_power, self.reg = 1.0, np.ones(model.otf.shape, np.float32)
+        self.noise_dn2, self.reg = 1.0, np.ones(model.otf.shape, np.float32)
 
     def start(self, frame: Linear) -> None:
         """Solve: `x` is the picture on the grid, `facts` what was chosen."""
@@ -59,9 +59,10 @@ class EvidenceWiener:
         mean = float(frame.y.mean())
         self.noise = Noise.of(self.sensor, grid.n, measured / energy, mean)
         lit = float(np.einsum("ij,ij,ij->", frame.y, self.fade, self.fade))
-        self.noise_power = max(self.noise.per_dn * lit + self.noise.floor_dn2 * energy, 1e-20)
-        self.law = self.evidence.fit(spectrum, self.noise_power)
-        self.reg = self.evidence.regularisation(self.law, self.noise_power)
+        self.noise_dn2 = max(self.noise.per_dn * lit + self.noise.floor_dn2 * energy, 1e-20)
+        fit = self.evidence.fit(spectrum, self.noise_dn2)
+        self.law = fit.law
+        self.reg = self.evidence.regularisation(self.law, self.noise_dn2)
         sweeps.wiener_with(spectrum, model.otf, self.reg, 1 / grid.size)
         self.x += fft.inverse()
         self.x *= model.mask
@@ -69,7 +70,16 @@ class EvidenceWiener:
         self.facts = {
             "prior_slope": self.law.slope, "prior_log_power": self.law.log_power, "flat_dn": self.level,
             "background_dn": self.stray, "noise_dn": self.noise.variance_dn2(mean) ** 0.5, "mean_dn": mean,
+            "quality": self._quality(fit),
         }  # fmt: skip
+
+    def _quality(self, fit: Fit) -> dict[str, float | None]:
+        limit = quality.cutoff(self.evidence, fit.law, self.noise_dn2, self.model.grid.n, self.geometry)
+        return {
+            "structure_nats": quality.structure_nats(self.evidence, fit.seen, fit.levels, self.noise_dn2),
+            "cutoff_per_px": limit.cycles_per_px,
+            "resolution_um": limit.half_period_um,
+        }
 
     def _blur(self) -> None:
         """blurred = h * x."""
@@ -86,6 +96,8 @@ class EvidenceWiener:
         """Hand the picture over: positive, dark outside the field."""
         np.maximum(self.x, 0, out=out)
         out *= self.model.mask
+        noise_dn = float(self.noise.variance_dn2(self.level) ** 0.5)
+        self.facts["quality"]["coverage"] = quality.coverage(out, self.model.mask, noise_dn)
 
 
 class Variation(EvidenceWiener):
@@ -93,8 +105,8 @@ class Variation(EvidenceWiener):
 
     rounds = 12
 
-    def __init__(self, model: Model, sensor: Sensor, planner: Planner) -> None:
-        super().__init__(model, sensor)
+    def __init__(self, model: Model, calibration: Calibration, planner: Planner) -> None:
+        super().__init__(model, calibration)
         self._data: RealFft = planner.plan(model.grid.shape)
         self._image: RealFft = model.fft
         shape = model.grid.shape

@@ -45,7 +45,7 @@ def simulate(spec: InstrumentSpec, folder: Path, refraction: Refraction = EMMETR
     plan = {**effects(world, electrons, float((counts >= spec.camera.white_dn).mean())), **left_out(world)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        tifffile.imwrite(folder / "raw.tiff", counts)
+        tifffile.imwrite(folder / "raw.tiff", counts, description=json.dumps({"simulated": True}))
         np.save(folder / "truth.npy", world.truth(colour))
         tifffile.imwrite(folder / "psf.tiff", fitted(world.psf(colour), world.shape))
         _write_vessels(world, folder / "vessels.png")

@@ -9,7 +9,7 @@ from device.values import Psf, Sensor
 from tests import scenes
 
 SHAPE = (60, 84)
-METHODS = ("tikhonov", "gradient", "evidence", "variation")
+METHODS = ("tikhonov", "gradient", "evidence", "variation", "open")
 
 
 def frame(level: float = 2000.0, seed: int = 1) -> np.ndarray:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -128,8 +129,9 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """A world whose light is already traced, and its calibration: the same for every test."""
-    world = World(spec, VirtualClock())
+    """A world whose light is already traced, and its calibration: the same for every test, and half as fine again."""
+    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
+    world = World(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}), VirtualClock())
     for colour in (spec.light.colour, spec.light.preview_colour):
         world.electrons_per_s(colour)
     return world, simulated_calibration(world)
@@ -138,35 +140,58 @@ def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
 MakeRig = Callable[..., Rig]
 
 
-@pytest.fixture
-def make_rig(tmp_path: Path, template: tuple[World, Calibration], plans: Path) -> Iterator[MakeRig]:
-    """Build instruments: `camera` wraps the simulated one, `store` gives its options, `max_on_s` is the guard's."""
+@pytest.fixture(scope="session")
+def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
+    """Build an instrument: `camera` wraps the simulated one, `store` gives its options, `max_on_s` is the guard's."""
     dark_world, calibration = template
+
+    def built(
+        folder: Path,
+        undo: ExitStack,
+        camera: Callable[[Camera], Camera] = lambda camera: camera,
+        max_on_s: float = 30.0,
+        store: dict[str, Any] | None = None,
+    ) -> Rig:
+        clock, died = GateClock(), Event()
+        scene = copy(dark_world)
+        scene.clock, scene.faults = clock, set()
+        light = GuardedLight(SimLight(scene), clock, max_on_s)
+        head = Head(scene.spec, camera(SimCamera(scene)), light, calibration)
+        shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
+        bulletin = Bulletin()
+        exam = Exam(head, shelf, bulletin, clock, plans, died.set)
+        undo.callback(exam.close)
+        undo.callback(clock.gate.set)
+        return Rig(scene, clock, shelf, bulletin, exam, create_app(exam), died)
+
+    return built
+
+
+@pytest.fixture
+def make_rig(build: Callable[..., Rig], tmp_path: Path) -> Iterator[MakeRig]:
     with ExitStack() as undo:
-
-        def made(
-            camera: Callable[[Camera], Camera] = lambda camera: camera,
-            max_on_s: float = 30.0,
-            store: dict[str, Any] | None = None,
-        ) -> Rig:
-            clock, died = GateClock(), Event()
-            scene = copy(dark_world)
-            scene.clock, scene.faults = clock, set()
-            light = GuardedLight(SimLight(scene), clock, max_on_s)
-            head = Head(scene.spec, camera(SimCamera(scene)), light, calibration)
-            shelf = undo.enter_context(Store(tmp_path / "shelf", **{"reserve_bytes": 0, **(store or {})}))
-            bulletin = Bulletin()
-            exam = Exam(head, shelf, bulletin, clock, plans, died.set)
-            undo.callback(exam.close)
-            undo.callback(clock.gate.set)
-            return Rig(scene, clock, shelf, bulletin, exam, create_app(exam), died)
-
-        yield made
+        yield partial(build, tmp_path, undo)
 
 
 @pytest.fixture
 def rig(make_rig: MakeRig) -> Rig:
     return make_rig()
+
+
+@pytest.fixture(scope="module")
+def lasting_rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    with ExitStack() as undo:
+        yield build(tmp_path_factory.mktemp("lasting"), undo)
+
+
+@pytest.fixture
+def old_rig(lasting_rig: Rig) -> Iterator[Rig]:
+    """An instrument that has been used before: planning a new one takes a second. It is well and dark afterwards."""
+    yield lasting_rig
+    lasting_rig.world.faults.clear()
+    lasting_rig.clock.gate.set()
+    until(lambda: lasting_rig.world.glow is None)
+    assert not lasting_rig.died.is_set()
 
 
 def until(holds: Callable[[], bool], patience_s: float = 15.0) -> None:

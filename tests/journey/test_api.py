@@ -55,7 +55,7 @@ def test_every_leaf_of_the_error_tree_has_its_status_and_its_words() -> None:
     assert DiffuscopeError in STATUS  # whatever is added has at least this one
 
 
-def test_a_press_answers_201_with_the_capture_and_links_that_work(rig: Any) -> None:
+def test_a_press_answers_201_with_the_capture_and_links_that_work(old_rig: Any) -> None:
     async def story(client: httpx.AsyncClient) -> None:
         answer = await client.post("/api/captures", json=OD)
         assert answer.status_code == 201
@@ -69,10 +69,10 @@ def test_a_press_answers_201_with_the_capture_and_links_that_work(rig: Any) -> N
             file = await client.get(link)
             assert file.status_code == 200
             assert file.headers["content-type"] == media[name]
-            assert file.content == rig.store.read(made["id"], link.rsplit("/", 1)[1])
+            assert file.content == old_rig.store.read(made["id"], link.rsplit("/", 1)[1])
         assert (await client.get(made["links"]["report"])).json() == made["report"] | {"simulated": True}
 
-    rig.ask(story)
+    old_rig.ask(story)
 
 
 def test_a_second_press_while_busy_is_409_with_a_remedy(rig: Any) -> None:
@@ -108,10 +108,10 @@ def test_a_request_that_the_network_doubles_makes_one_picture(rig: Any) -> None:
 
 
 @pytest.mark.parametrize(("fault", "status"), [("camera.missing", 503), ("camera.stalled", 503), ("light.fault", 423)])
-def test_a_broken_part_is_answered_with_its_own_words(rig: Any, fault: str, status: int) -> None:
-    rig.world.faults.add(fault)
-    refused(rig.request("POST", "/api/captures", json=OD), status, fault)
-    assert rig.world.glow is None
+def test_a_broken_part_is_answered_with_its_own_words(old_rig: Any, fault: str, status: int) -> None:
+    old_rig.world.faults.add(fault)
+    refused(old_rig.request("POST", "/api/captures", json=OD), status, fault)
+    assert old_rig.world.glow is None
 
 
 def test_a_full_shelf_is_507_and_nothing_is_listed(make_rig: Any) -> None:
@@ -145,54 +145,56 @@ def test_the_list_is_newest_first_and_can_be_read_in_parts(rig: Any) -> None:
     "path",
     ["/api/captures/nobody", "/api/captures/nobody/picture.png", "/api/captures/..%2f..%2fetc", "/api/captures/%00"],
 )
-def test_what_was_never_kept_is_404(rig: Any, path: str) -> None:
-    answer = rig.request("GET", path)
+def test_what_was_never_kept_is_404(old_rig: Any, path: str) -> None:
+    answer = old_rig.request("GET", path)
     assert answer.status_code == 404
     assert set(answer.json()) == {"code", "message", "remedy"}
 
 
-def test_a_file_that_no_capture_has_is_404_and_a_strange_name_422(rig: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    refused(rig.request("GET", f"/api/captures/{kept.id}/other.png"), 404, "store.unknown")
+def test_a_file_that_no_capture_has_is_404_and_a_strange_name_422(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OD").result(30)
+    refused(old_rig.request("GET", f"/api/captures/{kept.id}/other.png"), 404, "store.unknown")
     for name in ("shelf.sqlite", "..%5c..%5cpasswd", "RAW.TIFF", "raw.tiff.bak"):
-        refused(rig.request("GET", f"/api/captures/{kept.id}/{name}"), 422, "input")
+        refused(old_rig.request("GET", f"/api/captures/{kept.id}/{name}"), 422, "input")
 
 
-def test_a_damaged_file_is_said_and_its_neighbours_still_come(rig: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    (rig.store.folder / "captures" / kept.id / "picture.png").write_bytes(b"not what was kept")
-    refused(rig.request("GET", f"/api/captures/{kept.id}/picture.png"), 500, "store.damaged")
-    assert rig.request("GET", f"/api/captures/{kept.id}/raw.tiff").status_code == 200
+def test_a_damaged_file_is_said_and_its_neighbours_still_come(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OD").result(30)
+    (old_rig.store.folder / "captures" / kept.id / "picture.png").write_bytes(b"not what was kept")
+    refused(old_rig.request("GET", f"/api/captures/{kept.id}/picture.png"), 500, "store.damaged")
+    assert old_rig.request("GET", f"/api/captures/{kept.id}/raw.tiff").status_code == 200
 
 
 @pytest.mark.parametrize(
     "body", [{}, {"eye": "left"}, {"eye": None}, {"eye": "OD", "lamp": 1}, {"eye": "OD", "key": "short"}, [], "OD"]
 )
-def test_a_press_that_no_button_sends_is_422_with_the_place_of_the_mistake(rig: Any, body: Any) -> None:
-    words = refused(rig.request("POST", "/api/captures", json=body), 422, "input")
+def test_a_press_that_no_button_sends_is_422_with_the_place_of_the_mistake(old_rig: Any, body: Any) -> None:
+    before = old_rig.store.captures()
+    words = refused(old_rig.request("POST", "/api/captures", json=body), 422, "input")
     assert words["message"].startswith("body")
-    assert rig.store.captures() == []
+    assert old_rig.store.captures() == before
 
 
-def test_a_wrong_eye_is_told_which_eyes_there_are(rig: Any) -> None:
-    words = refused(rig.request("POST", "/api/captures", json={"eye": "left"}), 422, "input")
+def test_a_wrong_eye_is_told_which_eyes_there_are(old_rig: Any) -> None:
+    words = refused(old_rig.request("POST", "/api/captures", json={"eye": "left"}), 422, "input")
     assert "body.eye" in words["message"]
     assert "OD" in words["message"]
     assert "OS" in words["message"]
-    refused(rig.request("POST", "/api/captures", content=b"{not json"), 422, "input")
+    refused(old_rig.request("POST", "/api/captures", content=b"{not json"), 422, "input")
 
 
-def test_a_body_too_large_or_of_unknown_length_is_refused_before_it_is_read(rig: Any) -> None:
-    words = refused(rig.request("POST", "/api/captures", content=b" " * 20_000 + b'{"eye": "OD"}'), 422, "input")
+def test_a_body_too_large_or_of_unknown_length_is_refused_before_it_is_read(old_rig: Any) -> None:
+    before = old_rig.store.captures()
+    words = refused(old_rig.request("POST", "/api/captures", content=b" " * 20_000 + b'{"eye": "OD"}'), 422, "input")
     assert "too large" in words["message"]
 
     async def drip() -> Any:
         yield b'{"eye": '
         raise AssertionError("nobody should read this")
 
-    refused(rig.request("POST", "/api/captures", content=drip()), 422, "input")
-    refused(rig.request("POST", "/api/captures", content=b"{}", headers={"Content-Length": "-1"}), 422, "input")
-    assert rig.store.captures() == []
+    refused(old_rig.request("POST", "/api/captures", content=drip()), 422, "input")
+    refused(old_rig.request("POST", "/api/captures", content=b"{}", headers={"Content-Length": "-1"}), 422, "input")
+    assert old_rig.store.captures() == before
 
 
 UNKNOWN = [("GET", "/nowhere", 404), ("GET", "/api/nowhere", 404), ("GET", "/web/nowhere.js", 404),
@@ -201,9 +203,9 @@ UNKNOWN = [("GET", "/nowhere", 404), ("GET", "/api/nowhere", 404), ("GET", "/web
 
 @pytest.mark.parametrize(("method", "path", "status"), UNKNOWN)
 def test_an_address_that_does_not_exist_is_refused_in_the_same_shape(
-    rig: Any, method: str, path: str, status: int
+    old_rig: Any, method: str, path: str, status: int
 ) -> None:
-    answer = rig.request(method, path)
+    answer = old_rig.request(method, path)
     refused(answer, status, f"http.{status}")
     assert ("allow" in answer.headers) == (status == 405)
 
@@ -241,33 +243,33 @@ def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> Non
     refused(answers["unforeseen"], 500, "fault")
 
 
-def test_the_page_and_its_scripts_are_served(rig: Any) -> None:
-    page = rig.request("GET", "/")
+def test_the_page_and_its_scripts_are_served(old_rig: Any) -> None:
+    page = old_rig.request("GET", "/")
     assert page.headers["content-type"].startswith("text/html")
     assert "<script" in page.text
-    assert "javascript" in rig.request("GET", "/web/app.js").headers["content-type"]
+    assert "javascript" in old_rig.request("GET", "/web/app.js").headers["content-type"]
 
 
-def test_status_and_health_say_what_it_is_and_whether_it_works(rig: Any, wait_until: Callable[..., None]) -> None:
-    status = rig.request("GET", "/api/status").json()
+def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wait_until: Callable[..., None]) -> None:
+    status = old_rig.request("GET", "/api/status").json()
     assert status["kind"] == "simulated"
     assert status["state"] == "aim"
-    assert status["shape"] == [270, 480]
+    assert status["shape"] == [135, 240]
     assert status["problem"] is None
-    assert status["field_px"] == pytest.approx(33.4 * 3.8956, rel=0.01)
-    assert rig.request("GET", "/api/health").json()["ok"] is True
-    rig.world.faults.add("camera.missing")
-    rig.exam.preview(0, wait_s=0.0)
-    wait_until(lambda: rig.exam.problem is not None)
-    assert rig.request("GET", "/api/status").json()["problem"]["code"] == "camera.missing"
-    assert rig.request("GET", "/api/health").json()["ok"] is False
-    rig.world.faults.clear()
-    assert rig.request("POST", "/api/captures", json=OD).status_code == 201
-    assert rig.request("GET", "/api/health").json()["ok"] is True
+    assert status["field_px"] == pytest.approx(33.4 * 1.9478, rel=0.01)
+    assert old_rig.request("GET", "/api/health").json()["ok"] is True
+    old_rig.world.faults.add("camera.missing")
+    old_rig.exam.preview(0, wait_s=0.0)
+    wait_until(lambda: old_rig.exam.problem is not None)
+    assert old_rig.request("GET", "/api/status").json()["problem"]["code"] == "camera.missing"
+    assert old_rig.request("GET", "/api/health").json()["ok"] is False
+    old_rig.world.faults.clear()
+    assert old_rig.request("POST", "/api/captures", json=OD).status_code == 201
+    assert old_rig.request("GET", "/api/health").json()["ok"] is True
 
 
-def test_openapi_describes_what_is_served(rig: Any) -> None:
-    book = rig.request("GET", "/api/openapi.json").json()
+def test_openapi_describes_what_is_served(old_rig: Any) -> None:
+    book = old_rig.request("GET", "/api/openapi.json").json()
     assert book["openapi"].startswith("3.")
     fixed = {
         "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
@@ -284,7 +286,7 @@ def test_openapi_describes_what_is_served(rig: Any) -> None:
 # Live
 
 
-def test_previews_come_with_rising_numbers_and_their_age(rig: Any) -> None:
+def test_previews_come_with_rising_numbers_and_their_age(old_rig: Any) -> None:
     async def story(client: httpx.AsyncClient) -> None:
         number = 0
         for _ in range(3):
@@ -297,7 +299,7 @@ def test_previews_come_with_rising_numbers_and_their_age(rig: Any) -> None:
                 assert picture.format == "JPEG"
         refused(await client.get("/api/preview?after=-1"), 422, "input")
 
-    rig.ask(story)
+    old_rig.ask(story)
 
 
 def test_a_preview_that_does_not_come_is_204_after_two_seconds(rig: Any) -> None:
@@ -309,11 +311,11 @@ def test_a_preview_that_does_not_come_is_204_after_two_seconds(rig: Any) -> None
     assert 1.9 < time.monotonic() - before < 6
 
 
-def test_a_press_is_told_in_order_and_its_links_lead_to_it(rig: Any, read_events: Any) -> None:
+def test_a_press_is_told_in_order_and_its_links_lead_to_it(old_rig: Any, read_events: Any) -> None:
     def enough(heard: list[Any]) -> bool:
         return bool(heard[-1][1:] == ("state", {"state": "aim"}))
 
-    heard = read_events(rig.app, enough, begin=lambda: rig.exam.press("OS"))
+    heard = read_events(old_rig.app, enough, begin=lambda: old_rig.exam.press("OS"))
     assert heard[0][:2] == (None, "beat")
     news = [event for event in heard if event[1] != "beat"]
     told = [(kind, data.get("state") or data.get("stage")) for _, kind, data in news]
@@ -325,9 +327,9 @@ def test_a_press_is_told_in_order_and_its_links_lead_to_it(rig: Any, read_events
     fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
     assert fractions == sorted(fractions)
     kept = news[4][2]
-    assert kept == rig.request("GET", f"/api/captures/{kept['id']}").json()
+    assert kept == old_rig.request("GET", f"/api/captures/{kept['id']}").json()
     assert {data["id"] for _, kind, data in news if kind == "stage"} == {kept["id"]}
-    assert rig.request("GET", news[2][2]["url"]).status_code == 200
+    assert old_rig.request("GET", news[2][2]["url"]).status_code == 200
 
 
 def test_a_page_that_was_away_hears_what_it_missed_and_nothing_twice(rig: Any, read_events: Any) -> None:
@@ -355,9 +357,9 @@ def test_a_capture_that_was_damaged_does_not_stop_the_news_after_it(rig: Any, re
     assert [number for number, _, _ in news] == [1, 2, 3, 4, 6]
 
 
-def test_the_heart_beats_every_second_while_nothing_happens(rig: Any, read_events: Any) -> None:
+def test_the_heart_beats_every_second_while_nothing_happens(old_rig: Any, read_events: Any) -> None:
     before = time.monotonic()
-    heard = read_events(rig.app, lambda heard: len(heard) == 3)
+    heard = read_events(old_rig.app, lambda heard: len(heard) == 3)
     assert [(number, kind) for number, kind, _ in heard] == [(None, "beat")] * 3
     assert 1.9 < time.monotonic() - before < 6
 

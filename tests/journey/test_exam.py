@@ -22,49 +22,49 @@ FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
 
 
-def test_a_press_keeps_a_picture_whose_every_file_reads_back(rig: Any) -> None:
-    kept = rig.exam.press("OS").result(30)
-    assert rig.world.glow is None
-    assert rig.store.captures() == [kept]
+def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OS").result(30)
+    assert old_rig.world.glow is None
+    assert old_rig.store.captures(1) == [kept]
     assert set(kept.files) == FILES
-    raw, facts = read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))
-    dark, dark_facts = read_raw_tiff(rig.store.read(kept.id, "dark.tiff"))
-    assert raw.shape == dark.shape == (270, 480)
+    raw, facts = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
+    dark, dark_facts = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
+    assert raw.shape == dark.shape == (135, 240)
     assert raw.max() > dark.max() + 500
     assert facts["glow"] == {"colour": "green", "level": 1.0}
     assert dark_facts["glow"] is None
     assert facts["eye"] == kept.eye == "OS"
-    report = json.loads(rig.store.read(kept.id, "report.json"))
+    report = json.loads(old_rig.store.read(kept.id, "report.json"))
     assert report == kept.report | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
     assert report["seconds"]["expose"] == pytest.approx(0.2)
-    with Image.open(BytesIO(rig.store.read(kept.id, "picture.png"))) as picture:
+    with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         picture.load()
-        assert min(picture.size) > 100
-    with Image.open(BytesIO(rig.store.read(kept.id, "quick.jpg"))) as quick:
+        assert min(picture.size) > 60
+    with Image.open(BytesIO(old_rig.store.read(kept.id, "quick.jpg"))) as quick:
         quick.load()
         assert max(quick.size) <= 640
 
 
-def test_that_it_was_simulated_is_in_the_record_the_report_and_the_picture(rig: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    assert rig.store.get(kept.id).simulated is True
-    assert json.loads(rig.store.read(kept.id, "report.json"))["simulated"] is True
-    assert read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))[1]["simulated"] is True
-    with Image.open(BytesIO(rig.store.read(kept.id, "picture.png"))) as picture:
+def test_that_it_was_simulated_is_in_the_record_the_report_and_the_picture(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OD").result(30)
+    assert old_rig.store.get(kept.id).simulated is True
+    assert json.loads(old_rig.store.read(kept.id, "report.json"))["simulated"] is True
+    assert read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))[1]["simulated"] is True
+    with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         assert picture.text["simulated"] == "true"
         corner = np.asarray(picture)[-12:, :40]
     assert corner.max() > 200  # the letters of the mark, on its black band
     assert (corner < 10).mean() > 0.3
 
 
-def test_the_picture_shows_the_retina_that_was_looked_at(rig: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    raw, _ = read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))
-    dark, _ = read_raw_tiff(rig.store.read(kept.id, "dark.tiff"))
-    picture = rig.exam._full(raw, dark, simulated=True).picture
-    truth = rig.world.truth("green")
+def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OD").result(30)
+    raw, _ = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
+    dark, _ = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
+    picture = old_rig.exam._full(raw, dark, simulated=True).picture
+    truth = old_rig.world.truth("green")
     seen = truth > 0
     assert np.corrcoef(picture[seen], truth[seen])[0, 1] > 0.8
 
@@ -265,7 +265,7 @@ def test_the_lamp_rests_when_nobody_asks(rig: Any, wait_until: Callable[..., Non
 def test_aiming_leaves_the_eye_as_much_darkness_as_light(make_rig: Any) -> None:
     rig = make_rig(max_on_s=1.0)
     number = 0
-    while rig.clock.elapsed_s < 10:  # the guard would refuse after one second of debt
+    while rig.clock.elapsed_s < 6:  # the guard would refuse after one second of debt
         live = rig.exam.preview(number)
         assert live is not None
         number = live.number

@@ -109,7 +109,7 @@ def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Play
 
 def test_a_preview_of_a_recording_comes_too(folder: Path, play: Played) -> None:
     _, exam = play(folder)
-    live = exam.preview(0)
+    live = exam.preview(0, wait_s=20.0)  # two seconds are for a page; a loaded machine may take longer
     assert live is not None
     with Image.open(BytesIO(live.jpeg)) as picture:
         assert b"simulated=false" in picture.info["comment"]

@@ -173,7 +173,7 @@ def test_what_cannot_be_a_psf_is_refused_by_name(tmp_path: Path, kind: str) -> N
 def test_psfs_of_another_camera_mode_are_refused() -> None:
     psf = Psf(np.ones((4, 6), np.float32), "half.tiff")
     refuse_other_sizes((psf,), (4, 6))
-    with pytest.raises(PsfError, match="half.tiff has 4 x 6 pixels, the raw 8 x 12"):
+    with pytest.raises(PsfError, match=r"half\.tiff has 4 x 6 pixels, the raw 8 x 12"):
         refuse_other_sizes((psf,), (8, 12))
 
 
@@ -265,6 +265,13 @@ def test_a_header_that_promises_the_whole_memory_is_refused(tmp_path: Path) -> N
     refused_file(tmp_path / "huge.npy", "is not a whole")
 
 
+def read_or_refuse(path: Path) -> tuple[str, Any]:
+    try:
+        return "", read_image(path)
+    except FrameError as error:
+        return f"{error.message} {error.remedy}", None
+
+
 @pytest.mark.parametrize("name", ["grey.png", "deep.png", "grey.tiff", "packed.tiff", "colour.npy"])
 def test_a_file_cut_off_anywhere_is_refused_with_words(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
@@ -278,11 +285,10 @@ def test_a_file_cut_off_anywhere_is_refused_with_words(tmp_path: Path, name: str
     refused = 0
     for length in range(1, len(whole), max(1, len(whole) // 60)):
         path.write_bytes(whole[:length])
-        try:
-            back = read_image(path)
-        except FrameError as error:
+        words, back = read_or_refuse(path)
+        if back is None:
             refused += 1
-            assert str(path) in error.message
+            assert str(path) in words
         else:  # what was cut off was not part of the picture
             assert np.array_equal(back, image)
     assert refused > 20
@@ -298,10 +304,8 @@ def test_damaged_files_are_images_or_refused_and_nothing_else(seed: int, suffix:
         for place in rng.integers(0, min(len(data), 200), 4):
             data[place] = rng.integers(0, 256)
         path.write_bytes(data)
-        try:
-            assert read_image(path).ndim in (2, 3)
-        except FrameError as error:
-            assert error.remedy
+        words, back = read_or_refuse(path)
+        assert words if back is None else back.ndim in (2, 3)
     finally:
         path.unlink(missing_ok=True)
 

@@ -1,0 +1,78 @@
+"""How good a picture is, without knowing the truth: what the frame's own spectrum says (optics.md 8.3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.recon.evidence import BINS, Evidence, PowerLaw
+from device.values import Geometry, Image
+
+RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
+ENOUGH_NATS = 0.005  # per frequency: noise alone stays below a tenth of it, a retina at 200 e- above ten times
+FAINT_DN = 1e-9
+Series = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Where signal and noise are equal: in cycles per sensor pixel, and as the smallest half period on the retina."""
+
+    cycles_per_px: float
+    half_period_um: float | None
+
+
+def cutoff(evidence: Evidence, law: PowerLaw, noise_dn2: float, n: int, geometry: Geometry | None) -> Limit:
+    """Q3: the frequency at which |H|^2 g falls to the noise s2; the single best number about a frame.
+
+    Searched outwards over rings of the band, so that one lucky frequency far out does not count; 0 if none is above.
+    """
+    snr = evidence.power * np.exp(law.log_power - law.slope * evidence.logs) / noise_dn2
+    sums = np.bincount(evidence.bins, snr, BINS)
+    means = sums / np.maximum(np.bincount(evidence.bins, minlength=BINS), 1)
+    below = np.flatnonzero(means < 1)
+    last = int(below[0]) if below.size else BINS
+    edges = np.geomspace(evidence.low, evidence.high, BINS + 1)
+    per_px = float(edges[last]) / n if last > 0 else 0.0
+    if geometry is None or per_px == 0:
+        return Limit(per_px, None)
+    per_deg = per_px * geometry.px_per_deg
+    return Limit(per_px, 0.5 / per_deg * RETINA_UM_PER_DEG)
+
+
+def structure_nats(evidence: Evidence, seen: Series, levels: Series, noise_dn2: float) -> float:
+    """Q7: how much better the PSF's own speckle explains the spectrum than a smooth one, in nats per frequency.
+
+    Near zero where no light passed the diffuser (a lid, a hand), where nothing has structure, or where the PSF is not
+    this head's. The rival is the ring mean of what was seen: any smooth spectrum.
+    """
+    rings = np.bincount(evidence.bins, minlength=BINS)
+    smooth = (np.bincount(evidence.bins, seen, BINS) / np.maximum(rings, 1))[evidence.bins]
+    smooth = np.maximum(smooth, FAINT_DN)
+    model = evidence.power * levels[evidence.bins] + noise_dn2
+    rival = np.log(smooth) + seen / smooth
+    ours = np.log(model) + seen / model
+    return float((rival - ours).mean())
+
+
+def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
+    """Q4: the share of the field that is brighter than a third of its median, and than three times the noise."""
+    inside = picture[mask > 0.5]
+    if not inside.size:
+        return 0.0
+    bright = max(float(np.median(inside)) / 3, 3 * noise_dn)
+    return float((inside > bright).mean())
+
+
+def complaints(quality: dict[str, float | None]) -> tuple[str, ...]:
+    """What is wrong with a picture, in plain words, the most useful first; empty if nothing is."""
+    said = []
+    if (quality["saturated"] or 0) > 0.001:
+        said.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
+    nats = quality.get("structure_nats")
+    if nats is not None and nats < ENOUGH_NATS:
+        said.append("No eye was seen, or this is not this head's PSF. Centre the ring on the pupil.")
+    share = quality.get("coverage")
+    if share is not None and share < 0.75:
+        said.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")
+    return tuple(said)

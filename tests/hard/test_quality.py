@@ -1,0 +1,90 @@
+"""A bad picture must be known as bad: noise, a wrong PSF, a covered sensor, little light - and a good one as good."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device.clock import VirtualClock
+from device.recon.reconstructor import Recipe, Reconstructor
+from device.sim.calibrate import simulated_calibration
+from device.sim.camera import SimCamera
+from device.sim.light import SimLight
+from device.sim.world import World
+from device.spec import load_head
+from device.values import Calibration, Glow, Psf, Shot
+from tests import scenes
+
+HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
+SMALL = {"rows": 540, "cols": 960, "pitch_um": 10.08}
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    spec = load_head(HEAD)
+    return World(spec.model_copy(update={"camera": spec.camera.model_copy(update=SMALL)}), VirtualClock())
+
+
+@pytest.fixture(scope="module")
+def calibration(world: World) -> Calibration:
+    return simulated_calibration(world)
+
+
+def seen(world: World, exposure_s: float = 0.1) -> np.ndarray:
+    camera = SimCamera(world)
+    with SimLight(world).on(Glow("green")):
+        return camera.expose(Shot(exposure_s)).counts
+
+
+def look(calibration: Calibration, counts: np.ndarray):
+    make = Reconstructor(calibration, counts.shape, scenes.PLANNER, VirtualClock(), (Recipe("variation", 1),))
+    return make(counts).report
+
+
+@pytest.fixture(scope="module")
+def good(world: World, calibration: Calibration):
+    return look(calibration, seen(world))
+
+
+def test_a_good_picture_has_no_complaint(good) -> None:
+    assert good.warnings == ()
+    assert good.quality["coverage"] > 0.9
+    assert 60 < good.quality["resolution_um"] < 300  # optics.md 8.2: 137 um at 20 ke-, 244 um at 2 ke-
+    assert good.residual == pytest.approx(1, abs=0.25)
+
+
+def test_less_light_resolves_less(good, world: World, calibration: Calibration) -> None:
+    dim = look(calibration, seen(world, 0.04))
+    assert dim.quality["resolution_um"] > 1.15 * good.quality["resolution_um"]
+
+
+@pytest.mark.parametrize("case", ["noise", "mirrored psf"])
+def test_what_this_psf_did_not_make_is_said_to_be_no_eye(case: str, world: World, calibration: Calibration) -> None:
+    counts = seen(world)
+    if case == "noise":
+        counts = np.random.default_rng(0).poisson(600, counts.shape).astype(np.uint16)
+    else:
+        mirrored = Psf(np.ascontiguousarray(calibration.psfs[0].pixels[::-1]))
+        calibration = Calibration((mirrored,), calibration.sensor, calibration.geometry, calibration.field_deg)
+    report = look(calibration, counts)
+    assert report.quality["structure_nats"] < 0.005
+    assert any("No eye was seen" in words for words in report.warnings)
+
+
+def test_detail_that_the_frame_does_not_hold_is_not_painted(world: World, calibration: Calibration) -> None:
+    """Two objects that differ only where the OTF is empty give one picture: nothing is invented from the prior."""
+    counts = seen(world).astype(np.float32)
+    H = np.abs(np.fft.rfft2(np.fft.ifftshift(calibration.psfs[0].pixels)))
+    rng = np.random.default_rng(4)
+    hidden = np.fft.irfft2(
+        np.where(np.quantile(H, 0.2) > H, np.fft.rfft2(rng.normal(0, 1, counts.shape)), 0), counts.shape
+    )
+    hidden *= 300 / hidden.std()  # an object far stronger than the noise, which the optics does not pass
+    arriving = np.fft.irfft2(
+        np.fft.rfft2(hidden) * np.fft.rfft2(np.fft.ifftshift(calibration.psfs[0].pixels)), counts.shape
+    )
+    make = Reconstructor(calibration, counts.shape, scenes.PLANNER, VirtualClock(), (Recipe("variation", 1),))
+    without = make(counts).picture.copy()
+    with_hidden = make((counts + arriving).astype(np.float32)).picture
+    lit = without > 0
+    assert np.linalg.norm((with_hidden - without)[lit]) < 0.01 * np.linalg.norm(hidden[lit])
