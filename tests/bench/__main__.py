@@ -1,7 +1,7 @@
 """`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
 
 Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `peers` or `scaling`.
+`python -m tests.bench speed`, `deadline`, `peers` or `scaling`.
 """
 
 import os
@@ -13,11 +13,11 @@ from pathlib import Path
 from device.recon.plan import Planner, processor
 from device.sim.staged import staged
 from device.spec import load_head
-from tests.bench import peers, scaling, speed
+from tests.bench import deadline, peers, scaling, speed
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "peers", "scaling")
+PARTS = ("speed", "deadline", "peers", "scaling")
 
 
 def main(parts: list[str]) -> None:
@@ -27,12 +27,14 @@ def main(parts: list[str]) -> None:
     wanted = parts or list(PARTS)
     print(f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {platform.platform()}")
     planner = Planner(PLANS)
-    if {"speed", "peers"} & set(wanted):
+    if {"speed", "deadline", "peers"} & set(wanted):
         scene = staged(load_head(SCENE))
         if "speed" in wanted:
             speed.closed_forms(scene, planner)
             speed.rounds(scene, planner)
             speed.libraries(planner)
+        if "deadline" in wanted:
+            deadline.deadlines(scene, planner)
         if "peers" in wanted:
             peers.peers(scene, planner)
     if "scaling" in wanted:
