@@ -49,7 +49,7 @@ class Grid:
         for size in sensor:
             half, psf = size // n / 2, psf_radius_px / n
             thing = (field_radius_px + 3) / n if isfinite(field_radius_px) else half + psf
-            samples = _even_fast(ceil(thing + psf + min(half, thing + psf)) + 2)
+            samples = _fast(ceil(thing + psf + min(half, thing + psf)) + 2)
             shape.append(samples)
             window.append(min(samples, size // n))
         at = [(g - w) // 2 for g, w in zip(shape, window, strict=True)]
@@ -122,9 +122,9 @@ def support_radius_px(psf: Psf) -> float:
     return min(1.05 * reached + 2, float(radius.max() + 1))
 
 
-def _even_fast(samples: int) -> int:
-    """The next even size that an FFT likes."""
-    while (good := int(next_fast_len(samples, real=True))) % 2:
+def _fast(samples: int) -> int:
+    """The next size that an FFT likes and that eight divides: blocks of four samples still make an even torus."""
+    while (good := int(next_fast_len(samples, real=True))) % 8:
         samples = good + 1
     return good
 

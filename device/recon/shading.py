@@ -1,14 +1,16 @@
 """The low orders of a picture: an evenly bright field, its shading, and stray light, fitted through the blur.
 
 What is smooth over the whole field is what a cropped sensor determines worst by iteration and best by a small least
-squares: 45 Zernike polynomials on the field's disc, blurred once at planning, and a constant for light that never
+squares: 45 Zernike polynomials on the field's disc, blurred once per PSF, and a constant for light that never
 passed the diffuser. Without it a small sensor needs 160 rounds for what 10 then do.
 """
 
+from collections.abc import Iterator
 from math import factorial, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft as scipy_fft
 
 from device.recon.kernels import Box
 from device.recon.model import Model
@@ -26,19 +28,52 @@ class Shading:
     Without a known field there is one mode: evenly bright everywhere.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, degree: int = DEGREE) -> None:
         self._model = model
         self.box: Box = model.box
-        modes = list(_modes(model)) if isfinite(model.grid.radius) else [model.mask]
-        seen = [_blocks(model.blur(mode)[model.grid.slices]).ravel() for mode in modes]
+        known = isfinite(model.grid.radius)
+        count = (degree + 1) * (degree + 2) // 2 if known else 1
         top, bottom, left, right = self.box
-        self._modes = np.stack([mode[top:bottom, left:right].ravel() for mode in modes])
-        if isfinite(model.grid.radius):
+        self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
+        spectra = []
+        for row, mode in zip(self._modes, _modes(model, degree) if known else [model.mask], strict=True):
+            row[:] = mode[top:bottom, left:right].ravel()
+            spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
+        self._spectra = np.asarray(spectra, np.complex64)
+        self._ridge = np.full(count + known, RIDGE)
+        self._ridge[count:] = STRAY_RIDGE
+        self.refocus()
+
+    def refocus(self) -> None:
+        """Blur the modes with the model's OTF as it is now, as means over blocks, and solve for the fit anew.
+
+        A mean over blocks and a blur may change places, and a mode holds nothing finer than a block except its rim:
+        so the modes are blurred on a torus of blocks, sixteen times smaller, with the OTF's low frequencies.
+        """
+        otf, n = self._model.otf, self._block
+        rows, cols = (size // n for size in self._model.grid.shape)
+        low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
+        window = [max(size // n, 1) for size in self._model.grid.window]
+        seen = [
+            scipy_fft.irfft2(spectrum * low, (rows, cols))[: window[0], : window[1]].ravel()
+            for spectrum in self._spectra
+        ]
+        if len(self._ridge) > len(seen):
             seen.append(np.full_like(seen[0], float(seen[0].max())))  # stray light, at home in the same scale
-        ridge = np.full(len(seen), RIDGE)
-        ridge[len(modes) :] = STRAY_RIDGE
-        self._fit = self._solver(np.stack(seen), ridge)
+        self._fit = self._solver(np.stack(seen), self._ridge)
         self._stray_scale = float(seen[0].max())
+
+    @property
+    def _block(self) -> int:
+        return BLOCK if min(self._model.grid.window) >= BLOCK else 1
+
+    def _torus_of_blocks(self, mode: Image) -> Image:
+        """Means over the blocks of the torus, counted from the window's corner."""
+        n, (top, left) = self._block, self._model.grid.at
+        rows, cols = (size // n for size in mode.shape)
+        moved = np.roll(mode, (-top, -left), (0, 1))
+        means: Image = moved.reshape(rows, n, cols, n).mean(axis=(1, 3))
+        return means
 
     @staticmethod
     def _solver(seen: Image, ridge: NDArray[np.float64]) -> Image:
@@ -67,19 +102,16 @@ def _blocks(image: Image) -> Image:
     return means
 
 
-def _modes(model: Model) -> "list[Image]":
-    """Zernike polynomials up to DEGREE on the field's disc, the even field first."""
+def _modes(model: Model, degree: int) -> Iterator[Image]:
+    """Zernike polynomials up to a degree on the field's disc, the even field first."""
     rows, cols = model.grid.shape
     v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius
     u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
-    return [
-        (model.mask * _radial(n, abs(m), radius) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))).astype(
-            np.float32
-        )
-        for n in range(DEGREE + 1)
-        for m in range(-n, n + 1, 2)
-    ]
+    for n in range(degree + 1):
+        for m in range(-n, n + 1, 2):
+            turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
+            yield (model.mask * _radial(n, abs(m), radius) * turn).astype(np.float32)
 
 
 def _radial(n: int, m: int, radius: NDArray[np.float64]) -> NDArray[np.float64]:
