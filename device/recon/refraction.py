@@ -5,8 +5,9 @@ every frame. The spectral evidence of optics.md 6.2 is maximised over the stretc
 
     E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
 
-R is what remains of the frame after its smooth part, seen through the *candidate's* PSF, has been subtracted: with one
-smooth part for all candidates the answer is pulled towards that PSF by a third (the trap in every first version).
+R is what remains of the frame after its smooth part, blurred by the *candidate's* PSF, has been subtracted: blurred by
+one PSF for all candidates it pulls the answer a third of the way towards that PSF. The smooth part itself (`shading`) is
+fitted with the stored PSF for the coarse search, and again with the PSF that this found for the fine one.
 """
 
 from collections.abc import Callable
@@ -18,11 +19,11 @@ from device.errors import SettingError
 from device.recon import kernels, sweeps
 from device.recon.choose import flat_fit
 from device.recon.evidence import band
-from device.recon.geometry import Pair, support_radius_px
+from device.recon.geometry import Grid, Pair, support_radius_px
 from device.recon.kernels import Pixels
 from device.recon.model import field_radius_px, taper, tight_model
 from device.recon.noise import Noise
-from device.recon.plan import Planner, RealFft
+from device.recon.plan import Planner, RealFft, Spectrum
 from device.recon.prepare import Linear, Preparer
 from device.recon.shading import Shading
 from device.recon.warp import ElasticOtf, transform
@@ -31,21 +32,20 @@ from device.values import Calibration, Image
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
 SPAN_DPT = 9.0
-DEGREE = 3  # of the smooth part; at 6 it explains so much that the stored PSF, with which it is fitted, is preferred
 RINGS, TURNS = 20, 4
 SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from neighbouring frequencies
 FRINGES = 0.2  # cycles by which the finest speckle moves from one candidate of the coarse search to the next
 LEAST_NATS = 50.0  # the best candidate over the median one; real retinas at 10 ke- give 600 and more
 LEAST_FREQUENCIES = 500
-SD_FACTOR = 1.4  # measured: z scores over 12 frames had an rms of 1.4, neighbouring frequencies are not independent
+SD_FACTOR = 1.4  # neighbouring frequencies are not independent; with it 23 frames had z scores of rms 1.0
 
 
 @dataclass(frozen=True)
 class Refraction:
     """What a frame says about the eye: mean sphere M in dpt (positive: myopia), its standard deviation, and the curve.
 
-    `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate,
-    sorted; `nats` is how much likelier the best is than the median of the coarse search.
+    `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate of
+    the coarse search, sorted; `nats` is how much likelier its best is than its median.
     """
 
     sphere_dpt: float
@@ -80,7 +80,7 @@ class Refractor:
         n = max(1, min(round(SAMPLE_UM / geometry.pitch_um), min(shape) // 16))
         self.model = tight_model(calibration, shape, n, planner, index)
         self.grid = self.model.grid
-        self.shading = Shading(self.model, DEGREE)
+        self.shading = Shading(self.model)
         self.preparer = Preparer(calibration, self.grid)
         self.fft: RealFft = planner.plan(self.grid.window)
         self.taper = taper(self.grid.window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(self.grid.window))))
@@ -113,27 +113,40 @@ class Refractor:
         if self._where.size < LEAST_FREQUENCIES:
             return None
         frame = self.preparer(counts, dark)
-        level, _ = self.shading.fit(frame.y, self._smooth)
-        if not level > 0:
-            return None
-        self.model.fft.space[:] = self._smooth
-        self._object[:] = self.model.fft.forward()
         np.multiply(frame.good, self.taper, out=self._seen)
+        if not self._fit_smooth(frame, self.model.stored) > 0:
+            return None
         self._residual(frame, 0.0)
         noise = self._noise_power(frame)
-        return self._refraction(_Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt)))
-
-    def _refraction(self, search: "_Search") -> Refraction | None:
-        sphere_dpt = search.coarse(self.step_dpt)
-        nats = search.relief
-        if nats < LEAST_NATS:
+        coarse = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
+        sphere_dpt = coarse.ladder(self.step_dpt)
+        if coarse.relief < LEAST_NATS:
             return None
+        sphere_dpt = coarse.walk(sphere_dpt, self.step_dpt / 2)
+        self._fit_smooth(frame, self.otf(self.grid, sphere_dpt))
+        fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
         for part in (2, 4):
-            sphere_dpt = search.walk(sphere_dpt, self.step_dpt / part)
-        vertex_dpt, bend = search.parabola(sphere_dpt, self.step_dpt / 4)
+            sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
+        vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
         sd_dpt = min(SD_FACTOR * (self._spread / bend) ** 0.5, SPAN_DPT) if bend > 0 else SPAN_DPT
-        scale = 1 - self.geometry.scale_per_dpt * vertex_dpt
-        return Refraction(vertex_dpt, scale, sd_dpt, nats, tuple(sorted(search.known.items())))
+        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, tuple(sorted(coarse.known.items())))
+
+    def scale(self, m_dpt: float) -> float:
+        """How an eye with mean sphere M stretches the PSF."""
+        return 1 - self.geometry.scale_per_dpt * m_dpt
+
+    def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
+        """The OTF on a grid as an eye with mean sphere M makes it."""
+        return self.elastic.on(grid.shape, grid.n, transform(self.geometry, m_dpt))
+
+    def _fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
+        """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
+        self.model.refocus(otf)
+        self.shading.refocus()
+        level, _ = self.shading.fit(frame.y, self._smooth)
+        self.model.fft.space[:] = self._smooth
+        self._object[:] = self.model.fft.forward()
+        return level
 
     def _residual(self, frame: Linear, m_dpt: float) -> None:
         """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered."""
@@ -178,12 +191,12 @@ class _Search:
             self.known[m_dpt] = self._value(m_dpt)
         return self.known[m_dpt]
 
-    def coarse(self, step_dpt: float) -> float:
+    def ladder(self, step_dpt: float) -> float:
         """The best of an even ladder over the whole span; `relief` is its median minus its least."""
-        ladder = np.linspace(-SPAN_DPT, SPAN_DPT, 2 * max(int(np.ceil(SPAN_DPT / step_dpt)), 2) + 1)
-        values = [self(m_dpt) for m_dpt in ladder]
+        rungs = np.linspace(-SPAN_DPT, SPAN_DPT, 2 * max(int(np.ceil(SPAN_DPT / step_dpt)), 2) + 1)
+        values = [self(m_dpt) for m_dpt in rungs]
         self.relief = float(np.median(values) - min(values))
-        return float(ladder[int(np.argmin(values))])
+        return float(rungs[int(np.argmin(values))])
 
     def walk(self, m_dpt: float, step_dpt: float) -> float:
         """Downhill in equal steps until both neighbours are higher."""

@@ -28,15 +28,15 @@ class Shading:
     Without a known field there is one mode: evenly bright everywhere.
     """
 
-    def __init__(self, model: Model, degree: int = DEGREE) -> None:
+    def __init__(self, model: Model) -> None:
         self._model = model
         self.box: Box = model.box
         known = isfinite(model.grid.radius)
-        count = (degree + 1) * (degree + 2) // 2 if known else 1
+        count = (DEGREE + 1) * (DEGREE + 2) // 2 if known else 1
         top, bottom, left, right = self.box
         self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
         spectra = []
-        for row, mode in zip(self._modes, _modes(model, degree) if known else [model.mask], strict=True):
+        for row, mode in zip(self._modes, _modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
             spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
         self._spectra = np.asarray(spectra, np.complex64)
@@ -102,13 +102,13 @@ def _blocks(image: Image) -> Image:
     return means
 
 
-def _modes(model: Model, degree: int) -> Iterator[Image]:
-    """Zernike polynomials up to a degree on the field's disc, the even field first."""
+def _modes(model: Model) -> Iterator[Image]:
+    """Zernike polynomials up to DEGREE on the field's disc, the even field first."""
     rows, cols = model.grid.shape
     v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius
     u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
-    for n in range(degree + 1):
+    for n in range(DEGREE + 1):
         for m in range(-n, n + 1, 2):
             turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
             yield (model.mask * _radial(n, abs(m), radius) * turn).astype(np.float32)
