@@ -211,7 +211,8 @@ class Reconstructor:
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
             psf_index=self.psf_index, psf_scale=climb.psf_scale,
-            refraction_dpt=None if eye is None else {"sphere": -eye.sphere_dpt, "sd": eye.sd_dpt}, regularisation={k: v for k, v in facts.items() if k not in apart},
+            refraction_dpt=None if eye is None else {"sphere": -eye.sphere_dpt, "sd": eye.sd_dpt},
+            regularisation={k: v for k, v in facts.items() if k not in apart},
             noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
             quality={key: facts[key] for key in ("saturated", "missing", "mean_dn")}, warnings=tuple(warnings),
         )  # fmt: skip

@@ -1,13 +1,13 @@
 """The eye's refraction from the frame itself: the stretch of the stored PSF under which the frame is most likely.
 
-A defocused eye stretches the caustic (see `warp`), and with it the speckle of |H|^2, which is stamped on the spectrum of
+A defocused eye stretches the caustic (see `warp`), and with it the speckle of |H|^2 that is stamped on the spectrum of
 every frame. The spectral evidence of optics.md 6.2 is maximised over the stretch:
 
     E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
 
 R is what remains of the frame after its smooth part, blurred by the *candidate's* PSF, has been subtracted: blurred by
-one PSF for all candidates it pulls the answer a third of the way towards that PSF. The smooth part itself (`shading`) is
-fitted with the stored PSF for the coarse search, and again with the PSF that this found for the fine one.
+one PSF for all candidates it pulls the answer a third of the way towards that PSF. The smooth part itself (`shading`)
+is fitted with the stored PSF for the coarse search, and again with the PSF that this found for the fine one.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from device.recon.choose import flat_fit
 from device.recon.evidence import band
 from device.recon.geometry import Grid, Pair, support_radius_px
 from device.recon.kernels import Pixels
-from device.recon.model import field_radius_px, taper, tight_model
+from device.recon.model import dirichlet, field_radius_px, taper, tight_model
 from device.recon.noise import Noise
 from device.recon.plan import Planner, RealFft, Spectrum
 from device.recon.prepare import Linear, Preparer
@@ -35,7 +35,7 @@ SPAN_DPT = 9.0
 RINGS, TURNS = 20, 4
 SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from neighbouring frequencies
 FRINGES = 0.2  # cycles by which the finest speckle moves from one candidate of the coarse search to the next
-LEAST_NATS = 50.0  # the best candidate over the median one; real retinas at 10 ke- give 600 and more
+LEAST_NATS = 150.0  # best candidate over the median one: another head's PSF gives 110, retinas at 10 ke- 1200 and more
 LEAST_FREQUENCIES = 500
 SD_FACTOR = 1.4  # neighbouring frequencies are not independent; with it 23 frames had z scores of rms 1.0
 
@@ -104,12 +104,13 @@ class Refractor:
         self._ring = np.clip(np.digitize(frequency.ravel()[self._where], edges) - 1, 0, RINGS - 1)
         self._rows = np.broadcast_to(rows, frequency.shape).ravel()[self._where]
         self._cols = np.broadcast_to(cols, frequency.shape).ravel()[self._where]
+        self._share = (dirichlet(self._rows, n) * dirichlet(self._cols, n)).astype(np.float32)
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
         self._energy, self._power = (np.zeros(self._where.size, np.float32) for _ in range(2))
 
     def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
-        """The refraction behind a frame (rows, cols) in counts; None where the frame does not tell."""
+        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or lies beyond the span."""
         if self._where.size < LEAST_FREQUENCIES:
             return None
         frame = self.preparer(counts, dark)
@@ -127,9 +128,12 @@ class Refractor:
         fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
         for part in (2, 4):
             sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
+        if abs(sphere_dpt) >= SPAN_DPT:
+            return None
         vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
         sd_dpt = min(SD_FACTOR * (self._spread / bend) ** 0.5, SPAN_DPT) if bend > 0 else SPAN_DPT
-        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, tuple(sorted(coarse.known.items())))
+        curve = tuple(sorted(coarse.known.items()))
+        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve)
 
     def scale(self, m_dpt: float) -> float:
         """How an eye with mean sphere M stretches the PSF."""
@@ -161,7 +165,8 @@ class Refractor:
 
     def _unlikelihood(self, frame: Linear, noise: float, m_dpt: float) -> float:
         self._residual(frame, m_dpt)
-        otf = self.elastic.at(self._rows, self._cols, self.grid.n, transform(self.geometry, m_dpt))
+        stretch = transform(self.geometry, m_dpt)
+        otf = self.elastic.at(self._rows, self._cols, self._share, self.grid.n, stretch)
         return sweeps.unlikelihood(
             self.fft.spectrum, otf, self._where, self._ring, noise, SMEAR, TURNS,
             self._levels, self._energy, self._power,

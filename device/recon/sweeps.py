@@ -4,7 +4,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.kernels import Series, Single, Spectrum
+from device.recon.kernels import Series, Spectrum
 from device.values import Image
 
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
@@ -194,7 +194,7 @@ def _read(table: Spectrum, row: float, col: float) -> complex:
 def stretched(
     table: Spectrum, matrix: Series, rows: Series, cols: Series, row_share: Image, col_share: Image, out: Spectrum
 ) -> None:
-    """out = the table at matrix (col, row) for a grid of frequencies, times the transfer of a sample along either axis."""
+    """out = the table at matrix (col, row) for a grid of frequencies, times a sample's transfer along either axis."""
     for i in range(rows.size):
         across, down, share = matrix[0, 1] * rows[i], matrix[1, 1] * rows[i], row_share[i]
         for j in range(cols.size):
@@ -221,7 +221,7 @@ def unlikelihood(
     mixes neighbouring frequencies. `energy` and `power` are scratch of that length.
     """
     above, below = np.zeros(levels.size), np.zeros(levels.size)
-    rows, cols = seen.shape
+    cols = seen.shape[1]
     for m in range(where.size):
         f, h, b = seen[where[m] // cols, where[m] % cols], otf[m], ring[m]
         energy[m] = f.real * f.real + f.imag * f.imag

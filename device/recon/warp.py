@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from device.recon import sweeps
 from device.recon.geometry import Pair, support_radius_px
+from device.recon.kernels import Series
 from device.recon.model import dirichlet
 from device.recon.plan import Spectrum
 from device.recon.resolution import working_bin
@@ -70,20 +71,19 @@ class ElasticOtf:
 
     def on(self, shape: Pair, n: int, transform: Transform, out: Spectrum | None = None) -> Spectrum:
         """The OTF through n x n pixels on a torus of `shape` samples, (rows, cols//2 + 1), into `out` if given."""
-        rows, cols = np.fft.fftfreq(shape[0]), np.fft.rfftfreq(shape[1])
+        rows: Series = np.fft.fftfreq(shape[0]).astype(np.float64)
+        cols: Series = np.fft.rfftfreq(shape[1]).astype(np.float64)
         otf = np.empty((rows.size, cols.size), np.complex64) if out is None else out
         scaled = transform * (self.pixels / n)
         row_share, col_share = (dirichlet(f, n).astype(np.float32) for f in (rows, cols))
         sweeps.stretched(self._table, scaled, rows, cols, row_share, col_share, otf)
         return otf
 
-    def at(self, rows: NDArray[np.float64], cols: NDArray[np.float64], n: int, transform: Transform) -> Spectrum:
-        """The OTF at single frequencies, in cycles per sample of n x n pixels."""
-        otf = np.empty((rows.size, 1), np.complex64)
-        scaled = transform * (self.pixels / n)
-        share = (dirichlet(rows, n) * dirichlet(cols, n)).astype(np.float32)
-        sweeps.stretched_at(self._table, scaled, rows, cols, share, otf[:, 0])
-        return otf[:, 0]
+    def at(self, rows: Series, cols: Series, share: Image, n: int, transform: Transform) -> Spectrum:
+        """The OTF at single frequencies, in cycles per sample of n x n pixels; `share` is the sample's own transfer."""
+        otf = np.empty(rows.size, np.complex64)
+        sweeps.stretched_at(self._table, transform * (self.pixels / n), rows, cols, share, otf)
+        return otf
 
 
 def _supported(psf: Psf) -> tuple[NDArray[np.float64], Pair]:
