@@ -110,7 +110,7 @@ class Refractor:
         self._energy, self._power = (np.zeros(self._where.size, np.float32) for _ in range(2))
 
     def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
-        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or lies beyond the span."""
+        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span."""
         if self._where.size < LEAST_FREQUENCIES:
             return None
         frame = self.preparer(counts, dark)

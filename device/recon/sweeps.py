@@ -212,10 +212,10 @@ def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, sh
 
 @_jit
 def unlikelihood(
-    seen: Spectrum, otf: Spectrum, where: NDArray[np.int64], ring: NDArray[np.int64], noise: float, smear: float,
+    seen: Spectrum, otf: Spectrum, where: NDArray[np.int64], ring: NDArray[np.int64], s2: float, smear: float,
     turns: int, levels: Series, energy: Image, power: Image,
 ) -> float:  # fmt: skip
-    """Minus the log likelihood of a spectrum under S = q g + noise with the best level g of each ring; optics.md 6.2.
+    """Minus the log likelihood of a spectrum under S = q g + s2 with the best level g of each ring; optics.md 6.2.
 
     `otf` belongs to the frequencies `where` of `seen`. q = |H|^2 + smear (its mean over the ring): a tapered window
     mixes neighbouring frequencies. `energy` and `power` are scratch of that length.
@@ -234,13 +234,13 @@ def unlikelihood(
         above[:], below[:] = 0, 0
         for m in range(where.size):
             b = ring[m]
-            w = 1.0 if turn == 0 else 1 / (power[m] * levels[b] + noise)
-            above[b] += (energy[m] - noise) * power[m] * w * w
+            w = 1.0 if turn == 0 else 1 / (power[m] * levels[b] + s2)
+            above[b] += (energy[m] - s2) * power[m] * w * w
             below[b] += power[m] * power[m] * w * w
         for b in range(levels.size):
-            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * noise)
+            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * s2)
     total = 0.0
     for m in range(where.size):
-        s = power[m] * levels[ring[m]] + noise
+        s = power[m] * levels[ring[m]] + s2
         total += np.log(s) + energy[m] / s
     return total

@@ -44,7 +44,7 @@ def test_no_refraction_is_no_stretch() -> None:
 @pytest.mark.parametrize("eye", EYES)
 @pytest.mark.parametrize("n", [2, 3])
 def test_the_look_up_is_the_spectrum_of_the_stretched_psf(eye: tuple[float, float, float], n: int) -> None:
-    """2 %: the look-up has a ghost of 0.7 % along either axis at the PSF's edge; splines soften what is finer than n = 2."""
+    """2 %: the look-up has a ghost of 0.7 % along either axis at the PSF's edge; splines soften finer than n = 2."""
     matrix = transform(GEOMETRY, *eye)
     grid = Grid.tight(SHAPE, n, 50.0, 60.0)
     looked_up, transformed = ElasticOtf(PSF).on(grid.shape, n, matrix), otf(warped(PSF, matrix), grid)
