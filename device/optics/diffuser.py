@@ -140,9 +140,10 @@ def caustic(
     """The intensity on the sensor from one retinal point on the axis: float32 (n, n), sum 1, wave optics.
 
     `seed` names the diffuser; `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light
-    of its whole area. Raises SpecError where no honest grid exists. optics.md 2.1.
+    of its whole area. The grid is a relaxed eye's: another window would hold another surface. Raises SpecError where no
+    honest grid exists, or that one cannot carry so strong a refraction. optics.md 2.1.
     """
-    return caustic_on(grid_for(optics, pitch_um, refraction), optics, seed, refraction, lines)
+    return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines)
 
 
 def caustic_on(grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3) -> Image:

@@ -49,6 +49,11 @@ class ClosedForm:
         self.model, self.prior, self.mu = model, prior, mu
         self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.facts: dict[str, Any] = {}
+        self.refocus()
+
+    def refocus(self) -> None:
+        """Measure anew what depends on the model's OTF."""
+        model, prior = self.model, self.prior
         self.sample = Sample.of(model)
         self.delta = prior.psf_error * self.sample.passband_power(model.grid.n)
         self._weights = prior.slope * self.sample.gradient + prior.floor

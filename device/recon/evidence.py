@@ -46,10 +46,11 @@ class Evidence:
         rows, cols = model.grid.shape
         frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
         power = np.abs(model.otf.astype(np.complex128)) ** 2
-        self.low, self.high = _band(frequency, power, model.grid.window)
+        self.low, self.high = band(frequency, power, max(model.grid.window))
         self.where = np.flatnonzero((frequency > self.low) & (frequency < self.high))
         chosen = frequency.ravel()[self.where]
-        self.power = power.ravel()[self.where]
+        self._model = model
+        self.refocus()
         edges = np.geomspace(self.low, self.high, BINS + 1)
         self.bins = np.clip(np.digitize(chosen, edges) - 1, 0, BINS - 1)
         self.reference = float(np.sqrt(self.low * self.high))
@@ -57,6 +58,10 @@ class Evidence:
         self.logs = np.log(chosen / self.reference)
         floor = np.maximum(frequency, self.low / 5)  # a power law has no end at f = 0, a picture has
         self.all_logs: Image = np.log(floor / self.reference).astype(np.float32)
+
+    def refocus(self) -> None:
+        """Take the model's OTF as it is now; the band stays: a stretch of a few per cent does not move it."""
+        self.power = np.abs(self._model.otf.ravel()[self.where].astype(np.complex128)) ** 2
 
     def fit(self, spectrum: NDArray[np.complex64], noise_dn2: float) -> "Fit":
         """The power law under which |spectrum|^2 is most likely, given the noise power per frequency.
@@ -81,8 +86,9 @@ class Evidence:
         return reg
 
 
-def _band(frequency: NDArray[np.float64], power: NDArray[np.float64], window: tuple[int, int]) -> tuple[float, float]:
-    low = min(16 / max(window), 0.1)
+def band(frequency: NDArray[np.float64], power: NDArray[np.float64], samples: int) -> tuple[float, float]:
+    """From 16 cycles across `samples` to where the mean |H|^2 is a twentieth of its best; cycles per sample."""
+    low = min(16 / samples, 0.1)
     edges = np.linspace(low, 0.45, 24)
     rings = np.digitize(frequency.ravel(), edges)
     sums = np.bincount(rings, power.ravel(), edges.size + 1)[1:-1]

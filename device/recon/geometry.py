@@ -49,7 +49,8 @@ class Grid:
         for size in sensor:
             half, psf = size // n / 2, psf_radius_px / n
             thing = (field_radius_px + 3) / n if isfinite(field_radius_px) else half + psf
-            samples = _even_fast(ceil(thing + psf + min(half, thing + psf)) + 2)
+            blocks = 8 if isfinite(field_radius_px) else 2  # shading is fitted on blocks of four
+            samples = _fast(ceil(thing + psf + min(half, thing + psf)) + 2, blocks)
             shape.append(samples)
             window.append(min(samples, size // n))
         at = [(g - w) // 2 for g, w in zip(shape, window, strict=True)]
@@ -128,9 +129,9 @@ def support_radius_px(psf: Psf) -> float:
     return min(1.05 * reached + 2, float(radius.max() + 1))
 
 
-def _even_fast(samples: int) -> int:
-    """The next even size that an FFT likes."""
-    while (good := int(next_fast_len(samples, real=True))) % 2:
+def _fast(samples: int, multiple: int) -> int:
+    """The next size that an FFT likes and that `multiple` divides: blocks of four samples still make an even torus."""
+    while (good := int(next_fast_len(samples, real=True))) % multiple:
         samples = good + 1
     return good
 

@@ -23,6 +23,9 @@ class Solver(Protocol):
     facts: dict[str, Any]
     rounds: int
 
+    def refocus(self) -> None:
+        """Measure anew what depends on the model's OTF, which has changed."""
+
     def start(self, frame: Linear) -> None:
         """Take a frame and make a first picture in `x`."""
 

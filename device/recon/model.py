@@ -12,7 +12,7 @@ class Model:
     """One PSF on one grid: its planned FFT, its OTF, the field, and the field as the sensor would see it.
 
     `flat` (the window's shape) is crop(h * mask): what an evenly bright field would give. `fade` tapers a window that
-    the picture's light runs past; None where it does not.
+    the picture's light runs past; None where it does not. `stored` is the OTF as calibrated, `otf` the one in use.
     """
 
     def __init__(self, psf: Psf, grid: Grid, planner: Planner) -> None:
@@ -20,10 +20,15 @@ class Model:
         self.fft: RealFft = planner.plan(grid.shape)
         self.mask = grid.field()
         self.box = _box(self.mask)
-        self.otf = otf(psf, grid)
-        self.flat = np.ascontiguousarray(self.blur(self.mask)[grid.slices])
-        self.fade = taper(grid.window) if _runs_past_the_edge(self.flat) else None
         self.row_gradient, self.col_gradient = gradient_symbol(grid.shape)
+        self.stored = otf(psf, grid)
+        self.refocus(self.stored)
+
+    def refocus(self, otf: Spectrum) -> None:
+        """See through another OTF on the same grid, one that a stretched PSF has; costs one FFT pair."""
+        self.otf = otf
+        self.flat = np.ascontiguousarray(self.blur(self.mask)[self.grid.slices])
+        self.fade = taper(self.grid.window) if _runs_past_the_edge(self.flat) else None
 
     def blur(self, image: Image) -> Image:
         """h * x on the grid, as a new array."""
@@ -62,11 +67,11 @@ def otf(psf: Psf, grid: Grid) -> Spectrum:
     fine = scipy_fft.rfft2(wrapped(psf, (rows * n, cols * n)).astype(np.float64))
     down = np.fft.fftfreq(rows, 1 / rows).astype(int)
     low = fine[down][:, : cols // 2 + 1]
-    kernel = np.outer(_dirichlet(np.fft.fftfreq(rows), n), _dirichlet(np.fft.rfftfreq(cols), n))
+    kernel = np.outer(dirichlet(np.fft.fftfreq(rows), n), dirichlet(np.fft.rfftfreq(cols), n))
     return np.asarray(low * kernel / low[0, 0].real, np.complex64)
 
 
-def _dirichlet(frequency: np.ndarray, n: int) -> np.ndarray:
+def dirichlet(frequency: np.ndarray, n: int) -> np.ndarray:
     """The transfer of a mean over n pixels, at frequencies in cycles per sample of n pixels."""
     return np.asarray(np.sinc(frequency) / np.sinc(frequency / n))
 

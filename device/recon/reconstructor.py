@@ -13,9 +13,10 @@ from device.errors import FrameError, SettingError
 from device.recon.kernels import Pixels
 from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
-from device.recon.plan import Planner
+from device.recon.plan import Planner, Spectrum
 from device.recon.prepare import Preparer
 from device.recon.quality import complaints
+from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
@@ -72,6 +73,11 @@ class Cost:
         """The worst of the last dozen; nothing is known to be free."""
         return max(self._seen, default=0.0)
 
+    def doubt(self) -> None:
+        """Forget the oldest run: what was refused because of one bad moment must get its chance again."""
+        if len(self._seen) > 1:
+            self._seen.popleft()
+
 
 class _Rung:
     """Everything that one recipe needs, planned: its preparer, its solver, its output, its cost."""
@@ -82,15 +88,28 @@ class _Rung:
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
         self.preparer = Preparer(calibration, self.grid)
+        self.scale = 1.0
         self.solver: Solver = method.build(self.model, calibration, planner)
         self.most = self.solver.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
         self.start_cost, self.round_cost, self.finish_cost = Cost(), Cost(), Cost()
 
+    def refocus(self, otf: Spectrum, scale: float) -> None:
+        """See from now on through the OTF of the PSF stretched by `scale`."""
+        self.scale = scale
+        if otf is not self.model.otf:
+            self.model.refocus(otf)
+            self.solver.refocus()
+
     @property
     def picture(self) -> Image:
         """What was solved last: (rows, cols) or (rows, cols, 3) of the grid."""
         return self.planes[0] if len(self.planes) == 1 else np.moveaxis(self.planes, 0, -1)
+
+    def doubt(self) -> None:
+        """It was refused: let its costs age, so that one bad moment does not refuse it for ever."""
+        for cost in (self.start_cost, self.round_cost, self.finish_cost):
+            cost.doubt()
 
     @property
     def shown(self) -> Image:
@@ -102,17 +121,24 @@ class Reconstructor:
     """Plans once for a calibration and a sensor shape; then turns frames into pictures within a deadline.
 
     `recipes` run in order; the last is the wanted picture, those before it are quick looks. One thread at a time.
+    With `refract`, where geometry and field are known, the frame tells the eye's refraction after the quick look, and
+    what follows is solved with the PSF of that eye.
     """
 
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
-        recipes: tuple[Recipe, ...] = (), psf_index: int = 0,
+        recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
     ) -> None:  # fmt: skip
         recipes = recipes or ladder(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
         self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
         self.rungs = [_Rung(recipe, calibration, shape, planner, psf_index) for recipe in recipes]
+        self.refractor = None
+        if refract and can_refract(calibration):
+            self.refractor = Refractor(calibration, shape, planner, psf_index)
+        self._sharp = self.rungs[min(1, len(self.rungs) - 1) :]  # what is solved with the eye's own PSF
+        self._find_cost, self._refocus_cost = Cost(), Cost()
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -121,7 +147,10 @@ class Reconstructor:
         self(noise, rounds=1)  # compiles, where no compiled code is kept
         for rung in self.rungs:
             rung.start_cost, rung.round_cost, rung.finish_cost = Cost(), Cost(), Cost()
+        self._find_cost = Cost()
         self(noise, rounds=2)
+        for m_dpt in (1.0, None):
+            self._refocus(m_dpt)
 
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False,
@@ -135,6 +164,8 @@ class Reconstructor:
         climb = _Climb(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         for rung in self.rungs:
+            if rung is self._sharp[0]:
+                self._focus(climb)
             if not climb.up(rung):
                 break
             if watch is not None:
@@ -143,8 +174,33 @@ class Reconstructor:
         picture = to_sensor(climb.done.picture, climb.done.grid)
         finished_s = self.clock.now_s()
         climb.done.finish_cost.add(finished_s - solved_s)
-        seconds = {"solve": solved_s - begin_s, "upsample": finished_s - solved_s}
+        focused_s = climb.focus_s
+        seconds = {"solve": solved_s - begin_s - focused_s, "refract": focused_s, "upsample": finished_s - solved_s}
         return Reconstruction(picture, self._report(climb, seconds), simulated)
+
+    def _focus(self, climb: "_Climb") -> None:
+        """Ask the frame for the eye's refraction if time allows, and see through the PSF of that eye."""
+        begin_s = self.clock.now_s()
+        if self.refractor is None:
+            return
+        if climb.fits(self._find_cost.seconds + self._refocus_cost.seconds + climb.cost_s(self._sharp[0])):
+            climb.refraction = self.refractor.find(*climb.brightest())
+            self._find_cost.add(self.clock.now_s() - begin_s)
+        self._refocus(climb.sharp_dpt)
+        climb.focus_s = self.clock.now_s() - begin_s
+
+    def _refocus(self, m_dpt: float | None) -> None:
+        """The PSF of an eye with mean sphere M from now on; None: the stored one."""
+        if self.refractor is None:
+            return
+        begin_s = self.clock.now_s()
+        for rung in self._sharp:
+            if m_dpt is None:
+                rung.refocus(rung.model.stored, 1.0)
+            else:
+                rung.refocus(self.refractor.otf(rung.grid, m_dpt), self.refractor.scale(m_dpt))
+        if m_dpt is not None:
+            self._refocus_cost.add(self.clock.now_s() - begin_s)
 
     def _refuse_other_shapes(self, counts: Pixels) -> None:
         check_image_shape(counts.shape)
@@ -158,10 +214,15 @@ class Reconstructor:
         dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
         quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
         warnings = ("There is no signal in this frame.",) if dark else complaints(quality)
+        eye = climb.refraction
+        if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
+            warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
-            psf_index=self.psf_index, regularisation={k: v for k, v in facts.items() if k not in apart},
+            psf_index=self.psf_index, psf_scale=climb.psf_scale,
+            refraction_dpt=None if eye is None else {"sphere": -eye.sphere_dpt, "sd": eye.sd_dpt},
+            regularisation={k: v for k, v in facts.items() if k not in apart},
             noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
             quality=quality, warnings=warnings,
         )  # fmt: skip
@@ -179,18 +240,40 @@ class _Climb:
         self.done: _Rung = owner.rungs[0]
         self.facts: dict[str, Any] = {}
         self.rounds_done, self.stopped = 0, "done"
+        self.refraction: Refraction | None = None
+        self.focus_s, self.psf_scale = 0.0, 1.0
+
+    @property
+    def sharp_dpt(self) -> float | None:
+        """The mean sphere with which to see on; None where the stored PSF is as good as any."""
+        eye = self.refraction
+        return None if eye is None or eye.in_doubt else eye.sphere_dpt
+
+    def fits(self, cost_s: float) -> bool:
+        """Whether something of that cost fits into what is left."""
+        return self.deadline is None or self.deadline.fits(cost_s)
+
+    def cost_s(self, rung: _Rung) -> float:
+        """What a rung takes at the least."""
+        return self.channels * (rung.start_cost.seconds + rung.round_cost.seconds) + rung.finish_cost.seconds
+
+    def brightest(self) -> tuple[Pixels, Pixels | None]:
+        """The channel with the most light, and its dark frame."""
+        c = 0 if self.channels == 1 else int(np.argmax(np.nanmean(self.counts, axis=(0, 1))))
+        return _plane(self.counts, c), None if self.dark is None else _plane(self.dark, c)
 
     def up(self, rung: _Rung) -> bool:
         """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""
-        cost_s = self.channels * (rung.start_cost.seconds + rung.round_cost.seconds) + rung.finish_cost.seconds
-        if self.facts and self.deadline is not None and not self.deadline.fits(cost_s):
+        if self.facts and not self.fits(self.cost_s(rung)):
             self.stopped = "deadline"
+            rung.doubt()
             return False
         if len(rung.planes) != self.channels:
             rung.planes = np.zeros((self.channels, *rung.grid.shape), np.float32)
         for c in range(self.channels):
             self._channel(rung, c)
         self.done = rung
+        self.psf_scale = rung.scale
         return True
 
     def _channel(self, rung: _Rung, c: int) -> None:

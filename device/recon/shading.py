@@ -1,14 +1,16 @@
 """The low orders of a picture: an evenly bright field, its shading, and stray light, fitted through the blur.
 
 What is smooth over the whole field is what a cropped sensor determines worst by iteration and best by a small least
-squares: 45 Zernike polynomials on the field's disc, blurred once at planning, and a constant for light that never
+squares: 45 Zernike polynomials on the field's disc, blurred once per PSF, and a constant for light that never
 passed the diffuser. Without it a small sensor needs 160 rounds for what 10 then do.
 """
 
+from collections.abc import Iterator
 from math import factorial, isfinite
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft as scipy_fft
 
 from device.recon.kernels import Box
 from device.recon.model import Model
@@ -21,7 +23,7 @@ STRAY_RIDGE = 1e-2  # where the whole sensor is lit a constant is nearly a mode:
 
 
 class Shading:
-    """The modes of one model, and the matrix that turns a frame into their coefficients.
+    """The modes of one model, and the matrices that turn a frame into their coefficients.
 
     Without a known field there is one mode: evenly bright everywhere.
     """
@@ -29,27 +31,67 @@ class Shading:
     def __init__(self, model: Model) -> None:
         self._model = model
         self.box: Box = model.box
-        modes = list(_modes(model)) if isfinite(model.grid.radius_samples) else [model.mask]
-        seen = [_blocks(model.blur(mode)[model.grid.slices]).ravel() for mode in modes]
+        known = isfinite(model.grid.radius_samples)
+        count = (DEGREE + 1) * (DEGREE + 2) // 2 if known else 1
         top, bottom, left, right = self.box
-        self._modes = np.stack([mode[top:bottom, left:right].ravel() for mode in modes])
-        if isfinite(model.grid.radius_samples):
-            seen.append(np.full_like(seen[0], float(seen[0].max())))  # stray light, at home in the same scale
-        ridge = np.full(len(seen), RIDGE)
-        ridge[len(modes) :] = STRAY_RIDGE
-        self._fit = self._solver(np.stack(seen), ridge)
-        self._stray_scale = float(seen[0].max())
+        self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
+        spectra, seen = [], []
+        for row, mode in zip(self._modes, _modes(model) if known else [model.mask], strict=True):
+            row[:] = mode[top:bottom, left:right].ravel()
+            spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
+            seen.append(_blocks(model.blur(mode)[model.grid.slices]).ravel())
+        self._spectra = np.asarray(spectra, np.complex64)
+        self._ridge = np.full(count + known, RIDGE)
+        self._ridge[count:] = STRAY_RIDGE
+        self._beyond_blocks = np.stack(seen) - self._blurred_on_blocks()
+        self.refocus()
 
-    @staticmethod
-    def _solver(seen: Image, ridge: NDArray[np.float64]) -> Image:
+    def refocus(self) -> None:
+        """Blur the modes with the model's OTF as it is now, as means over blocks, and prepare the fit anew."""
+        seen = self._blurred_on_blocks() + self._beyond_blocks
+        self._stray_scale = float(seen[0].max())
+        if len(self._ridge) > len(seen):
+            seen = np.vstack([seen, np.full_like(seen[:1], self._stray_scale)])  # at home in the same scale
+        self._normal_equations(seen)
+
+    def _blurred_on_blocks(self) -> Image:
+        """What the window would see of each mode, as means over blocks: (modes, blocks) float32.
+
+        A mean over blocks and a blur may change places, and a mode holds nothing finer than a block except its rim: so
+        this is done on a torus of blocks, sixteen times smaller, with the OTF's low frequencies. What the rim adds is
+        measured once, on all samples (`_beyond_blocks`), and changes little with the PSF.
+        """
+        otf, n = self._model.otf, self._block
+        rows, cols = (size // n for size in self._model.grid.shape)
+        low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
+        high, wide = (size // n for size in self._model.grid.window)
+        seen = np.empty((len(self._spectra), high * wide), np.float32)
+        for row, spectrum in zip(seen, self._spectra, strict=True):
+            row[:] = scipy_fft.irfft2(spectrum * low, (rows, cols))[:high, :wide].ravel()
+        return seen
+
+    @property
+    def _block(self) -> int:
+        return BLOCK if min(self._model.grid.window) >= BLOCK else 1
+
+    def _torus_of_blocks(self, mode: Image) -> Image:
+        """Means over the blocks of the torus, counted from the window's corner."""
+        n, (top, left) = self._block, self._model.grid.at
+        rows, cols = (size // n for size in mode.shape)
+        moved = np.roll(mode, (-top, -left), (0, 1))
+        means: Image = moved.reshape(rows, n, cols, n).mean(axis=(1, 3))
+        return means
+
+    def _normal_equations(self, seen: Image) -> None:
         """Weighted ridge regression: the weights are those of shot noise under an even field."""
         weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + 0.03)
-        normal = (seen * weights) @ seen.T
-        return np.asarray(np.linalg.solve(normal + np.diag(ridge * np.diag(normal)), seen * weights), np.float32)
+        self._weighted = np.asarray(seen * weights, np.float32)
+        normal = self._weighted @ seen.T
+        self._inverse = np.linalg.inv(normal + np.diag(self._ridge * np.diag(normal)))
 
     def fit(self, y: Image, out: Image) -> tuple[float, float]:
         """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN."""
-        coefficients = self._fit @ _blocks(y).ravel()
+        coefficients = (self._inverse @ (self._weighted @ _blocks(y).ravel())).astype(np.float32)
         top, bottom, left, right = self.box
         out[:] = 0
         smooth = coefficients[: len(self._modes)] @ self._modes
@@ -67,19 +109,16 @@ def _blocks(image: Image) -> Image:
     return means
 
 
-def _modes(model: Model) -> "list[Image]":
+def _modes(model: Model) -> Iterator[Image]:
     """Zernike polynomials up to DEGREE on the field's disc, the even field first."""
     rows, cols = model.grid.shape
     v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
     u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius_samples
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
-    return [
-        (model.mask * _radial(n, abs(m), radius) * (np.cos(m * angle) if m >= 0 else np.sin(-m * angle))).astype(
-            np.float32
-        )
-        for n in range(DEGREE + 1)
-        for m in range(-n, n + 1, 2)
-    ]
+    for n in range(DEGREE + 1):
+        for m in range(-n, n + 1, 2):
+            turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
+            yield (model.mask * _radial(n, abs(m), radius) * turn).astype(np.float32)
 
 
 def _radial(n: int, m: int, radius: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -169,3 +169,80 @@ def chi(blurred: Image, y: Image, good: Image, per_dn: float, floor: float, at: 
         total += row_total
         weight += row_weight
     return np.sqrt(total / weight) if weight > 0 else np.float64(0)
+
+
+@_jit
+def _read(table: Spectrum, row: float, col: float) -> complex:
+    """The table at a place between its samples; its rows run from -last to last, its columns from 0 to last.
+
+    The left half plane is the conjugate of the right one; beyond the table there is nothing.
+    """
+    last = table.shape[1] - 1
+    left = col < 0
+    if left:
+        row, col = -row, -col
+    row += last
+    if not (0 <= row < 2 * last and col < last):
+        return complex(np.float32(0), np.float32(0))
+    k, m = int(row), int(col)
+    t, u, one = np.float32(row - k), np.float32(col - m), np.float32(1)
+    value = (one - t) * ((one - u) * table[k, m] + u * table[k, m + 1]) + t * (
+        (one - u) * table[k + 1, m] + u * table[k + 1, m + 1]
+    )
+    return complex(value.real, -value.imag) if left else value
+
+
+@_jit
+def stretched(
+    table: Spectrum, matrix: Series, rows: Series, cols: Series, row_share: Image, col_share: Image, out: Spectrum
+) -> None:
+    """out = the table at matrix (col, row) for a grid of frequencies, times a sample's transfer along either axis."""
+    for i in range(rows.size):
+        across, down, share = matrix[0, 1] * rows[i], matrix[1, 1] * rows[i], row_share[i]
+        for j in range(cols.size):
+            value = _read(table, matrix[1, 0] * cols[j] + down, matrix[0, 0] * cols[j] + across)
+            out[i, j] = value * (share * col_share[j])
+
+
+@_jit
+def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, share: Image, out: Spectrum) -> None:
+    """The same at single frequencies."""
+    for i in range(rows.size):
+        down = matrix[1, 0] * cols[i] + matrix[1, 1] * rows[i]
+        out[i] = _read(table, down, matrix[0, 0] * cols[i] + matrix[0, 1] * rows[i]) * share[i]
+
+
+@_jit
+def unlikelihood(
+    seen: Spectrum, otf: Spectrum, where: NDArray[np.int64], ring: NDArray[np.int64], s2: float, smear: float,
+    turns: int, levels: Series, energy: Image, power: Image,
+) -> float:  # fmt: skip
+    """Minus the log likelihood of a spectrum under S = q g + s2 with the best level g of each ring; optics.md 6.2.
+
+    `otf` belongs to the frequencies `where` of `seen`. q = |H|^2 + smear (its mean over the ring): a tapered window
+    mixes neighbouring frequencies. `energy` and `power` are scratch of that length.
+    """
+    above, below = np.zeros(levels.size), np.zeros(levels.size)
+    cols = seen.shape[1]
+    for m in range(where.size):
+        f, h, b = seen[where[m] // cols, where[m] % cols], otf[m], ring[m]
+        energy[m] = f.real * f.real + f.imag * f.imag
+        power[m] = h.real * h.real + h.imag * h.imag
+        above[b] += power[m]
+        below[b] += 1
+    for m in range(where.size):
+        power[m] += np.float32(smear * above[ring[m]] / below[ring[m]])
+    for turn in range(turns + 1):
+        above[:], below[:] = 0, 0
+        for m in range(where.size):
+            b = ring[m]
+            w = 1.0 if turn == 0 else 1 / (power[m] * levels[b] + s2)
+            above[b] += (energy[m] - s2) * power[m] * w * w
+            below[b] += power[m] * power[m] * w * w
+        for b in range(levels.size):
+            levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * s2)
+    total = 0.0
+    for m in range(where.size):
+        s = power[m] * levels[ring[m]] + s2
+        total += np.log(s) + energy[m] / s
+    return total

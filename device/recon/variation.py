@@ -43,6 +43,12 @@ class EvidenceWiener:
         self.noise, self.law, self.level, self.stray = Noise(0, 1), PowerLaw(0, 2), 0.0, 0.0
         self.noise_dn2, self.reg = 1.0, np.ones(model.otf.shape, np.float32)
 
+    def refocus(self) -> None:
+        """Measure anew what depends on the model's OTF."""
+        self.shading.refocus()
+        self.evidence.refocus()
+        self.sample = Sample.of(self.model)
+
     def start(self, frame: Linear) -> None:
         """Solve: `x` is the picture on the grid, `facts` what was chosen."""
         model, grid = self.model, self.model.grid
@@ -117,6 +123,11 @@ class Variation(EvidenceWiener):
         self._dual = self._dual_norms()
         self.tau = self.rho = self.stiffness = 0.0
         self._y = self._good = np.zeros(model.grid.window, np.float32)
+
+    def refocus(self) -> None:
+        """Measure anew what depends on the model's OTF."""
+        super().refocus()
+        self._dual = self._dual_norms()
 
     def _dual_norms(self) -> Image:
         """|H|^2 / |D|^2 per frequency, averaged over the full plane: how loud the data's noise is to the prior."""

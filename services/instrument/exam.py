@@ -63,7 +63,7 @@ class Exam:
         index = self._best_psf(planner)
         recipes = ladder(head.calibration, head.camera.shape, index)
         self._full = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes, index)
-        self._small = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes[:1], index)
+        self._small = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes[:1], index, False)
         self.planned = planner.planned
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()

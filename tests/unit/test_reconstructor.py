@@ -110,3 +110,13 @@ def test_known_memory_is_what_is_taken(method: str) -> None:
     tracemalloc.stop()
     assert kept.rungs
     assert taken == pytest.approx(METHODS[method].memory_bytes(kept.rungs[0].grid), rel=0.25)
+
+
+def test_one_bad_moment_does_not_refuse_the_good_picture_for_ever() -> None:
+    clock = VirtualClock()
+    cal = scenes.calibration(scenes.speckle(SHAPE))
+    reconstruct = Reconstructor(cal, SHAPE, scenes.PLANNER, clock, (QUICK, FULL))
+    reconstruct.rungs[1].start_cost.add(60.0)  # a neighbour held the machine for a minute
+    bins = [reconstruct(counts(), deadline=Deadline.after(clock, 1.0)).report.bin for _ in range(15)]
+    assert bins[0] == 4
+    assert bins[-1] == 1

@@ -1,0 +1,220 @@
+"""The eye's refraction from the frame itself: the stretch of the stored PSF under which the frame is most likely.
+
+A defocused eye stretches the caustic (see `warp`), and with it the speckle of |H|^2 that is stamped on the spectrum of
+every frame. The spectral evidence of optics.md 6.2 is maximised over the stretch:
+
+    E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
+
+R is what remains of the frame after its smooth part, blurred by the *candidate's* PSF, has been subtracted: blurred by
+one PSF for all candidates it pulls the answer a third of the way towards that PSF. The smooth part itself (`shading`)
+is fitted with the stored PSF for the coarse search, and again with the PSF that this found for the fine one.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from device.errors import SettingError
+from device.recon import kernels, sweeps
+from device.recon.choose import flat_fit
+from device.recon.evidence import band
+from device.recon.geometry import Grid, Pair, support_radius_px
+from device.recon.kernels import Pixels
+from device.recon.model import dirichlet, field_radius_px, taper, tight_model
+from device.recon.noise import Noise
+from device.recon.plan import Planner, RealFft, Spectrum
+from device.recon.prepare import Linear, Preparer
+from device.recon.shading import Shading
+from device.recon.warp import ElasticOtf, transform
+from device.values import Calibration, Image
+
+SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
+TAPER_UM = 300.0
+SPAN_DPT = 9.0
+RINGS, TURNS = 20, 4
+SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from neighbouring frequencies
+FRINGES = 0.2  # cycles by which the finest speckle moves from one candidate of the coarse search to the next
+LEAST_NATS = 150.0  # best candidate over the median one: another head's PSF gives 110, retinas at 10 ke- 1200 and more
+LEAST_FREQUENCIES = 500
+SD_FACTOR = 1.4  # neighbouring frequencies are not independent; with it 23 frames had z scores of rms 1.0
+
+
+@dataclass(frozen=True)
+class Refraction:
+    """What a frame says about the eye: mean sphere M in dpt (positive: myopia), its standard deviation, and the curve.
+
+    `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate of
+    the coarse search, sorted; `nats` is how much likelier its best is than its median.
+    """
+
+    sphere_dpt: float
+    psf_scale: float
+    sd_dpt: float
+    nats: float
+    curve: tuple[tuple[float, float], ...]
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the stored PSF is as good: the eye is relaxed as far as anyone can tell."""
+        return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
+
+
+def can_refract(calibration: Calibration) -> bool:
+    """Whether dioptres mean anything: the geometry and the illuminated field are known."""
+    return calibration.geometry is not None and np.isfinite(field_radius_px(calibration))
+
+
+class Refractor:
+    """Planned once for a calibration and a sensor shape; then asked for the refraction behind each frame."""
+
+    def __init__(
+        self, calibration: Calibration, shape: Pair, planner: Planner, index: int, elastic: ElasticOtf | None = None
+    ) -> None:
+        geometry = calibration.geometry
+        if geometry is None or not can_refract(calibration):
+            raise SettingError("a refraction needs the head's geometry and field", "Give --head HEAD.toml.")
+        psf = calibration.psfs[index]
+        self.geometry, self.sensor = geometry, calibration.sensor
+        self.elastic = ElasticOtf(psf) if elastic is None else elastic
+        n = max(1, min(round(SAMPLE_UM / geometry.pitch_um), min(shape) // 16))
+        self.model = tight_model(calibration, shape, n, planner, index)
+        self.grid = self.model.grid
+        self.shading = Shading(self.model)
+        self.preparer = Preparer(calibration, self.grid)
+        self.fft: RealFft = planner.plan(self.grid.window)
+        self.taper = taper(self.grid.window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(self.grid.window))))
+        self._choose_frequencies()
+        self._spread = float((self.taper**4).sum() * self.taper.size / (self.taper**2).sum() ** 2)
+        lever = self.high / n * 2 * support_radius_px(psf) * geometry.scale_per_dpt
+        self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
+        self._smooth: Image = np.zeros(self.grid.shape, np.float32)
+        self._object, self._otf = (np.zeros(self.model.otf.shape, np.complex64) for _ in range(2))
+        self._seen = np.zeros(self.grid.window, np.float32)
+
+    def _choose_frequencies(self) -> None:
+        """The band that carries the speckle, in rings; and the quarter of all frequencies that carries least."""
+        window, n = self.grid.window, self.grid.n
+        rows, cols = np.fft.fftfreq(window[0])[:, None], np.fft.rfftfreq(window[1])[None]
+        frequency = np.hypot(rows, cols)
+        power = np.abs(self.elastic.on(window, n, np.eye(2)).astype(np.complex128)) ** 2
+        self.low, self.high = band(frequency, power, min(window))
+        self._where = np.flatnonzero((frequency > self.low) & (frequency < self.high))
+        edges = np.linspace(self.low, self.high, RINGS + 1)
+        self._ring = np.clip(np.digitize(frequency.ravel()[self._where], edges) - 1, 0, RINGS - 1)
+        self._rows = np.broadcast_to(rows, frequency.shape).ravel()[self._where]
+        self._cols = np.broadcast_to(cols, frequency.shape).ravel()[self._where]
+        self._share = (dirichlet(self._rows, n) * dirichlet(self._cols, n)).astype(np.float32)
+        self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
+        self._levels = np.zeros(RINGS)
+        self._energy, self._power = (np.zeros(self._where.size, np.float32) for _ in range(2))
+
+    def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
+        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span."""
+        if self._where.size < LEAST_FREQUENCIES:
+            return None
+        frame = self.preparer(counts, dark)
+        np.multiply(frame.good, self.taper, out=self._seen)
+        if not self._fit_smooth(frame, self.model.stored) > 0:
+            return None
+        self._residual(frame, 0.0)
+        noise = self._noise_power(frame)
+        coarse = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
+        sphere_dpt = coarse.ladder(self.step_dpt)
+        if coarse.relief < LEAST_NATS:
+            return None
+        sphere_dpt = coarse.walk(sphere_dpt, self.step_dpt / 2)
+        self._fit_smooth(frame, self.otf(self.grid, sphere_dpt))
+        fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
+        for part in (2, 4):
+            sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
+        if abs(sphere_dpt) >= SPAN_DPT:
+            return None
+        vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
+        sd_dpt = min(SD_FACTOR * (self._spread / bend) ** 0.5, SPAN_DPT) if bend > 0 else SPAN_DPT
+        curve = tuple(sorted(coarse.known.items()))
+        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve)
+
+    def scale(self, m_dpt: float) -> float:
+        """How an eye with mean sphere M stretches the PSF."""
+        return 1 - self.geometry.scale_per_dpt * m_dpt
+
+    def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
+        """The OTF on a grid as an eye with mean sphere M makes it."""
+        return self.elastic.on(grid.shape, grid.n, transform(self.geometry, m_dpt))
+
+    def _fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
+        """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
+        self.model.refocus(otf)
+        self.shading.refocus()
+        level, _ = self.shading.fit(frame.y, self._smooth)
+        self.model.fft.space[:] = self._smooth
+        self._object[:] = self.model.fft.forward()
+        return level
+
+    def _residual(self, frame: Linear, m_dpt: float) -> None:
+        """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered."""
+        model, grid = self.model, self.grid
+        stretch = transform(self.geometry, m_dpt)
+        self.elastic.on(grid.shape, grid.n, stretch, self._otf)
+        np.multiply(self._object, self._otf, out=model.fft.spectrum)
+        smooth = model.fft.inverse()[grid.slices]
+        level, stray = flat_fit(kernels.dots(frame.y, smooth, frame.good))
+        kernels.residual(frame.y, smooth, self._seen, level, stray, (0, 0), self.fft.space)
+        self.fft.forward()
+
+    def _unlikelihood(self, frame: Linear, noise: float, m_dpt: float) -> float:
+        self._residual(frame, m_dpt)
+        stretch = transform(self.geometry, m_dpt)
+        otf = self.elastic.at(self._rows, self._cols, self._share, self.grid.n, stretch)
+        return sweeps.unlikelihood(
+            self.fft.spectrum, otf, self._where, self._ring, noise, SMEAR, TURNS,
+            self._levels, self._energy, self._power,
+        )  # fmt: skip
+
+    def _noise_power(self, frame: Linear) -> float:
+        """Noise per frequency of the tapered window, from the sensor's gain or from the silent frequencies."""
+        silent = np.abs(self.fft.spectrum.ravel()[self._silent].astype(np.complex128)) ** 2
+        weight = float(np.vdot(self._seen, self._seen))
+        noise = Noise.of(self.sensor, self.grid.n, float(np.median(silent)) / np.log(2) / weight, float(frame.y.mean()))
+        lit = float(np.einsum("ij,ij,ij->", frame.y, self._seen, self._seen))
+        return max(noise.per_dn * lit + noise.floor_dn2 * weight, 1e-20)
+
+
+class _Search:
+    """The search for a minimum on a line that costs one evaluation per new candidate."""
+
+    def __init__(self, value: Callable[[float], float]) -> None:
+        self._value = value
+        self.known: dict[float, float] = {}
+        self.relief = 0.0
+
+    def __call__(self, m_dpt: float) -> float:
+        """Minus the log evidence of a candidate inside the span."""
+        m_dpt = round(float(np.clip(m_dpt, -SPAN_DPT, SPAN_DPT)), 4)
+        if m_dpt not in self.known:
+            self.known[m_dpt] = self._value(m_dpt)
+        return self.known[m_dpt]
+
+    def ladder(self, step_dpt: float) -> float:
+        """The best of an even ladder over the whole span; `relief` is its median minus its least."""
+        rungs = np.linspace(-SPAN_DPT, SPAN_DPT, 2 * max(int(np.ceil(SPAN_DPT / step_dpt)), 2) + 1)
+        values = [self(m_dpt) for m_dpt in rungs]
+        self.relief = float(np.median(values) - min(values))
+        return float(rungs[int(np.argmin(values))])
+
+    def walk(self, m_dpt: float, step_dpt: float) -> float:
+        """Downhill in equal steps until both neighbours are higher."""
+        while True:
+            least = min((m_dpt - step_dpt, m_dpt, m_dpt + step_dpt), key=self)
+            if least == m_dpt or abs(least) >= SPAN_DPT:
+                return float(np.clip(least, -SPAN_DPT, SPAN_DPT))
+            m_dpt = least
+
+    def parabola(self, m_dpt: float, step_dpt: float) -> tuple[float, float]:
+        """The vertex through three candidates around a minimum, and the second derivative there; 0 if there is none."""
+        left, middle, right = (self(m_dpt + k * step_dpt) for k in (-1, 0, 1))
+        second = left - 2 * middle + right
+        if second <= 0 or abs(m_dpt) + step_dpt > SPAN_DPT:
+            return m_dpt, max(second, 0.0) / step_dpt**2
+        return m_dpt + 0.5 * (left - right) / second * step_dpt, second / step_dpt**2
