@@ -25,7 +25,7 @@ def drawn(found: Found) -> str:
         series=tuple(_series(points, name) for name in METHODS if any(p["method"] == name for p in points)),
         edge=tuple(edge),
         limit=(budget_s, f"budget {budget_s:g} s"),
-        ring=(choice["seconds_median"], choice["psnr_db"], "what the instrument chooses"),
+        ring=(choice["seconds_median"], choice["psnr_db"], "the instrument's choice"),
         right=_correlations(y.low, y.high, found["region"]["truth_variance"]),
         right_title="the same as correlation (PCC)",
     )

@@ -240,10 +240,10 @@ def _legend(plot: Plot) -> list[str]:
     out, at = [], float(LEFT + 6)
     for k, series in enumerate(plot.series):
         out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', _text(at + 13, TOP - 15, series.name)]
-        at += 13 + 7.8 * len(series.name) + 26
+        at += 13 + 7.4 * len(series.name) + 16
     if plot.edge:
         out += [_line(at, TOP - 20, at + 24, TOP - 20, "edge"), _text(at + 31, TOP - 15, "Pareto edge")]
-        at += 31 + 7.8 * 11 + 22
+        at += 31 + 7.4 * 11 + 14
     if plot.ring is not None:
         out += [
             f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from device.recon.methods import METHODS
 from services.cli import main
 
 ROOT = Path(__file__).parents[2]
@@ -60,7 +61,7 @@ def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: P
     assert facts["simulated"] is True
     assert {"what", "intensity_fit", "psnr_range"} <= set(facts["region"])
     assert all(set(point) == POINT for point in facts["points"])
-    assert {point["method"] for point in facts["points"]} == {"tikhonov", "gradient", "evidence", "variation"}
+    assert {point["method"] for point in facts["points"]} == set(METHODS)
     assert {p["rounds"] for p in facts["points"] if p["method"] == "variation"} == {0, 1, 2, 4, 8, 12, 20}
     edge = sorted((p["seconds_median"], p["psnr_db"]) for p in facts["points"] if p["pareto"])
     assert edge == sorted(edge, key=lambda place: place[1])
