@@ -74,9 +74,9 @@ class Cost:
         return max(self._seen, default=0.0)
 
     def doubt(self) -> None:
-        """Forget the oldest run: what was refused because of one bad moment must get its chance again."""
-        if len(self._seen) > 1:
-            self._seen.popleft()
+        """Believe the worst run only half: what one bad moment made refused must get its chance again."""
+        if self._seen:
+            self._seen[self._seen.index(self.seconds)] /= 2
 
 
 class _Rung:
