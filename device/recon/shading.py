@@ -39,7 +39,7 @@ class Shading:
         for row, mode in zip(self._modes, _modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
             spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
-            seen.append(_blocks(model.blur(mode)[model.grid.slices]).ravel())
+            seen.append(_blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
         self._spectra = np.asarray(spectra, np.complex64)
         self._ridge = np.full(count + known, RIDGE)
         self._ridge[count:] = STRAY_RIDGE
@@ -72,7 +72,9 @@ class Shading:
 
     @property
     def _block(self) -> int:
-        return BLOCK if min(self._model.grid.window) >= BLOCK else 1
+        """Samples to a block's side: BLOCK where whole ones fill the torus and fit into the window, else one."""
+        whole = all(size % BLOCK == 0 for size in self._model.grid.shape)
+        return BLOCK if whole and min(self._model.grid.window) >= BLOCK else 1
 
     def _torus_of_blocks(self, mode: Image) -> Image:
         """Means over the blocks of the torus, counted from the window's corner."""
@@ -91,7 +93,7 @@ class Shading:
 
     def fit(self, y: Image, out: Image) -> tuple[float, float]:
         """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN."""
-        coefficients = (self._inverse @ (self._weighted @ _blocks(y).ravel())).astype(np.float32)
+        coefficients = (self._inverse @ (self._weighted @ _blocks(y, self._block).ravel())).astype(np.float32)
         top, bottom, left, right = self.box
         out[:] = 0
         smooth = coefficients[: len(self._modes)] @ self._modes
@@ -100,11 +102,9 @@ class Shading:
         return float(coefficients[0]), stray
 
 
-def _blocks(image: Image) -> Image:
-    if min(image.shape) < BLOCK:
-        return np.ascontiguousarray(image)
-    rows, cols = (size // BLOCK for size in image.shape)
-    cut = image[: rows * BLOCK, : cols * BLOCK].reshape(rows, BLOCK, cols, BLOCK)
+def _blocks(image: Image, n: int) -> Image:
+    rows, cols = (size // n for size in image.shape)
+    cut = image[: rows * n, : cols * n].reshape(rows, n, cols, n)
     means: Image = cut.mean(axis=(1, 3))
     return means
 
