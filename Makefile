@@ -14,8 +14,8 @@ help: ## List the words that make knows.
 	@echo "Setting up .venv (a minute, once)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Diffuscope needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -m venv .venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
-	@$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
@@ -40,13 +40,13 @@ bench: .venv/ready ## Print figures of speed and truth, measured on this machine
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam beside, in .bench-venv, for make bench to compare with.
 	@$(BIN)/python -m venv .bench-venv
-	@.bench-venv/bin/pip install --quiet --disable-pip-version-check --no-deps lensless==1.0.8 && \
-		.bench-venv/bin/pip install --quiet --disable-pip-version-check numpy scipy matplotlib opencv-python-headless pillow \
+	@.bench-venv/bin/pip install -qq --disable-pip-version-check --no-deps lensless==1.0.8 && \
+		.bench-venv/bin/pip install -qq --disable-pip-version-check numpy scipy matplotlib opencv-python-headless pillow \
 		|| { rm -rf .bench-venv; echo "LenslessPiCam could not be installed (is there a network?): make bench leaves it out"; }
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
 lock: .venv/ready ## Write requirements.lock anew.
-	@$(BIN)/pip install --quiet --disable-pip-version-check uv
+	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra test --group lock pyproject.toml -o requirements.lock
 

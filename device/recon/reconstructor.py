@@ -154,17 +154,18 @@ class Reconstructor:
 
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False,
-        deadline: Deadline | None = None, watch: Watcher | None = None, rounds: int | None = None,
+        deadline: Deadline | None = None, watch: Watcher | None = None, rounds: int | None = None, quick: bool = False,
     ) -> Reconstruction:  # fmt: skip
         """The best picture that fits: linear float32, rows x cols (x 3) of the sensor.
 
-        `counts` and `dark` are uint16 or float32 (rows, cols) or (rows, cols, 3). The first rung always runs.
+        `counts` and `dark` are uint16 or float32 (rows, cols) or (rows, cols, 3). The first rung always runs;
+        with `quick` nothing else does.
         """
         self._refuse_other_shapes(counts)
         climb = _Climb(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
-        for rung in self.rungs:
-            if rung is self._sharp[0]:
+        for rung in self.rungs[:1] if quick else self.rungs:
+            if rung is self._sharp[0] and not quick:
                 self._focus(climb)
             if not climb.up(rung):
                 break

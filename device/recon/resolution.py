@@ -1,6 +1,7 @@
 """The resolution at which a frame is worth solving: what the optics passes, and no finer."""
 
 import numpy as np
+from scipy import fft as scipy_fft
 
 from device.values import Psf
 
@@ -19,7 +20,7 @@ def working_bin(psf: Psf, empty: float = EMPTY) -> int:
     rows, cols = psf.shape
     if min(rows, cols) < 32:
         return 1
-    power = np.abs(np.fft.rfft2(psf.pixels)) ** 2
+    power = np.abs(scipy_fft.rfft2(psf.pixels)) ** 2
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
     edges = np.linspace(0, 0.5, 65)
     rings = np.digitize(frequency.ravel(), edges)

@@ -110,15 +110,18 @@ def _blocks(image: Image, n: int) -> Image:
 
 
 def _modes(model: Model) -> Iterator[Image]:
-    """Zernike polynomials up to DEGREE on the field's disc, the even field first."""
-    rows, cols = model.grid.shape
-    v = (np.arange(rows)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
-    u = (np.arange(cols)[None] - model.grid.centre[1]) / model.grid.radius_samples
+    """Zernike polynomials up to DEGREE on the field's disc, the even field first; computed only where the disc is."""
+    top, bottom, left, right = model.box
+    v = (np.arange(top, bottom)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
+    u = (np.arange(left, right)[None] - model.grid.centre[1]) / model.grid.radius_samples
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
+    disc = model.mask[top:bottom, left:right]
     for n in range(DEGREE + 1):
         for m in range(-n, n + 1, 2):
             turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
-            yield (model.mask * _radial(n, abs(m), radius) * turn).astype(np.float32)
+            mode = np.zeros(model.grid.shape, np.float32)
+            mode[top:bottom, left:right] = disc * _radial(n, abs(m), radius) * turn
+            yield mode
 
 
 def _radial(n: int, m: int, radius: NDArray[np.float64]) -> NDArray[np.float64]:

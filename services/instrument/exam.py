@@ -62,8 +62,7 @@ class Exam:
         planner = Planner(plans)
         index = self._best_psf(planner)
         recipes = ladder(head.calibration, head.camera.shape, index)
-        self._full = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes, index)
-        self._small = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes[:1], index, False)
+        self._reconstructor = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes, index)
         self.planned = planner.planned
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
@@ -225,7 +224,7 @@ class Exam:
                 self._tell_stage(id, "quick", 0.4, f"/api/captures/{id}/quick.jpg")
 
         deadline = Deadline.after(self.clock, BUDGET_S)
-        return self._full(frame.counts, dark.counts, simulated=frame.simulated, deadline=deadline, watch=show)
+        return self._reconstructor(frame.counts, dark.counts, simulated=frame.simulated, deadline=deadline, watch=show)
 
     def _files(self, capture: Capture, frame: Frame, dark: Frame, made: Reconstruction) -> dict[str, bytes]:
         facts = {
@@ -280,7 +279,7 @@ class Exam:
             self.head.light.off()
             dark_s = self.clock.now_s()
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
-        made = self._small(frame.counts, simulated=frame.simulated, deadline=deadline)
+        made = self._reconstructor(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
         return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s, dark_s
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:

@@ -63,7 +63,7 @@ def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any) -> None:
     kept = old_rig.exam.press("OD").result(30)
     raw, _ = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
     dark, _ = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
-    picture = old_rig.exam._full(raw, dark, simulated=True).picture
+    picture = old_rig.exam._reconstructor(raw, dark, simulated=True).picture
     truth = old_rig.world.truth("green")
     seen = truth > 0
     assert np.corrcoef(picture[seen], truth[seen])[0, 1] > 0.8
