@@ -15,7 +15,7 @@ DiffuscopeError
 └── StoreError                   the shelf
     ├── StoreFull                no room left
     ├── StoreDamaged             a kept file is not what was kept
-    └── NotKept (LookupError)                  no such capture
+    └── NotKept (LookupError)    no such capture
 """
 
 from typing import ClassVar
