@@ -78,3 +78,7 @@ class Deadline:
     def fits(self, cost_s: float) -> bool:
         """Whether something that takes `cost_s` would be done in time."""
         return cost_s <= self.left_s()
+
+    def later(self, delay_s: float) -> "Deadline":
+        """The same, put off by `delay_s` that somebody else used."""
+        return Deadline(self.clock, self.due_s + delay_s)

@@ -17,7 +17,7 @@ const START = Object.freeze({ name: "expose", fraction: 0, left: 0 });
 const store = createStore({
   link: "opening", // opening | live | lost
   status: null,
-  busy: false, // what the instrument says about itself
+  doing: "aim", // what the instrument says about itself
   screen: "aim", // aim | making | result
   eye: "OD",
   subject: null, // whose picture the viewer holds: a press, or a capture from the list
@@ -209,7 +209,7 @@ const heard = {
   },
 
   state({ state }) {
-    set({ busy: state === "busy" });
+    set({ doing: state });
   },
 
   stage({ id, stage: name, url, fraction, left_s: left }) {
@@ -237,7 +237,7 @@ async function refreshStatus() {
     const status = await getStatus();
     const { problem } = status;
     const was = get().status?.problem;
-    set({ status: Object.freeze(status), busy: status.state === "busy" });
+    set({ status: Object.freeze(status), doing: status.state });
     // Tell a standing problem once, not again every ten seconds after somebody has read it.
     if (problem && problem.code !== was?.code) set({ alert: problem });
     if (!problem && was && get().alert?.code === was.code) set({ alert: null });

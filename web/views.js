@@ -63,9 +63,9 @@ export function page(state, act) {
 
 // ---- header
 
-function header({ status, link, busy, shown }, act) {
+function header({ status, link, doing, shown }, act) {
   const kind = shown?.simulated ? "simulated" : status?.kind;
-  const word = link === "live" ? (busy ? "busy" : "aim") : link;
+  const word = link === "live" ? doing : link;
   return html`
     <header>
       <h1>${t("app.name")}</h1>
@@ -97,10 +97,10 @@ function prompt(state) {
   return html`<p class="prompt" role="status" data-tone=${tone}>${icon(name)} <span>${text}</span></p>`;
 }
 
-function promptOf({ screen, busy, stage, picture, shown, note }) {
+function promptOf({ screen, doing, stage, picture, shown, note }) {
   if (note) return ["wait", "wait", note];
   if (screen === "aim") {
-    return busy ? ["wait", "wait", t("aim.busy")] : ["plain", "ring", t("aim.prompt")];
+    return doing === "aim" ? ["plain", "ring", t("aim.prompt")] : ["wait", "wait", t(`aim.${doing}`)];
   }
   if (screen === "making") {
     if (picture === "quick") return ["quick", "wait", t("mark.quick")];

@@ -86,6 +86,16 @@ class Planner:
             return
         pyfftw.import_wisdom(tuple(wisdom))
 
+    @staticmethod
+    def _keep(wisdom: tuple[bytes, ...], file: Path) -> None:
+        part = file.with_suffix(".part")
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps([text.decode("ascii") for text in wisdom]), encoding="ascii")
+            part.replace(file)
+        except OSError as error:
+            log.warning("the plans cannot be kept in %s (%s): the next start makes them again", file.parent, error)
+
     def plan(self, shape: tuple[int, int]) -> RealFft:
         """A plan for one shape; its wisdom is kept if there is a folder."""
         known = pyfftw.export_wisdom()
@@ -93,11 +103,7 @@ class Planner:
         self.planned += 1
         wisdom = pyfftw.export_wisdom()
         if self.folder is not None and wisdom != known:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            file = self._file(self.folder)
-            part = file.with_suffix(".part")
-            part.write_text(json.dumps([text.decode("ascii") for text in wisdom]), encoding="ascii")
-            part.replace(file)
+            self._keep(wisdom, self._file(self.folder))
         return fft
 
 

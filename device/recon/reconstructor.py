@@ -41,6 +41,7 @@ class Stage:
 
 
 Watcher = Callable[[Stage], None]
+Between = Callable[[], None]
 
 
 def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
@@ -155,14 +156,16 @@ class Reconstructor:
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False,
         deadline: Deadline | None = None, watch: Watcher | None = None, rounds: int | None = None, quick: bool = False,
+        between: Between | None = None,
     ) -> Reconstruction:  # fmt: skip
         """The best picture that fits: linear float32, rows x cols (x 3) of the sensor.
 
         `counts` and `dark` are uint16 or float32 (rows, cols) or (rows, cols, 3). The first rung always runs;
-        with `quick` nothing else does.
+        with `quick` nothing else does. `between` is called between two rounds of the last rung; the time that it takes
+        is given back, and it may take a quick look at another frame with this same reconstructor.
         """
         self._refuse_other_shapes(counts)
-        climb = _Climb(self, counts, dark, deadline, rounds)
+        climb = _Climb(self, counts, dark, deadline, rounds, between if len(self.rungs) > 1 else None)
         begin_s = self.clock.now_s()
         for rung in self.rungs[:1] if quick else self.rungs:
             if rung is self._sharp[0] and not quick:
@@ -175,8 +178,8 @@ class Reconstructor:
         picture = to_sensor(climb.done.picture, climb.done.grid)
         finished_s = self.clock.now_s()
         climb.done.finish_cost.add(finished_s - solved_s)
-        focused_s = climb.focus_s
-        seconds = {"solve": solved_s - begin_s - focused_s, "refract": focused_s, "upsample": finished_s - solved_s}
+        solve_s = solved_s - begin_s - climb.focus_s - climb.away_s
+        seconds = {"solve": solve_s, "refract": climb.focus_s, "upsample": finished_s - solved_s}
         return Reconstruction(picture, self._report(climb, seconds), simulated)
 
     def _focus(self, climb: "_Climb") -> None:
@@ -233,16 +236,18 @@ class _Climb:
     """One frame's way up the ladder, and what it met."""
 
     def __init__(
-        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
-    ) -> None:
+        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None,
+        between: Between | None,
+    ) -> None:  # fmt: skip
         self.clock, self.counts, self.dark = owner.clock, counts, dark
-        self.deadline, self.most = deadline, most
+        self.deadline, self.most, self.between = deadline, most, between
+        self.last = owner.rungs[-1]
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
         self.done: _Rung = owner.rungs[0]
         self.facts: dict[str, Any] = {}
         self.rounds_done, self.stopped = 0, "done"
         self.refraction: Refraction | None = None
-        self.focus_s, self.psf_scale = 0.0, 1.0
+        self.focus_s, self.away_s, self.psf_scale = 0.0, 0.0, 1.0
 
     @property
     def sharp_dpt(self) -> float | None:
@@ -295,8 +300,19 @@ class _Climb:
             now_s = self.clock.now_s()
             rung.round_cost.add(now_s - begin_s)
             self.rounds_done += 1
+            if self.between is not None and rung is self.last:
+                now_s = self._rest(self.between, now_s)
         rung.solver.finish(rung.planes[c])
         self.facts = rung.solver.facts | {"saturated": frame.saturated, "missing": frame.missing}
+
+    def _rest(self, between: Between, begin_s: float) -> float:
+        """Let others do something; the deadline moves by what they took. The time after it."""
+        between()
+        now_s = self.clock.now_s()
+        self.away_s += now_s - begin_s
+        if self.deadline is not None:
+            self.deadline = self.deadline.later(now_s - begin_s)
+        return now_s
 
     def _fits_another(self, rung: _Rung, channels_left: int) -> bool:
         """Whether one more round fits, when the channels that are still to come get as much time as this one."""

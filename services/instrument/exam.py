@@ -1,22 +1,21 @@
 """The story of a picture: light, expose, dark, reconstruct, keep, show.
 
-One thread owns the head, so nothing in the device needs a lock. A press goes before the live preview; a second press
-while one is under way is refused, not queued. Every way out of the story leaves the lamp dark.
+One thread owns the head, so nothing in the device needs a lock. A press goes before everything: between two rounds of a
+refinement it is exposed and gets its quick look, and then the refinement goes on. A third press is refused, not queued.
+Every way out of the story leaves the lamp dark.
 """
 
 import json
 import logging
 import secrets
-from collections import OrderedDict
-from collections.abc import Callable
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
+from datetime import datetime
 from pathlib import Path
-from threading import Condition, Thread
-from typing import Any
-
-import numpy as np
+from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
 from device.errors import Busy, DiffuscopeError, LightLimit
@@ -27,6 +26,7 @@ from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.values import Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
+from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.records import picture
 from services.records.store import Store
 
@@ -35,10 +35,10 @@ log = logging.getLogger(__name__)
 BUDGET_S = 5.0
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
-QUICK_PX = 640
 RETRY_S = 1.0
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
+SEATS = 2  # pictures in the making at once: one that is refined, and one more that is exposed
 
 
 @dataclass(frozen=True)
@@ -50,46 +50,70 @@ class Preview:
     exposed_s: float
 
 
+@dataclass(frozen=True)
+class _Press:
+    """Who waits for a picture, and of which eye."""
+
+    answer: Future[Capture]
+    eye: Eye
+
+
+@dataclass(frozen=True)
+class _Exposed:
+    """A press whose light is done: what is left needs no eye."""
+
+    press: _Press
+    id: str
+    taken_at: datetime
+    frame: Frame
+    dark: Frame
+    expose_s: float
+
+
 class Exam:
-    """The one who owns the head: takes pictures on a press, and live ones while somebody looks."""
+    """The one who owns the head: takes pictures on a press, and live ones while somebody looks.
+
+    Ready at once to be asked; what it is asked waits until the plans are made (`ready`). Where that fails, `failure`
+    says why, and `died` is called, as after anything that nobody foresaw.
+    """
 
     def __init__(
         self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, plans: Path, died: Callable[[], None]
     ) -> None:
         self.head, self.store, self.bulletin, self.clock = head, store, bulletin, clock
         self.problem: DiffuscopeError | None = None
-        self._died = died
-        planner = Planner(plans)
-        index = self._best_psf(planner)
-        recipes = ladder(head.calibration, head.camera.shape, index)
-        self._reconstructor = Reconstructor(head.calibration, head.camera.shape, planner, clock, recipes, index)
-        self.planned = planner.planned
+        self.failure: DiffuscopeError | None = None
+        self.ready = Event()
+        self._died, self._plans = died, plans
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
-        self._press: tuple[Future[Capture], Eye] | None = None
-        self._busy = self._closing = self._ended = False
+        self._press: _Press | None = None
+        self._exposing = self._closing = self._ended = False
+        self._exposed: deque[_Exposed] = deque()
+        self._in_the_making = 0
         self._wanted_until_s = 0.0
         self._preview = Preview(0, b"", 0.0)
+        self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
         self._owner = Thread(target=self._own_the_head, name="head", daemon=True)
         self._owner.start()
-
-    def _best_psf(self, planner: Planner) -> int:
-        """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
-        if len(self.head.calibration.psfs) == 1:
-            return 0
-        frame, _ = self._expose(self.head.spec.camera.exposure_s)
-        return sharpest(self.head.calibration, frame.counts, planner)[0]
 
     # What others ask of it, from any thread
 
     @property
     def state(self) -> str:
-        """`busy` while a press is under way, else `aim`."""
-        return "busy" if self._busy else "aim"
+        """`starting`; `busy` while no press is taken; `making` while one is made and a press is welcome; else `aim`."""
+        if not self.ready.is_set():
+            return "starting"
+        if self._is_busy():
+            return "busy"
+        return "making" if self._in_the_making else "aim"
+
+    def _is_busy(self) -> bool:
+        return self._press is not None or self._exposing or self._in_the_making == SEATS
 
     def press(self, eye: Eye, key: str | None = None) -> Future[Capture]:
-        """Take one picture; the future holds what was kept. Raises Busy while another is under way or at the end.
+        """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         The same `key` again gives the same picture, however often the network repeats the request.
         """
@@ -98,12 +122,12 @@ class Exam:
                 return self._pressed[key]
             if self._closing or self._ended:
                 raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
-            if self._busy:
+            if self._is_busy():
                 raise Busy("a picture is being taken")
-            self._busy = True
-            future: Future[Capture] = Future()
+            self._press = _Press(Future(), eye)
+            future = self._press.answer
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
-            self._press = future, eye
+            self._in_the_making += 1
             if key is not None:
                 self._pressed[key] = future
                 while len(self._pressed) > REMEMBERED:
@@ -128,7 +152,7 @@ class Exam:
         with self._turn:
             self._closing = True
             self._turn.notify_all()
-        self._owner.join(timeout=10)
+        self._owner.join(timeout=SEATS * 2 * BUDGET_S)
         self.head.close()
 
     # What the owner does, alone
@@ -136,75 +160,117 @@ class Exam:
     def _own_the_head(self) -> None:
         """Until it is closed; what nobody foresaw ends the process, dark: a restart is safer than a half-alive head."""
         try:
+            self._plan()
+            self.ready.set()
+            self._tell_state()
             while (act := self._next()) is not None:
                 act()
+        except DiffuscopeError as error:  # of the planning: whatever comes later answers the press that it belongs to
+            self.failure = error
         finally:
             self.head.light.off()
             self._end()
             if not self._closing:
-                self.problem = DiffuscopeError("the instrument stopped unexpectedly")
+                self.problem = self.failure or DiffuscopeError("the instrument stopped unexpectedly")
                 self._died()
+
+    def _plan(self) -> None:
+        planner = Planner(self._plans)
+        index = self._best_psf(planner)
+        calibration, shape = self.head.calibration, self.head.camera.shape
+        recipes = ladder(calibration, shape, index)
+        self._reconstructor = Reconstructor(calibration, shape, planner, self.clock, recipes, index)
+
+    def _best_psf(self, planner: Planner) -> int:
+        """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
+        if len(self.head.calibration.psfs) == 1:
+            return 0
+        frame, _ = self._expose(self.head.spec.camera.exposure_s)
+        return sharpest(self.head.calibration, frame.counts, planner)[0]
 
     def _end(self) -> None:
         """Nobody waits for a picture that will never be taken."""
         with self._turn:
             self._ended = True
-            waiting, self._press = self._press, None
-        if waiting is not None:
-            waiting[0].set_exception(Busy("the instrument was switched off before the picture was taken"))
+            waiting = [shot.press for shot in self._exposed] + ([self._press] if self._press else [])
+            self._press = None
+            self._exposed.clear()
+        for press in waiting:
+            press.answer.set_exception(Busy("the instrument was switched off before the picture was taken"))
 
     def _next(self) -> Callable[[], None] | None:
         with self._turn:
-            while not self._closing:
-                if self._press is not None:
-                    act, self._press = partial(self._answer, *self._press), None
-                    return act
+            while not self._closing or self._exposed:
+                if self._press is not None and not self._closing:
+                    return self._answer
+                if self._exposed:
+                    return self._develop
                 if self.clock.now_s() < self._wanted_until_s:
                     return self._look
                 self._turn.wait()
         return None
 
-    def _answer(self, future: Future[Capture], eye: Eye) -> None:
-        self.bulletin.tell("state", state="busy")
+    def _answer(self) -> None:
+        """Expose what was pressed; its picture is made next."""
+        with self._turn:
+            press, self._press, self._exposing = self._press, None, True
+        assert press is not None
+        self._tell_state()
+        with self._answering(press):
+            taken_at = self.clock.wall()
+            id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
+            self._tell_stage(id, "expose", 0.1)
+            begin_s = self.clock.now_s()
+            frame, dark = self._expose(self.head.spec.camera.exposure_s)
+            self._exposed.append(_Exposed(press, id, taken_at, frame, dark, self.clock.now_s() - begin_s))
+        self._exposing = False
+        self._tell_state()
+
+    def _develop(self) -> None:
+        """Make and keep the picture of the oldest exposure."""
+        shot = self._exposed.popleft()
+        with self._answering(shot.press):
+            kept = self._make(shot)
+            self._report_problem(None)
+            self._leave(shot.press)
+            shot.press.answer.set_result(kept)
+        self._quick.pop(shot.id, None)
+
+    @contextmanager
+    def _answering(self, press: _Press) -> Iterator[None]:
+        """Whatever happens to a press, the lamp is dark after it, and whoever waits for it hears."""
         try:
-            kept = self._take(eye)
+            yield
         except DiffuscopeError as error:
             log.warning("press failed: %s", error)
             self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
-            self._free()
-            future.set_exception(error)
+            self._leave(press)
+            press.answer.set_exception(error)
         except BaseException:
-            self._free()
-            future.set_exception(DiffuscopeError("the instrument stopped unexpectedly"))
+            self._leave(press)
+            press.answer.set_exception(DiffuscopeError("the instrument stopped unexpectedly"))
             raise
-        else:
-            self._report_problem(None)
-            self._free()
-            future.set_result(kept)
+        finally:
+            self.head.light.off()
 
-    def _free(self) -> None:
-        self.head.light.off()
+    def _leave(self, press: _Press) -> None:
+        """The press gives its seat to another."""
         with self._turn:
-            self._busy = False
-            self._quick.clear()
-        self.bulletin.tell("state", state="aim")
+            self._exposing = False
+            self._in_the_making -= 1
+        self._tell_state()
 
-    def _take(self, eye: Eye) -> Capture:
-        """The story itself."""
-        taken_at = self.clock.wall()
-        id = Capture.named(taken_at, eye, secrets.token_hex(3))
-        self._tell_stage(id, "expose", 0.1)
-        begin_s = self.clock.now_s()
-        frame, dark = self._expose(self.head.spec.camera.exposure_s)
-        exposed_s = self.clock.now_s()
-        made = self._reconstruct(id, frame, dark)
+    def _make(self, shot: _Exposed) -> Capture:
+        """The rest of the story, which needs no eye."""
+        made = self._reconstruct(shot)
         report = asdict(made.report)
-        report["seconds"] = {"expose": exposed_s - begin_s, **made.report.seconds}
-        plain = json.loads(_json_bytes(report))  # as it will be read back: lists for tuples, floats for numpy's
-        capture = Capture(id, eye, taken_at, made.simulated, self.head.calibration.id, plain, {})
-        self._tell_stage(id, "keep", 0.9)
-        kept = self.store.keep(capture, self._files(capture, frame, dark, made))
-        self.bulletin.tell("kept", id=id)
+        report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
+        plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
+        calibration_id = self.head.calibration.id
+        capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
+        self._tell_stage(shot.id, "keep", 0.9)
+        kept = self.store.keep(capture, self._files(shot, capture, made))
+        self.bulletin.tell("kept", id=shot.id)
         return kept
 
     def _expose(self, exposure_s: float) -> tuple[Frame, Frame]:
@@ -217,31 +283,35 @@ class Exam:
         finally:
             light.off()
 
-    def _reconstruct(self, id: str, frame: Frame, dark: Frame) -> Reconstruction:
+    def _reconstruct(self, shot: _Exposed) -> Reconstruction:
         def show(stage: Stage) -> None:
             if not stage.last:
-                self._quick[id] = picture.to_jpeg(stage.picture, QUICK_PX, frame.simulated)
-                self._tell_stage(id, "quick", 0.4, f"/api/captures/{id}/quick.jpg")
+                self._show_quick(shot, stage.picture)
 
-        deadline = Deadline.after(self.clock, BUDGET_S)
-        return self._reconstructor(frame.counts, dark.counts, simulated=frame.simulated, deadline=deadline, watch=show)
+        return self._reconstructor(
+            shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
+            deadline=Deadline.after(self.clock, BUDGET_S), watch=show, between=self._let_in,
+        )  # fmt: skip
 
-    def _files(self, capture: Capture, frame: Frame, dark: Frame, made: Reconstruction) -> dict[str, bytes]:
-        facts = {
-            "id": capture.id, "eye": capture.eye, "taken_at": capture.taken_at.isoformat(),
-            "exposure_s": frame.exposure_s, "glow": asdict(frame.glow) if frame.glow else None,
-            "simulated": frame.simulated, "calibration_id": capture.calibration_id, "head": self.head.spec.name,
-        }  # fmt: skip
-        return {
-            "raw.tiff": picture.raw_tiff(frame.counts, facts),
-            "dark.tiff": picture.raw_tiff(dark.counts, facts | {"glow": None}),
-            "picture.png": picture.to_png(
-                self._eye(made.picture), made.simulated, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
-            ),
-            "quick.jpg": self._quick.get(capture.id)
-            or picture.to_jpeg(self._eye(made.picture), QUICK_PX, made.simulated),
-            "report.json": _json_bytes(capture.report | {"simulated": made.simulated}),
-        }
+    def _let_in(self) -> None:
+        """Between two rounds: who pressed meanwhile is exposed and sees a quick look; then the refinement goes on."""
+        if self._press is None or self._closing:
+            return
+        self._answer()
+        if self._exposed:
+            shot = self._exposed.pop()
+            with self._answering(shot.press):
+                quick = self._reconstructor(shot.frame.counts, shot.dark.counts, quick=True)
+                self._show_quick(shot, self._eye(quick.picture))
+                self._exposed.append(shot)
+
+    def _show_quick(self, shot: _Exposed, image: Image) -> None:
+        self._quick[shot.id] = picture.to_jpeg(image, QUICK_PX, shot.frame.simulated)
+        self._tell_stage(shot.id, "quick", 0.4, f"/api/captures/{shot.id}/quick.jpg")
+
+    def _files(self, shot: _Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
+        shown = self._eye(made.picture)
+        return capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, self._quick.get(capture.id))
 
     def _eye(self, image: Image) -> Image:
         """The part of a picture that people look at: the illuminated field."""
@@ -289,6 +359,11 @@ class Exam:
             log.warning("preview: %s", error)
             self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
 
+    def _tell_state(self) -> None:
+        if self.state != self._told:
+            self._told = self.state
+            self.bulletin.tell("state", state=self._told)
+
     def _tell_stage(self, id: str, stage: str, fraction: float, url: str | None = None) -> None:
         self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url)
 
@@ -297,13 +372,3 @@ def _lit(frame: Frame) -> Frame:
     if frame.glow is None:
         raise LightLimit("the light went out during the exposure: it had been on for too long")
     return frame
-
-
-def _json_bytes(data: dict[str, Any]) -> bytes:
-    return json.dumps(data, indent=1, default=_plain).encode()
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{type(value)} does not belong into a report")

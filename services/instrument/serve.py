@@ -52,21 +52,22 @@ def _remedy(error: OSError, port: int) -> str:
 
 
 def serve(spec: InstrumentSpec, host: str, port: int, data: Path, ready: Callable[[], None]) -> None:
-    """Open the head and the shelf, say `ready`, and serve the page until it is told to stop."""
+    """Open the head and the shelf, say `ready`, and serve the page until it is told to stop.
+
+    The page is there while the exam still makes its plans; raises what keeps it from making them.
+    """
     clock = SystemClock()
     with bound(host, port) as listener, Store(data) as store:
         head = open_head(spec, clock)
-        try:
-            exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process)
-        except BaseException:
-            head.close()
-            raise
+        exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process)
         config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()
             _Server(config, exam).run(sockets=[listener])
         finally:
             exam.close()
+        if exam.failure is not None:
+            raise exam.failure
 
 
 class _Server(uvicorn.Server):

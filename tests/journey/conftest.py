@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -151,17 +151,22 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         camera: Callable[[Camera], Camera] = lambda camera: camera,
         max_on_s: float = 30.0,
         store: dict[str, Any] | None = None,
+        bulletin: Bulletin | None = None,
+        wait: bool = True,
+        psfs: int = 1,
     ) -> Rig:
         clock, died = GateClock(), Event()
         scene = copy(dark_world)
         scene.clock, scene.faults = clock, set()
         light = GuardedLight(SimLight(scene), clock, max_on_s)
-        head = Head(scene.spec, camera(SimCamera(scene)), light, calibration)
+        stack = replace(calibration, psfs=calibration.psfs * psfs)
+        head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
         shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
-        bulletin = Bulletin()
+        bulletin = bulletin or Bulletin()
         exam = Exam(head, shelf, bulletin, clock, plans, died.set)
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
+        assert not wait or exam.ready.wait(60)
         return Rig(scene, clock, shelf, bulletin, exam, create_app(exam), died)
 
     return built

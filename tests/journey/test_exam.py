@@ -16,7 +16,8 @@ from device.errors import Busy, CameraMissing, CameraStalled, DiffuscopeError, F
 from device.errors import LightLimit as Limit
 from device.ports import Camera
 from device.values import Frame, Shot
-from services.records.picture import read_raw_tiff
+from services.instrument.bulletin import Bulletin
+from services.records.picture import read_raw_tiff, to_png
 
 FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
@@ -109,6 +110,101 @@ def test_many_hands_on_the_button_make_one_picture_at_a_time(rig: Any) -> None:
     assert {capture.id for capture in rig.store.captures()} == set(made)
 
 
+class Astonishing:
+    """A camera with a mistake in its driver that nobody foresaw, or that is pulled out."""
+
+    def __init__(self, camera: Camera, wrong: Event, error: Exception | None = None) -> None:
+        self._camera, self._wrong = camera, wrong
+        self._error = error or ZeroDivisionError("nobody foresaw this")
+        self.shape = camera.shape
+
+    def expose(self, shot: Shot, into: Any = None) -> Frame:
+        if self._wrong.is_set():
+            raise self._error
+        return self._camera.expose(shot, into)
+
+    def close(self) -> None:
+        self._camera.close()
+
+
+class Eager(Bulletin):
+    """News that make somebody press: once, as soon as the quick look of the first picture is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.press: Callable[[], Any] | None = None
+        self.pressed: list[Any] = []
+
+    def tell(self, kind: str, **data: Any) -> None:
+        super().tell(kind, **data)
+        if data.get("stage") == "quick" and self.press is not None:
+            press, self.press = self.press, None
+            self.pressed.append(press())
+
+
+def test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+    eager.press = lambda: rig.exam.press("OS")
+    first = rig.exam.press("OD").result(30)
+    (second,) = [pressed.result(30) for pressed in eager.pressed]
+    assert rig.store.captures() == [second, first]
+    order = [(data["id"], data["stage"]) for kind, data in rig.told() if kind == "stage"]
+    a, b = first.id, second.id
+    assert order[:5] == [(a, "expose"), (a, "quick"), (b, "expose"), (b, "quick"), (a, "keep")]
+    assert first.report["rounds"] == second.report["rounds"] > 5
+    raw, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in ("raw.tiff", "dark.tiff"))
+    alone = rig.exam._eye(rig.exam._reconstructor(raw, dark, simulated=True).picture)
+    kept = rig.store.read(a, "picture.png")
+    assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # to the last bit
+
+
+def test_a_press_that_fails_in_the_pause_leaves_the_refinement_alone(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+
+    def press_in_daylight() -> Any:
+        rig.world.ambient_e_per_s = 1e7
+        return rig.exam.press("OS")
+
+    eager.press = press_in_daylight
+    first = rig.exam.press("OD").result(30)
+    with pytest.raises(FrameError, match="cannot be used"):
+        eager.pressed[0].result(30)
+    assert rig.store.captures() == [first]
+    assert rig.exam.state == "aim"
+    assert rig.world.glow is None
+
+
+def test_a_third_press_is_refused_while_two_pictures_are_made(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+
+    def press_twice() -> Any:
+        pressed = rig.exam.press("OS")
+        assert rig.exam.state == "busy"
+        with pytest.raises(Busy):
+            rig.exam.press("OD")
+        return pressed
+
+    eager.press = press_twice
+    first = rig.exam.press("OD").result(30)
+    second = eager.pressed[0].result(30)
+    assert rig.store.captures() == [second, first]
+
+
+def test_plans_that_cannot_be_made_are_told_and_nobody_waits(make_rig: Any) -> None:
+    pulled = Event()
+    pulled.set()
+    rig = make_rig(camera=lambda camera: Astonishing(camera, pulled, CameraMissing("no camera")), psfs=2, wait=False)
+    assert rig.died.wait(60)
+    assert isinstance(rig.exam.failure, CameraMissing)
+    assert rig.exam.state == "starting"
+    assert rig.world.glow is None
+    with pytest.raises(Busy):
+        rig.exam.press("OD")
+
+
 FAULTS = {"camera.missing": CameraMissing, "camera.stalled": CameraStalled, "light.fault": LightFault}
 
 
@@ -166,22 +262,6 @@ def test_a_camera_that_hangs_does_not_keep_the_lamp_on(make_rig: Any, wait_until
     with pytest.raises(Limit, match="went out"):
         pressed.result(30)
     assert_dark_and_empty(rig)
-
-
-class Astonishing:
-    """A camera with a mistake in its driver that nobody foresaw."""
-
-    def __init__(self, camera: Camera, wrong: Event) -> None:
-        self._camera, self._wrong = camera, wrong
-        self.shape = camera.shape
-
-    def expose(self, shot: Shot, into: Any = None) -> Frame:
-        if self._wrong.is_set():
-            raise ZeroDivisionError("nobody foresaw this")
-        return self._camera.expose(shot, into)
-
-    def close(self) -> None:
-        self._camera.close()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # it ends the thread: on purpose
@@ -292,7 +372,7 @@ def test_a_problem_of_the_preview_is_told_once_and_forgotten_when_it_is_over(
     wait_until(lambda: rig.exam.problem is not None)
     wait_until(lambda: rig.clock.elapsed_s >= 3.0)  # several tries in virtual time
     assert rig.exam.problem.code == "camera.stalled"
-    assert [kind for kind, _ in rig.told()] == ["failed"]
+    assert [kind for kind, _ in rig.told()] == ["state", "failed"]
     assert rig.world.glow is None
     rig.world.faults.clear()
     assert rig.exam.preview(0) is not None

@@ -1,0 +1,44 @@
+"""What a capture is made of on the shelf: its raw and dark frames, its pictures, its report."""
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from device.values import Capture, Frame, Image
+from services.records import picture
+
+QUICK_PX = 640
+
+
+def capture_files(
+    capture: Capture, head: str, frame: Frame, dark: Frame, shown: Image, quick: bytes | None
+) -> dict[str, bytes]:
+    """Every file of a capture by its name; `shown` is the linear picture that people look at, `quick` its first JPEG.
+
+    The frames hold all it takes to make the picture again.
+    """
+    facts = {
+        "id": capture.id, "eye": capture.eye, "taken_at": capture.taken_at.isoformat(),
+        "exposure_s": frame.exposure_s, "glow": asdict(frame.glow) if frame.glow else None,
+        "simulated": frame.simulated, "calibration_id": capture.calibration_id, "head": head,
+    }  # fmt: skip
+    return {
+        "raw.tiff": picture.raw_tiff(frame.counts, facts),
+        "dark.tiff": picture.raw_tiff(dark.counts, facts | {"glow": None}),
+        "picture.png": picture.to_png(shown, capture.simulated, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"),
+        "quick.jpg": quick or picture.to_jpeg(shown, QUICK_PX, capture.simulated),
+        "report.json": as_json(capture.report | {"simulated": capture.simulated}),
+    }
+
+
+def as_json(data: dict[str, Any]) -> bytes:
+    """JSON for a file; numpy's numbers become plain ones."""
+    return json.dumps(data, indent=1, default=_plain).encode()
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value)} does not belong into a report")
