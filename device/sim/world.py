@@ -85,17 +85,17 @@ class World:
         geometry, sim = self.geometry, self.sim
         wide = int(np.ceil(geometry.px_per_deg * self.optics.field_deg)) + 4
         shape = (wide + (wide - self.shape[0]) % 2, wide + (wide - self.shape[1]) % 2)
-        if sim.image is not None:
-            return photograph(sim.image, shape, geometry.px_per_deg, self.optics.field_deg)
+        if sim.object.image is not None:
+            return photograph(sim.object.image, shape, geometry.px_per_deg, self.optics.field_deg)
         return fundus(
             shape,
             geometry.px_per_deg,
             self.optics.field_deg,
             self.seed,
             eye=self.eye,
-            haemorrhages=sim.haemorrhages,
-            microaneurysms=sim.microaneurysms,
-            exudates=sim.exudates,
+            haemorrhages=sim.object.haemorrhages,
+            microaneurysms=sim.object.microaneurysms,
+            exudates=sim.object.exudates,
         )
 
     def truth(self, colour: Colour) -> Image:

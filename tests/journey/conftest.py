@@ -52,6 +52,8 @@ angular_magnification = 0.75
 field_deg = 33.4
 
 [sim]
+
+[sim.object]
 haemorrhages = 3
 """
 

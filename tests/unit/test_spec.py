@@ -9,7 +9,8 @@ from pydantic import ValidationError
 from device.clock import VirtualClock
 from device.errors import SpecError
 from device.head import open_head
-from device.spec import line_of, load_head
+from device.spec import load_head
+from device.tables import line_of
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 TEXT = HEAD.read_text()
