@@ -1,4 +1,4 @@
-"""A TOML file as a checked, frozen value: a mistake is named with its file, line and key, and the key that was meant."""
+"""A TOML file as a checked, frozen value: a mistake is named with its file, its line, and the key that was meant."""
 
 import difflib
 import re
