@@ -53,8 +53,8 @@ class ObjectSpec(Table):
 class EyeSpec(Table):
     """The eye in front of the instrument, and how its background is shown.
 
-    `screen` shines by itself; `print` is paper lit by the ring; `model eye` and `human eye` have a lit fundus. Refraction
-    as wavefront, positive M is myopia. A `flat` surface is the paper's screen, a `curved` one follows the eye's focus.
+    `screen` shines by itself; `print` is paper lit by the ring; `model eye` and `human eye` have a lit fundus.
+    Refraction as wavefront, positive M is myopia. A `flat` surface is the paper's screen, a `curved` one follows the eye's focus.
     `axial_um` is how far the pupil is from the relay's focus, `decentred_um` how far off its axis.
     """
 
