@@ -17,8 +17,8 @@ WIDEST_GAZE_DEG = 30.0
 class ObjectSpec(Table):
     """What is looked at. Lengths on a screen or print count at its surface, behind the eye's focal length.
 
-    `retina` is drawn from the scene's seed with so many lesions; `image` is a photograph of one; `dots` are a lattice on
-    a screen, `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
+    `retina` is drawn from the scene's seed with so many lesions; `image` is a photograph of one; `dots` are a lattice
+    on a screen, `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
     one disc. All but the retina's tree are moved to `at_deg` (right, down).
     """
 
@@ -54,8 +54,8 @@ class EyeSpec(Table):
     """The eye in front of the instrument, and how its background is shown.
 
     `screen` shines by itself; `print` is paper lit by the ring; `model eye` and `human eye` have a lit fundus.
-    Refraction as wavefront, positive M is myopia. A `flat` surface is the paper's screen, a `curved` one follows the eye's focus.
-    `axial_um` is how far the pupil is from the relay's focus, `decentred_um` how far off its axis.
+    Refraction as wavefront, positive M is myopia. A `flat` surface is the paper's screen, a `curved` one follows the
+    eye's focus. `axial_um` is how far the pupil is from the relay's focus, `decentred_um` how far off its axis.
     """
 
     shown_by: Literal["screen", "print", "model eye", "human eye"] = "model eye"
@@ -84,6 +84,7 @@ class LightFlaws(Table):
     ambient: float = Field(default=0.0, ge=0, le=10)  # light without the lamp, share of the mean signal
     stray: float = Field(default=0.0, ge=0, le=10)  # even light with the lamp, share of the mean signal
     polariser_leak: float = Field(default=0.0, ge=0, le=1)  # of the corneal reflex, through crossed polarisers
+    ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
     led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
     falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (optics.md 3.5)
 
@@ -97,6 +98,7 @@ class SensorFlaws(Table):
     hot_pixels: float = Field(default=0.0, ge=0, le=0.05)  # their share
     nonlinearity: float = Field(default=0.0, ge=-0.2, le=0.2)  # quadratic, at full well
     line_s: float = Field(default=0.0, ge=0, le=1e-3)  # from one row to the next, of a rolling shutter
+    bayer: bool = False  # a colour sensor under one colour of light
 
 
 class CalibrationSpec(Table):

@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -91,12 +92,28 @@ def _cache() -> Path:
 @app.command()
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write into.")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write into.")] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Print the plan, and render nothing.")] = False,
+    everything: Annotated[bool, typer.Option("--all", help="Simulate all effects, seen or not.")] = False,
+    only: Annotated[list[str] | None, typer.Option(help="Simulate just this effect; may be repeated.")] = None,
+    without: Annotated[list[str] | None, typer.Option(help="Leave this effect out; may be repeated.")] = None,
 ) -> None:
-    """Write what the camera would give for a scene: raw.tiff, truth.npy, psf.tiff, plan.json."""
-    from device.sim.scene import simulate as simulate_scene
+    """Write what the camera would give for a scene: raw.tiff, truth.npy, psf.tiff, plan.json.
 
-    simulate_scene(load_head(scene), output)
+    Only the effects that the scene calls for are simulated; the plan says for each which number decided.
+    """
+    from device.sim import exposure, plan  # the simulator, which the other commands do not need
+    from device.sim.setup import Scene
+
+    spec = load_head(scene)
+    choose = partial(plan.decide, everything=everything, only=only or (), without=without or ())
+    if explain:
+        typer.echo(plan.table(choose(Scene(spec, spec.light.colour))))
+        return
+    if output is None:
+        raise typer.BadParameter("give -o FOLDER to write into, or --explain to see the plan only")
+    world = exposure.simulate(spec, output, choose)
+    typer.echo(plan.table(world.plan, world.setup(spec.light.colour).spent_ms))
     typer.echo(f"{output}: raw.tiff, truth.npy, psf.tiff, plan.json")
 
 

@@ -28,6 +28,14 @@ IRIS_EDGE_UM = 10.0  # a cut edge is not sharper than this
 MAX_SAMPLES = 4096
 
 
+class Beam(NamedTuple):
+    """The round beam of one place of the retina where it meets the iris: how far off its middle is, and its radius."""
+
+    x_um: float
+    y_um: float
+    radius_um: float
+
+
 class Refraction(NamedTuple):
     """The refraction of an eye as its wavefront: mean sphere, and the two axes of the cylinder, in dioptres.
 
@@ -135,18 +143,23 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
 
 
 def caustic(
-    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3
-) -> Image:
+    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
+    beam: Beam | None = None,
+) -> Image:  # fmt: skip
     """The intensity on the sensor from one retinal point on the axis: float32 (n, n), sum 1, wave optics.
 
-    `seed` names the diffuser; `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light
-    of its whole area. The grid is a relaxed eye's: another window would hold another surface. Raises SpecError where no
-    honest grid exists, or that one cannot carry so strong a refraction. optics.md 2.1.
+    A `beam` that leaves a part of the iris dark is told by its shape and by a sum below 1. `seed` names the diffuser;
+    `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light of its whole area. The grid
+    is a relaxed eye's: another window would hold another surface. Raises SpecError where no honest grid exists, or that
+    one cannot carry so strong a refraction. optics.md 2.1.
     """
-    return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines)
+    return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines, beam)
 
 
-def caustic_on(grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3) -> Image:
+def caustic_on(
+    grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
+    beam: Beam | None = None,
+) -> Image:  # fmt: skip
     """The caustic on a grid of one's own choice; SpecError if it cannot carry the light."""
     require_sampling(
         grid.samples,
@@ -158,12 +171,17 @@ def caustic_on(grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction
     )
     path_um = surface(optics, grid, seed) + eye_wavefront_um(optics, grid, refraction)
     amplitude = iris(optics, grid)
+    passed = 1.0
+    if beam is not None:
+        covered = amplitude * _disc(grid, beam)
+        passed = float((covered**2).sum(dtype=np.float64) / (amplitude**2).sum(dtype=np.float64))
+        amplitude = covered
     intensity = np.zeros_like(amplitude)
     for wavelength_um in spectral_lines_um(optics, lines):
         field: Field = amplitude * np.exp(np.complex64(2j * np.pi / wavelength_um) * path_um)
         carried = propagate(field, grid.dx_um, wavelength_um, optics.diffuser_to_sensor_um)
         intensity += carried.real**2 + carried.imag**2
-    return _onto_pixels(intensity, grid)
+    return _onto_pixels(intensity, grid) * np.float32(passed)
 
 
 def spectral_lines_um(optics: OpticsSpec, lines: int) -> list[float]:
@@ -173,9 +191,13 @@ def spectral_lines_um(optics: OpticsSpec, lines: int) -> list[float]:
 
 def iris(optics: OpticsSpec, grid: Grid) -> Image:
     """The amplitude that the round iris lets through, with an edge 10 um soft; float32 (samples, samples)."""
+    return _disc(grid, Beam(0.0, 0.0, optics.iris_um / 2))
+
+
+def _disc(grid: Grid, beam: Beam) -> Image:
     x_um = grid.x_um.astype(np.float32)
-    radius_um = np.hypot(x_um[:, None], x_um[None, :])
-    amplitude: Image = np.clip((optics.iris_um / 2 - radius_um) / IRIS_EDGE_UM + 0.5, 0, 1)
+    radius_um = np.hypot(x_um[:, None] - np.float32(beam.y_um), x_um[None, :] - np.float32(beam.x_um))
+    amplitude: Image = np.clip((beam.radius_um - radius_um) / IRIS_EDGE_UM + 0.5, 0, 1)
     return amplitude
 
 
@@ -199,5 +221,5 @@ def _onto_pixels(intensity: Image, grid: Grid) -> Image:
     smooth = fft.irfft2(spectrum, s=intensity.shape, overwrite_x=True)
     blocks = smooth.reshape(grid.pixels, grid.step, grid.pixels, grid.step).sum((1, 3))
     np.maximum(blocks, 0, out=blocks)
-    psf: Image = (blocks / blocks.sum(dtype=np.float64)).astype(np.float32)
+    psf: Image = (blocks / max(blocks.sum(dtype=np.float64), 1e-30)).astype(np.float32)
     return psf

@@ -2,9 +2,12 @@
 
 import numpy as np
 
-from device.optics.diffuser import EMMETROPIA, steepest_rad
+from device.optics.diffuser import Refraction, steepest_rad
+from device.sim.effects.hot import hot_pixels
+from device.sim.render import dotted, fitted, psf
 from device.sim.sensor import SensorModel
-from device.sim.world import World, fitted
+from device.sim.setup import Setup
+from device.sim.world import World
 from device.values import Calibration, Image, Psf, Sensor
 
 FRAMES = 16
@@ -14,11 +17,11 @@ FILLED = 0.8  # of the full well: bright, and nowhere saturated
 def simulated_calibration(world: World) -> Calibration:
     """Measure the head of a world as the factory does: PSF, sensor values, geometry; marked as simulated.
 
-    The PSF is float32 (rows, cols) of the sensor, sum 1, centre at (rows//2, cols//2). It was measured with a relaxed
-    eye, whatever the eye in the world is now, and it carries the noise of sixteen frames.
+    The PSF is float32 (rows, cols) of the sensor, sum 1, centre at (rows//2, cols//2). It was measured with the
+    eye of [sim.calibration], whatever the eye in the world is now, and it carries the noise of sixteen frames.
     """
     camera = world.spec.camera
-    point = world.psf(world.spec.light.colour, EMMETROPIA)
+    point = calibration_point(world)
     size = min(point.shape[0], camera.rows), min(point.shape[1], camera.cols)
     caustic_e = fitted(point, size)
     caustic_e *= np.float32(FILLED * camera.full_well_e / float(caustic_e.max()))
@@ -30,9 +33,24 @@ def simulated_calibration(world: World) -> Calibration:
         psfs=(Psf(fitted(measured, world.shape), name="simulated point source"),),
         sensor=sensor,
         geometry=world.geometry,
+        flat=world.setup(world.spec.light.colour).response,
+        bad=hot_pixels(world.scene) if world.scene.sim.sensor.hot_pixels else None,
         field_deg=world.optics.field_deg,
         simulated=True,
     )
+
+
+def calibration_point(world: World) -> Image:
+    """What the point source of the factory becomes: another eye, another distance, and a dot of some size."""
+    setup, said = world.setup(world.spec.light.colour), world.scene.sim.calibration
+    there = Setup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
+    there.refraction = Refraction(said.m_dpt, said.j0_dpt, said.j45_dpt)
+    if said.diffuser_to_sensor_um is not None:
+        there.optics = setup.optics.model_copy(update={"diffuser_to_sensor_um": said.diffuser_to_sensor_um})
+    point = psf(there)
+    scale = setup.optics.angular_magnification * setup.optics.diffuser_to_sensor_um
+    on_sensor_um = setup.source_um * scale / world.scene.sim.eye.focal_length_um
+    return dotted(point, on_sensor_um / world.spec.camera.pitch_um) if on_sensor_um else point
 
 
 def mean_frame(sensor: SensorModel, electrons: Image, seed: int, part: int) -> Image:

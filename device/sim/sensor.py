@@ -1,10 +1,10 @@
 """Electrons that arrive become counts that are read: shot noise, full well, read noise, gain, black level, converter.
 
-optics.md 3.9 without dark current and fixed pattern: DN = round(black + min(Poisson(e) + read, well) / gain).
+optics.md 3.9: DN = round(black + min(bent(Poisson(e) + read + offset), well) / gain).
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +20,35 @@ STRIP_ROWS = 64
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What turns electrons into counts, in the units of a head's [camera] table."""
+    """What turns electrons into counts, in the units of a head's [camera] table.
+
+    `offset_e` (rows, cols) is a fixed pattern; `nonlinearity` the relative bend at `bends_at_e`.
+    """
 
     gain_e_per_dn: float
     black_dn: float
     white_dn: int
     full_well_e: float
     read_noise_e: float
+    shot: bool = True
+    nonlinearity: float = 0.0
+    bends_at_e: float = 1.0
+    offset_e: Image | None = field(default=None, repr=False)
 
     @classmethod
     def of(cls, camera: CameraSpec) -> "SensorModel":
         """The sensor that a head's file describes."""
         return cls(camera.gain_e_per_dn, camera.black_dn, camera.white_dn, camera.full_well_e, camera.read_noise_e)
+
+    @classmethod
+    def ideal(cls, camera: CameraSpec) -> "SensorModel":
+        """The same without noise, and with wells that are never full: counts are all that is left of it."""
+        well_e = camera.full_well_e
+        return cls(camera.gain_e_per_dn, camera.black_dn, camera.white_dn, float("inf"), 0.0, False, 0.0, well_e)
+
+    def offset_by(self, pattern_e: Image) -> "SensorModel":
+        """With a fixed pattern more."""
+        return replace(self, offset_e=pattern_e if self.offset_e is None else self.offset_e + pattern_e)
 
     def read(self, electrons: Image, seed: int | tuple[int, ...], into: Counts | None = None) -> Counts:
         """One noisy frame of the expected `electrons` (rows, cols): uint16, the same for the same seed.
@@ -44,21 +61,30 @@ class SensorModel:
         streams = np.random.SeedSequence(seed).spawn(len(starts))
         with ThreadPoolExecutor(2) as pool:
             strips = [
-                pool.submit(self._read_strip, electrons[r : r + STRIP_ROWS], stream, counts[r : r + STRIP_ROWS])
+                pool.submit(self._read_strip, electrons, slice(r, r + STRIP_ROWS), stream, counts)
                 for r, stream in zip(starts, streams, strict=True)
             ]
             for strip in strips:
                 strip.result()
         return counts
 
-    def _read_strip(self, electrons: Image, stream: np.random.SeedSequence, into: Counts) -> None:
-        level = noisy(electrons, self.read_noise_e, np.random.Generator(np.random.SFC64(stream)))
-        np.minimum(level, np.float32(self.full_well_e), out=level)
+    def _read_strip(self, electrons: Image, rows: slice, stream: np.random.SeedSequence, counts: Counts) -> None:
+        rng = np.random.Generator(np.random.SFC64(stream))
+        if self.shot:
+            level = noisy(electrons[rows], self.read_noise_e, rng)
+        else:
+            level = electrons[rows] + np.float32(self.read_noise_e) * rng.standard_normal(electrons[rows].shape, "f4")
+        if self.offset_e is not None:
+            level += self.offset_e[rows]
+        if self.nonlinearity:
+            level *= 1 + level * np.float32(self.nonlinearity / self.bends_at_e)
+        if self.full_well_e < np.inf:
+            np.minimum(level, np.float32(self.full_well_e), out=level)
         level *= np.float32(1 / self.gain_e_per_dn)
         level += np.float32(self.black_dn)
         np.rint(level, out=level)
         np.clip(level, 0, self.white_dn, out=level)
-        np.copyto(into, level, casting="unsafe")
+        np.copyto(counts[rows], level, casting="unsafe")
 
 
 def noisy(electrons: Image, read_noise_e: float, rng: np.random.Generator) -> NDArray[np.float32]:

@@ -8,7 +8,8 @@ from device.clock import VirtualClock
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
-from device.sim.world import World, fitted
+from device.sim.render import fitted
+from device.sim.world import World
 from device.spec import InstrumentSpec
 from device.values import Calibration, Counts, Glow, Image, Mask, Shot
 

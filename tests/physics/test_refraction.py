@@ -13,6 +13,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.recon.warp import transform, warped
+from device.scene import EyeSpec
 from device.sim.calibrate import simulated_calibration
 from device.sim.world import World
 from device.spec import load_head
@@ -26,8 +27,8 @@ PLANNER = Planner(folder=None, effort="FFTW_ESTIMATE")
 
 def world(m_dpt: float) -> World:
     assert HEAD.sim is not None
-    spec = HEAD.model_copy(update={"sim": HEAD.sim.model_copy(update={"peak_e": PEAK_E})})
-    return World(spec, VirtualClock(), refraction=Refraction(m_dpt))
+    sim = HEAD.sim.model_copy(update={"peak_e": PEAK_E, "eye": EyeSpec(m_dpt=m_dpt)})
+    return World(HEAD.model_copy(update={"sim": sim}), VirtualClock())
 
 
 @cache

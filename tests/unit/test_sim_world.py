@@ -9,12 +9,12 @@ from scipy.signal import convolve2d
 
 from device.clock import VirtualClock
 from device.errors import CameraMissing, CameraStalled, LightFault, SettingError, SpecError
-from device.optics.diffuser import Refraction
-from device.scene import ObjectSpec
+from device.scene import EyeSpec, ObjectSpec
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
-from device.sim.world import World, blurred, fitted
+from device.sim.render import blurred, fitted
+from device.sim.world import World
 from device.spec import load_head
 from device.values import Glow, Shot
 
@@ -74,7 +74,7 @@ def test_the_blur_is_the_linear_convolution_cropped_about_the_middle(scene_shape
         )
         if 0 <= there[0] < shape[0] and 0 <= there[1] < shape[1]:
             expected[there] = value
-    assert blurred(scene, psf, shape) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+    assert blurred([(scene, psf)], shape) == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
 def test_a_point_in_the_scene_shows_the_caustic_around_its_own_pixel():
@@ -82,7 +82,7 @@ def test_a_point_in_the_scene_shows_the_caustic_around_its_own_pixel():
     psf[4, 4], psf[4, 6] = 0.75, 0.25
     scene = np.zeros((20, 20), np.float32)
     scene[10 + 3, 10 - 2] = 1
-    seen = blurred(scene, psf, (40, 50))
+    seen = blurred([(scene, psf)], (40, 50))
     assert seen[20 + 3, 25 - 2] == pytest.approx(0.75, abs=1e-5)
     assert seen[20 + 3, 25] == pytest.approx(0.25, abs=1e-5)
     assert fitted(scene, (40, 50))[23, 23] == 1
@@ -115,7 +115,7 @@ def test_the_wrong_lamp_looks_wrong(world):
 
 
 def test_the_eyes_refraction_changes_the_caustic_and_not_the_calibration(world):
-    myope = World(small_head(), VirtualClock(), refraction=Refraction(4.0))
+    myope = World(small_head(eye=EyeSpec(m_dpt=4.0)), VirtualClock())
     assert not np.allclose(myope.psf("green"), world.psf("green"), atol=1e-6)
     assert simulated_calibration(myope).id == simulated_calibration(world).id
 

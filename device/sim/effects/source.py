@@ -1,0 +1,18 @@
+"""The calibration's point is a dot of some size (optics.md 2.1, 3.1)."""
+
+from device.sim.setup import Scene, Setup, Size
+
+name = "source"
+
+TABLE_ETA, TABLE_UM = 0.89, 275.0
+
+
+def size(scene: Scene) -> Size:
+    """With the square of its diameter."""
+    dot_um = scene.sim.calibration.source_um
+    return Size(TABLE_ETA * (dot_um / TABLE_UM) ** 2 * scene.weight, f"a dot of {dot_um:.0f} um stands for the point")
+
+
+def apply(setup: Setup) -> None:
+    """For the calibration only: in a frame, an object's size is its own."""
+    setup.source_um = setup.scene.sim.calibration.source_um
