@@ -1,4 +1,4 @@
-"""`make bench-retinas`: acceptance figures of the reconstruction, on photographs and recordings kept beside the project.
+"""`make bench-retinas`: acceptance figures of the reconstruction, on photographs and recordings that are real.
 
 Every retina is put behind the simulated optics, of which the solver knows nothing; every parameter is chosen by the
 frame. The paper's method stands beside ours with the mu that suits the truth best, which no instrument can know.
