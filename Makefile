@@ -38,9 +38,8 @@ bench: .venv/ready ## Print figures of speed and truth, measured on this machine
 	@$(BIN)/python -m tests.bench
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
-DATA ?= ../shared/data
-bench-retinas: .venv/ready ## Print the acceptance figures on photographs and recordings in DATA=../shared/data.
-	@$(BIN)/python -m tests.bench.retinas --data $(DATA)
+bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
+	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
 
 bench-peers: .venv/ready ## Install LenslessPiCam beside, in .bench-venv, for make bench to compare with.
 	@$(BIN)/python -m venv .bench-venv
