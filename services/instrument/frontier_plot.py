@@ -20,7 +20,7 @@ def drawn(found: Found) -> str:
         title=f"What accuracy costs in time: {found['scene']}",
         under=_under(found),
         says=_says(found, edge),
-        x=time_axis(seconds, "time from counts in memory to the picture on the sensor grid, the eye's refraction apart"),
+        x=time_axis(seconds, "from counts in memory to the picture on the sensor grid, refraction apart"),
         y=y,
         series=tuple(_series(points, name) for name in METHODS if any(p["method"] == name for p in points)),
         edge=tuple(edge),
