@@ -51,6 +51,16 @@ class SensorModel:
         """With a fixed pattern more."""
         return replace(self, offset_e=pattern_e if self.offset_e is None else self.offset_e + pattern_e)
 
+    def middle(self, shape: tuple[int, int]) -> "SensorModel":
+        """Only the pixels (rows, cols) in the middle."""
+        if self.offset_e is None:
+            return self
+        rows, cols = (
+            slice(have // 2 - n // 2, have // 2 - n // 2 + n)
+            for have, n in zip(self.offset_e.shape, shape, strict=True)
+        )
+        return replace(self, offset_e=self.offset_e[rows, cols])
+
     def read(self, electrons: Image, seed: int | tuple[int, ...], into: Counts | None = None) -> Counts:
         """One noisy frame of the expected `electrons` (rows, cols): uint16, the same for the same seed.
 

@@ -6,7 +6,7 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "refraction"
 
-ETA_PER_DPT = 2.5
+ETA_PER_DPT = 3.0
 
 
 def size(scene: Scene) -> Size:
