@@ -46,12 +46,12 @@ class LightSpec(Table):
 
 
 class OpticsSpec(Table):
-    """The light path from the eye to the sensor: paper, sections "Optical design" and "Hardware design"."""
+    """The light path from the eye to the sensor, by default the paper's: "Optical design" and "Hardware design"."""
 
-    iris_um: float = Field(gt=0)
-    diffuser_to_sensor_um: float = Field(gt=0)
-    angular_magnification: float = Field(gt=0)
-    field_deg: float = Field(gt=0, lt=180)
+    iris_um: float = Field(default=3200.0, gt=0)
+    diffuser_to_sensor_um: float = Field(default=6000.0, gt=0)
+    angular_magnification: float = Field(default=0.75, gt=0)
+    field_deg: float = Field(default=33.4, gt=0, le=90)  # beyond, a degree is no longer a number of pixels (Geometry)
     wavelength_um: float = Field(default=0.55, gt=0.3, lt=1.2)
     bandwidth_um: float = Field(default=0.04, ge=0, lt=0.2)
     slope_fwhm_deg: float = Field(default=0.5, gt=0, lt=20)
@@ -96,4 +96,18 @@ def load_head(path: Path) -> InstrumentSpec:
                 f"{path}: camera.{key} = {getattr(spec.camera, key):g} is not shorter than "
                 f"light.max_on_s = {spec.light.max_on_s:g}, so the guard would end every exposure"
             )
+    _refuse_a_pupil_beside_the_iris(path, spec)
     return spec
+
+
+def _refuse_a_pupil_beside_the_iris(path: Path, spec: InstrumentSpec) -> None:
+    """No light passes if the pupil, as the relay images it, misses the iris."""
+    if spec.sim is None or spec.optics is None:
+        return
+    eye, iris_um = spec.sim.eye, spec.optics.iris_um * spec.optics.angular_magnification
+    most_um = (eye.pupil_um + iris_um) / 2
+    if eye.decentred_um >= most_um:
+        raise SpecError(
+            f"{path}: sim.eye.decentred_um = {eye.decentred_um:g}: no light of a pupil of {eye.pupil_um:g} um meets "
+            f"the iris; allowed: below {most_um:g}"
+        )

@@ -25,8 +25,9 @@ def simulated_calibration(world: World) -> Calibration:
     size = min(point.shape[0], camera.rows), min(point.shape[1], camera.cols)
     caustic_e = fitted(point, size)
     caustic_e *= np.float32(FILLED * camera.full_well_e / float(caustic_e.max()))
-    measured = mean_frame(world.sensor, caustic_e, world.seed, 1)
-    measured -= mean_frame(world.sensor, np.zeros_like(caustic_e), world.seed, 2)
+    pixels = world.sensor.middle(size)
+    measured = mean_frame(pixels, caustic_e, world.seed, 1)
+    measured -= mean_frame(pixels, np.zeros_like(caustic_e), world.seed, 2)
     measured -= _pedestal(measured, world)
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, float(camera.white_dn))
     return Calibration(

@@ -8,12 +8,12 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "falloff"
 
-ETA = 1.4  # at 33.4 degrees (optics.md 3.1), where the edge keeps 0.84 of the light
+ETA = 7.0  # at 33.4 degrees on a sensor that the field fills, where the edge keeps 0.84 of the light
 TABLE_LOSS = 1 - cos(radians(16.7)) ** 4
 
 
 def size(scene: Scene) -> Size:
-    """In proportion to what the edge loses; a screen that shines by itself has none of it."""
+    """In proportion to what the edge loses."""
     if not scene.sim.light.falloff:
         return Size(0.0, "the illumination is even")
     loss = 1 - cos(radians(scene.half_field_deg)) ** 4
