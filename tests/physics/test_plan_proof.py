@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from device.clock import VirtualClock
-from device.recon.metrics import pcc
 from device.recon.methods import METHODS
+from device.recon.metrics import pcc
 from device.recon.model import field_radius_px
 from device.recon.prepare import Preparer
 from device.recon.reconstructor import Recipe, Reconstructor
