@@ -89,6 +89,7 @@ class LightFlaws(Table):
     ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
     led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
     falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (optics.md 3.5)
+    vignette_deg: float | None = Field(default=None, gt=0, le=180)  # where exp(-1) of the light is left beside that
 
 
 class SensorFlaws(Table):

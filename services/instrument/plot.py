@@ -35,7 +35,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Mark:
-    """One measured point: where, in which series, what its label and its tooltip say; `weight` scales it."""
+    """One point: where, what its label and its tooltip say; `weight` scales it, and 0 leaves just the trail."""
 
     x: float
     y: float
@@ -210,6 +210,8 @@ def _series(plot: Plot) -> list[str]:
             if len(places) > 1:
                 out.append(f'<polyline class="trail" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
             for mark, (x, y) in zip(trail, places, strict=True):
+                if not mark.weight:
+                    continue
                 shape = _shape(k, x, y, 6.5 * mark.weight)
                 out.append(f"{shape}<title>{escape(mark.says)}</title></path>" if mark.says else f"{shape}</path>")
         out.append("</g>")
