@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 
 from device import sim
-from device.clock import SystemClock
 from device.recon.closed import TIKHONOV, ClosedForm
 from device.recon.evenness import even_out
 from device.recon.geometry import disc
+from device.recon.methods import method_named
 from device.recon.metrics import Judge, Scores
 from device.recon.model import field_radius_px, periodic_model
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
-from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.refraction import Refractor
 from device.recon.upsample import to_sensor
 from device.sim.staged import Staged, staged
 from device.spec import InstrumentSpec, load_head
-from device.values import Calibration, Image, Mask, Reconstruction
+from device.values import Calibration, Image, Mask
 
 SCENES = Path(sim.__file__).parent / "scenes"
 SAMPLE_UM = 10.08  # of the scores: two of the paper's pixels
@@ -42,7 +42,7 @@ class Bench:
     def __init__(self, merged: int = 1, say: Say = lambda line: None) -> None:
         self.merged, self.say = merged, say
         self.planner = Planner(folder=None, effort="FFTW_ESTIMATE")
-        self._makers: dict[tuple[str, str], Reconstructor] = {}
+        self._refractor: tuple[str, Refractor] | None = None
 
     def scene(self, name: str, changes: Mapping[str, Any] | None = None) -> InstrumentSpec:
         """A shipped scene with changes like {"sim.eye.m_dpt": 4.0}, its pixels merged; SpecError where one is wrong."""
@@ -53,19 +53,25 @@ class Bench:
         spec = self.scene(name, changes)
         return Take(spec.name, staged(spec))
 
-    def solve(self, take: "Take", method: str) -> Image:
+    def solve(self, take: "Take", name: str) -> Image:
         """The picture by one of our methods, with the PSF as calibrated, on the samples of the scores."""
-        return take.sampled(self.reconstruct(take, method).picture)
+        method = method_named(name)
+        model = method.model(take.calibration, take.shape, take.samples_px, self.planner, 0)
+        solver, out = method.build(model, take.calibration, self.planner), np.zeros(model.grid.shape, np.float32)
+        solver.start(Preparer(take.calibration, model.grid)(take.staged.counts))
+        if method.round_pairs:
+            for _ in range(solver.rounds):
+                solver.step()
+        solver.finish(out)
+        return take.sampled(to_sensor(out, model.grid))
 
-    def reconstruct(self, take: "Take", method: str, refract: bool = False) -> Reconstruction:
-        """The same on the sensor's own pixels, with its report; planned once per calibration and method."""
-        key = take.staged.calibration.id, f"{method}{refract}"
-        if key not in self._makers:
-            recipe = (Recipe(method, take.samples_px),)
-            self._makers[key] = Reconstructor(
-                take.staged.calibration, take.shape, self.planner, SystemClock(), recipe, refract=refract
-            )
-        return self._makers[key](take.staged.counts, simulated=True)
+    def refraction(self, take: "Take") -> float:
+        """The mean sphere that the frame tells, as wavefront in dpt; not a number where it tells none."""
+        if self._refractor is None or self._refractor[0] != take.calibration.id:
+            found = Refractor(take.calibration, take.shape, self.planner, 0)
+            self._refractor = take.calibration.id, found
+        eye = self._refractor[1].find(take.staged.counts)
+        return float("nan") if eye is None else eye.sphere_dpt
 
     def tikhonov(self, take: "Take", mu: float) -> Image:
         """The paper's own solution for one weight, on the samples of the scores."""

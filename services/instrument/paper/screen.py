@@ -15,6 +15,7 @@ FLOOR = 0.05  # of the brightest: what is darker is taken for nothing before a g
 DOT_MU = 1e-5
 APART_DEG = 1.5  # two brightest places nearer than this are one dot
 EDGE_DEG = 25.64  # of the outermost dots on the middle row: 12 mm behind 25 mm
+NEXT_DEG = 21.80  # of the dots beside them, 10 mm
 WINDOW_DEG = 1.9
 FLAT = {"sim.eye.surface": "flat", "sim.eye.walks": True}
 SAID_DOTS = "SSIM .59 to .85"
@@ -141,11 +142,11 @@ def run_flat_screen(bench: Bench) -> Outcome:
     curved, flat = bench.take("paper_dots"), bench.take("paper_dots", FLAT)
     good, bad = (floored(bench.tikhonov(take, DOT_MU)) for take in (curved, flat))
     scores = curved.score(good), flat.score(bad)
+    drawn_out = sum(elongation(bad, flat, at) / elongation(good, curved, at) for at in (-NEXT_DEG, NEXT_DEG)) / 2
     claims = (
         below("edge dot over middle dot on the flat screen", peak(bad, flat, EDGE_DEG) / peak(bad, flat, 0), 0.35),
         above("PCC lost by the flat screen", scores[0].pcc - scores[1].pcc, 0.1, "blurred, lower contrast"),
-        above("edge dot, along the radius over across", elongation(bad, flat, 22.62), 1.15),
-        within("the same on a curved screen", elongation(good, curved, 22.62), 0.85, 1.15),
+        above("edge dots drawn out along the radius, flat over curved", drawn_out, 1.1),
     )
     shown = (
         *compared(flat, {"flat screen": bad, "curved screen": good}),
@@ -155,7 +156,7 @@ def run_flat_screen(bench: Bench) -> Outcome:
     rows = (_row("curved", scores[0]), _row("flat", scores[1]))
     note = (
         "The flat screen is 7.7 and 16.9 dpt out of focus at its edge, across and along the radius; so its dots are drawn "
-        "out along the radius. The optics notes say \"tangentially\", which names the meridian, not the blur."
+        "out along the radius. The optics notes expected \"tangentially\": that is the name of the meridian, not of the blur."
     )
     return Outcome(claims, shown, (Sheet(("screen", "PCC", "PSNR, dB", "SSIM"), rows),), (note,))
 
