@@ -72,9 +72,12 @@ def reconstruct(
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where to write the report as JSON.")] = None,
+    sweep: Annotated[
+        Path | None, typer.Option(help="Where to draw how well each of several PSFs fits, as SVG.")
+    ] = None,
 ) -> None:
     """Turn one raw frame into a picture, without a head and without a page."""
-    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report)
+    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report, sweep)
     made = reconstruct_file(order)
     text = json.dumps(asdict(made.report), indent=1)
     if report is not None:
