@@ -169,11 +169,11 @@ class Take:
 
     def column(self, right_deg: float) -> int:
         """The column of a place on the samples."""
-        return round((self.truth.shape[1] - 1) / 2 + right_deg * self.px_per_deg)
+        return round(float((self.truth.shape[1] - 1) / 2 + right_deg * self.px_per_deg))
 
     def row(self, down_deg: float) -> int:
         """The row of a place on the samples."""
-        return round((self.truth.shape[0] - 1) / 2 + down_deg * self.px_per_deg)
+        return round(float((self.truth.shape[0] - 1) / 2 + down_deg * self.px_per_deg))
 
 
 def changed(spec: InstrumentSpec, changes: Mapping[str, Any]) -> InstrumentSpec:

@@ -110,11 +110,13 @@ def run_walk(bench: Bench) -> Outcome:
 
 EXPERIMENTS = (
     Experiment(
-        "S0", "The caustic", "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm "
-        "and in every colour.", "Figures 1 and 3a; \"precise control of this distance is not required\".", run_caustic,
+        "S0", "The caustic",
+        "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour.",
+        "Figures 1 and 3a; \"precise control of this distance is not required\".", run_caustic,
     ),
     Experiment(
-        "S8", "The beam walks over the iris", "Up to 25 degrees the beam fills the iris; at 30 degrees hardly any of it "
-        "is left.", "Section \"Optical design\": 6.3 % of the aperture is lit at 30 degrees.", run_walk,
+        "S8", "The beam walks over the iris",
+        "Up to 25 degrees the beam fills the iris; at 30 degrees hardly any of it is left.",
+        "Section \"Optical design\": 6.3 % of the aperture is lit at 30 degrees.", run_walk,
     ),
 )  # fmt: skip

@@ -20,11 +20,12 @@ class Claim:
 
 @dataclass(frozen=True)
 class Shown:
-    """One picture with its caption, as a data address."""
+    """One picture with its caption, as a data address; a `wide` one fills a row, one that `begins` starts a row."""
 
     caption: str
     address: str
     wide: bool = False
+    begins: bool = False
 
 
 @dataclass(frozen=True)

@@ -27,21 +27,22 @@ def plane(caption: str, image: Image, inside: Mask | None = None, box: Mask | No
     return Shown(caption, _png((255 * grey[rows, cols]).astype(np.uint8)))
 
 
-def compared(take: Take, pictures: Mapping[str, Image]) -> tuple[Shown, ...]:
-    """The frame and the truth of a take, and pictures beside them, each with its scores."""
+def compared(take: Take, pictures: Mapping[str, Image], name: str = "") -> tuple[Shown, ...]:
+    """The frame and the truth of a take, and pictures beside them, each with its scores: a row of their own."""
+    before = f"{name}: " if name else ""
     out = [
-        Shown(f"{take.name}: what the sensor sees", plane("", take.raw).address),
-        plane("truth", take.truth, take.inside),
+        Shown(f"{before}what the sensor sees", plane("", take.raw).address, begins=True),
+        plane(f"{before}truth", take.truth, take.inside),
     ]
-    for name, picture in pictures.items():
+    for kind, picture in pictures.items():
         scores = take.score(picture)
-        words = f"{name}: PCC {scores.pcc:.3f}, PSNR {scores.psnr_db:.1f} dB, SSIM {scores.ssim:.2f}"
+        words = f"{before}{kind}: PCC {scores.pcc:.3f}, PSNR {scores.psnr_db:.1f} dB, SSIM {scores.ssim:.2f}"
         out.append(plane(words, np.where(take.inside, picture, 0), take.inside))
     return tuple(out)
 
 
 def cutline(take: Take, down_deg: float, pictures: Mapping[str, Image], title: str) -> Shown:
-    """The values of truth and pictures along a row of the field, each picture fitted to the truth by gain and offset."""
+    """Truth and pictures along a row of the field, each picture brought to the truth by one gain and offset."""
     row = take.row(down_deg)
     cols = np.flatnonzero(take.inside[row])
     middle = (take.truth.shape[1] - 1) / 2
@@ -67,9 +68,7 @@ def trend(title: str, under: str, across: str, up: str, lines: Mapping[str, Mapp
     return _svg(title, Plot(title, under, title, value_axis(xs, across), value_axis(ys, up), series, height=380))
 
 
-def _lines(
-    title: str, under: str, across: str, up: str, x: np.ndarray, lines: Mapping[str, np.ndarray]
-) -> Shown:
+def _lines(title: str, under: str, across: str, up: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Shown:
     series = tuple(
         Series(name, (tuple(Mark(float(a), float(b), weight=0) for a, b in zip(x, values, strict=True)),))
         for name, values in lines.items()

@@ -57,8 +57,8 @@ def run_rulers(bench: Bench) -> Outcome:
                         ("black on white, flat-sub", three), ("black on white, ours", four))
     )  # fmt: skip
     shown = (
-        *compared(sparse, {f"paper's solver, mu {mu:.0e}": white}),
-        *compared(dense, {f"paper's solver, mu {mu:.0e}": black, "flat-sub": flat, "ours": ours}),
+        *compared(sparse, {f"paper's solver, mu {mu:.0e}": white}, "white ruler"),
+        *compared(dense, {f"paper's solver, mu {mu:.0e}": black, "flat-sub": flat, "ours": ours}, "black ruler"),
         cutline(sparse, -1.6, {"paper's solver": white}, "White ruler, across the ticks"),
         cutline(dense, -1.6, {"paper's solver": black, "ours": ours}, "Black ruler, across the ticks"),
     )
@@ -109,7 +109,7 @@ def run_prints(bench: Bench) -> Outcome:
         rows.append((name, f"{scores.pcc:.3f}", f"{ours.pcc:.3f}", f"{sum(n for _, n in signs)}/"
                      f"{sum(n for n, _ in signs)}"))  # fmt: skip
         both = {"paper's solver": paper, "flat-sub": pictures[name]}
-        shown += [*compared(take, {f"{name}, {k}": x for k, x in both.items()})[1:]]
+        shown += compared(take, both, name)
         shown.append(cutline(take, 0.0, both, f"Across vessels, {name}"))
     off = [registered(pictures, takes, name) for name in ("left", "right")]
     claims = (
@@ -119,11 +119,13 @@ def run_prints(bench: Bench) -> Outcome:
     )
     sheet = Sheet(("position", "PCC, paper's solver", "PCC, flat-sub", "edges right"), tuple(rows))
     note = (
-        "The paper moved the model eye sideways to move the field. With an object at infinity that moves the pupil, not "
+        "The paper moved the model eye sideways to move the field. With an object at infinity that moves the "
+        "pupil, not "
         "the field; here the print moves by 4 mm behind the lens, which is 9.09 degrees."
     )
     fainter = (
-        f"Asked are edges of 5 % of the mean over 0.6 degrees. Of all from 3 % on, {faint_same} of {faint} go the right way "
+        f"Asked are edges of 5 % of the mean over 0.6 degrees. Of all from 3 % on, {faint_same} of {faint} go the "
+        "right way "
         "in the paper's solution: the faintest drown in its ringing."
     )
     return Outcome(claims, tuple(shown), (sheet,), (note, fainter))

@@ -129,15 +129,17 @@ def run_retina(bench: Bench) -> Outcome:
     shown = (*compared(take, pictures), cutline(take, 0.4, pictures, "Across disc and macula"))
     rows = tuple(_row(name, take.score(x)) for name, x in pictures.items())
     note = (
-        f"At 48.3 degrees the light runs past the sensor's short side (7.0 of 5.4 mm), which a periodic solution cannot "
-        f"know. Before its flat field the paper's solver has {paper.pcc:.2f}; the optics notes found .32 on a retina with "
+        "At 48.3 degrees the light runs past the sensor's short side (7.0 of 5.4 mm), which a periodic solution "
+        "cannot "
+        f"know. Before its flat field the paper's solver has {paper.pcc:.2f}; the optics notes found .32 on a "
+        "retina with "
         "less shading. Its best weight is the largest on offer: a blur."
     )
     return Outcome(claims, shown, (Sheet(("picture", "PCC", "PSNR, dB", "SSIM"), rows),), (note,))
 
 
 def run_flat_screen(bench: Bench) -> Outcome:
-    """The same lattice on a flat screen, with the beam that walks: what the paper suspects behind its uneven pictures."""
+    """The same lattice on a flat screen, with the beam that walks: why the paper suspects its pictures are uneven."""
     bench.say("S2b: dots on a flat screen")
     curved, flat = bench.take("paper_dots"), bench.take("paper_dots", FLAT)
     good, bad = (floored(bench.tikhonov(take, DOT_MU)) for take in (curved, flat))
@@ -155,8 +157,10 @@ def run_flat_screen(bench: Bench) -> Outcome:
     )
     rows = (_row("curved", scores[0]), _row("flat", scores[1]))
     note = (
-        "The flat screen is 7.7 and 16.9 dpt out of focus at its edge, across and along the radius; so its dots are drawn "
-        "out along the radius. The optics notes expected \"tangentially\": that is the name of the meridian, not of the blur."
+        "The flat screen is 7.7 and 16.9 dpt out of focus at its edge, across and along the radius; so its dots "
+        "are drawn "
+        'out along the radius. The optics notes expected "tangentially": that is the name of the meridian, not '
+        "of the blur."
     )
     return Outcome(claims, shown, (Sheet(("screen", "PCC", "PSNR, dB", "SSIM"), rows),), (note,))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from services.instrument.paper.bench import Bench, Take
 from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, above, below
-from services.instrument.paper.pictures import compared, plane, trend
+from services.instrument.paper.pictures import compared, trend
 
 PAPER_PITCH_UM, PAPER_PEAK_E = 5.04, 20000.0
 SLACK = 0.02
@@ -50,14 +50,14 @@ def run_sensors(bench: Bench) -> Outcome:
             cut = take.score(plain.solve(take, "variation")).pcc
             take = whole_psf(plain, take, name)
         _, paper, scores = plain.best(take)
-        flat, ours = (plain.solve(take, method) for method in ("gradient", "variation"))
+        flat, ours = (plain.solve(take, method) for method in ("evidence", "variation"))
         found = scores.pcc, take.score(flat).pcc, take.score(ours).pcc
         claims += [
             above(f"{name}, PCC of flat-sub", found[1], NOTES[name][1] - SLACK),
             above(f"{name}, PCC of ours", found[2], NOTES[name][2] - SLACK),
             above(f"{name}, ours over the paper's solver, PCC", found[2] - found[0], 0.3),
         ]
-        shown += [*compared(take, {f"{name}, paper's solver": paper, f"{name}, ours": ours})]
+        shown += compared(take, {"paper's solver": paper, "ours": ours}, name)
         rows.append((name, *(f"{pcc:.3f} ({noted:.3f})" for pcc, noted in zip(found, NOTES[name], strict=True))))
     sheet = Sheet(("sensor", "paper's solver", "flat-sub", "ours"), tuple(rows))
     note = (
@@ -66,7 +66,8 @@ def run_sensors(bench: Bench) -> Outcome:
         "needed at 33.4 degrees. With a solver that knows of the crop it is no rule any more."
     )
     parts = (
-        "The OV9281 does not even hold the PSF (3.4 mm on 2.4), so its PSF is taken in parts, as by a point that moves. "
+        "The OV9281 does not even hold the PSF (3.4 mm on 2.4), so its PSF is taken in parts, as by a point that "
+        "moves. "
         f"With what it sees of a point on the axis alone our default has {cut:.2f}."
     )
     return Outcome(tuple(claims), tuple(shown), (sheet,), (note, parts))
@@ -83,10 +84,15 @@ def run_refraction(bench: Bench) -> Outcome:
         said = []
         for kind, (j0, j45) in {"round eyes": (0.0, 0.0), "astigmatic eyes": (j0_dpt, j45_dpt)}.items():
             bench.say(f"S11: an eye of {m_dpt:+.2f} dpt, {kind}")
-            eye = {"sim.eye.m_dpt": m_dpt, "sim.eye.j0_dpt": j0, "sim.eye.j45_dpt": j45, "sim.calibration.source_um": 0.0}
+            eye = {
+                "sim.eye.m_dpt": m_dpt,
+                "sim.eye.j0_dpt": j0,
+                "sim.eye.j45_dpt": j45,
+                "sim.calibration.source_um": 0.0,
+            }
             found = bench.refraction(bench.take("paper_heine", eye))
             errors[kind].append(found - m_dpt)
-            curve[kind][m_dpt] = found
+            curve[kind][m_dpt] = found - m_dpt
             said.append(f"{found:+.2f}")
         rows.append((f"{m_dpt:+.2f}", f"{j0_dpt:+.2f}", f"{j45_dpt:+.2f}", *said))
     rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in errors.items()}
@@ -94,12 +100,17 @@ def run_refraction(bench: Bench) -> Outcome:
         below("mean sphere of round eyes, rms error, dpt", rms["round eyes"], 0.15, "promised, not shown"),
         below("mean sphere of astigmatic eyes, rms error, dpt", rms["astigmatic eyes"], 0.15, "promised, not shown"),
     )
-    shown = (trend("Refraction that the frame tells", "no beacon; wavefront M", "of the eye, dpt", "found, dpt", curve),)
+    shown = (
+        trend("Refraction that the frame tells", "no beacon; wavefront M", "of the eye, dpt", "found, dpt", curve),
+    )
     note = (
-        "The optics notes also read J0 and J45 (0.06 dpt) this way. The instrument reads the mean sphere only, so nothing "
+        "The optics notes also read J0 and J45 (0.06 dpt) this way. The instrument reads the mean sphere only, "
+        "so nothing "
         "is claimed about cylinder. One diffuser model makes and reads these frames: a simulation, not a measurement."
     )
-    return Outcome(claims, shown, (Sheet(("M", "J0", "J45", "M found, round", "M found, astigmatic"), tuple(rows)),), (note,))
+    return Outcome(
+        claims, shown, (Sheet(("M", "J0", "J45", "M found, round", "M found, astigmatic"), tuple(rows)),), (note,)
+    )
 
 
 EXPERIMENTS = (
@@ -108,7 +119,9 @@ EXPERIMENTS = (
         "\"One needs to choose an image sensor size D > d + 2s.\"", run_sensors,
     ),
     Experiment(
-        "S11", "Refraction from the frame", "The stretch of the caustic that a frame carries tells the eye's mean sphere.",
-        "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".", run_refraction,
+        "S11", "Refraction from the frame",
+        "The stretch of the caustic that a frame carries tells the eye's mean sphere.",
+        "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
+        run_refraction,
     ),
 )  # fmt: skip
