@@ -8,7 +8,7 @@ from scipy import ndimage
 from device.recon.metrics import shift_px
 from device.values import Image
 from services.instrument.paper.bench import Bench, Take
-from services.instrument.paper.outcome import Experiment, Outcome, Sheet, above, below, within
+from services.instrument.paper.outcome import Experiment, Outcome, Sheet, Shown, above, below, within
 from services.instrument.paper.pictures import compared, cutline
 from services.instrument.paper.screen import DOT_MU, floored, found
 
@@ -94,7 +94,8 @@ def edge_signs(take: Take, picture: Image, down_deg: float, step: float = EDGE_S
 
 def run_prints(bench: Bench) -> Outcome:
     """One print behind the lens at three places."""
-    takes, pictures, rows, shown = {}, {}, [], []
+    takes, pictures, rows = {}, {}, []
+    shown: list[Shown] = []
     asked = same = faint = faint_same = 0
     for name, right_deg in POSITIONS.items():
         bench.say(f"S4: a printed retina, {name}")

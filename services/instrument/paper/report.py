@@ -56,6 +56,11 @@ def rerun(
     return ran
 
 
+def all_hold(ran: Sequence[Ran]) -> bool:
+    """Whether every assertion of every experiment holds."""
+    return all(claim.holds for one in ran for claim in one.outcome.claims)
+
+
 def table(ran: Sequence[Ran]) -> str:
     """Every assertion as text."""
     lines = [f"{'':5}{'':4}{'assertion':<62}{'value':>10}  {'limit':<18}paper"]
@@ -71,7 +76,7 @@ def html(ran: Sequence[Ran], merged: int) -> str:
     """The whole page, self-contained."""
     every = [claim for one in ran for claim in one.outcome.claims]
     hold, total_s = sum(claim.holds for claim in every), sum(one.seconds for one in ran)
-    size = "full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
+    size = "Full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
     verdict = f"{hold} of {len(every)} assertions hold" + ("." if hold == len(every) else ": the others are marked.")
     toc = "".join(
         f'<li><a href="#{one.experiment.key}">{one.experiment.key}</a> {escape(one.experiment.title)}'
@@ -132,7 +137,8 @@ def _sheet(sheet: Sheet) -> str:
 
 def _figure(shown: Shown) -> str:
     words = escape(shown.caption)
-    return f'<figure><img src="{shown.address}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+    kind = " class=begins" if shown.begins else ""
+    return f'<figure{kind}><img src="{shown.address}" alt="{words}"><figcaption>{words}</figcaption></figure>'
 
 
 def _value(claim: Claim) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from services.instrument.paper.bench import Bench, Take
-from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, above, below
+from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown, above, below
 from services.instrument.paper.pictures import compared, trend
 
 PAPER_PITCH_UM, PAPER_PEAK_E = 5.04, 20000.0
@@ -41,7 +41,8 @@ def whole_psf(bench: Bench, take: Take, name: str) -> Take:
 def run_sensors(bench: Bench) -> Outcome:
     """Each sensor with the paper's solver, with the flat field taken out first, and with ours."""
     claims: list[Claim] = []
-    shown, rows, cut = [], [], 0.0
+    shown: list[Shown] = []
+    rows, cut = [], 0.0
     plain = Bench(1)  # these pixels are small already
     for name in SENSORS:
         bench.say(f"S10: {name}")
@@ -101,8 +102,9 @@ def run_refraction(bench: Bench) -> Outcome:
         below("mean sphere of astigmatic eyes, rms error, dpt", rms["astigmatic eyes"], 0.15, "promised, not shown"),
     )
     shown = (
-        trend("Refraction that the frame tells", "no beacon; wavefront M", "of the eye, dpt", "found, dpt", curve),
-    )
+        trend("Error of the refraction that the frame tells", "no beacon; wavefront M", "M of the eye, dpt",
+              "found less true, dpt", curve),
+    )  # fmt: skip
     note = (
         "The optics notes also read J0 and J45 (0.06 dpt) this way. The instrument reads the mean sphere only, "
         "so nothing "
