@@ -42,11 +42,25 @@ def simulated_calibration(world: World) -> Calibration:
         psfs=(Psf(fitted(measured, world.shape), name="simulated point source"),),
         sensor=sensor,
         geometry=world.geometry,
-        flat=world.setup(world.spec.light.colour).response,
+        flat=flat_frame(world),
         bad=hot_pixels(world.scene) if world.scene.sim.sensor.hot_pixels else None,
         field_deg=world.optics.field_deg,
         simulated=True,
     )
+
+
+def flat_frame(world: World) -> Image | None:
+    """How the pixels respond, (rows, cols); each of a colour mosaic's four sites relative to its own mean.
+
+    What a mosaic keeps away must not be made up for: it would be noise. None for pixels that are all alike.
+    """
+    response = world.setup(world.spec.light.colour).response
+    if response is None:
+        return None
+    flat = response.copy()
+    for site in ((slice(row, None, 2), slice(col, None, 2)) for row in (0, 1) for col in (0, 1)):
+        flat[site] /= max(float(flat[site].mean(dtype=np.float64)), 1e-30)
+    return flat
 
 
 def calibration_point(world: World) -> Image:

@@ -4,7 +4,8 @@ The judge is optics.md 3.0: eta = ||F dY|| / ||F noise||, with F the product's o
 best common gain taken out of dY. Pixels are twice as wide, which is how the product solves the paper's sensor anyway.
 """
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -20,9 +21,12 @@ from device.recon.reconstructor import Recipe, Reconstructor
 from device.recon.resolution import working_bin
 from device.recon.variation import EvidenceWiener
 from device.sim.calibrate import calibration_point, simulated_calibration
+from device.sim.effects import EFFECTS
+from device.sim.effects.effect import Effect
 from device.sim.fundus import field_mask
 from device.sim.plan import SEEN
-from device.sim.render import blurred, fitted
+from device.sim.render import blurred, fitted, traced, zones
+from device.sim.setup import Scene, Setup, Size
 from device.sim.world import World
 from device.spec import load_head
 from device.values import Calibration, Image
@@ -77,6 +81,7 @@ class Proof:
 
     planned: World
     everything: World
+    calibration: Calibration  # of the planned one
     filter: Filter
 
 
@@ -84,24 +89,24 @@ class Proof:
 def proof(request: pytest.FixtureRequest) -> Proof:
     spec = coarse(load_head(SCENES / f"{request.param}.toml"), COARSER)
     planned = world(spec)
-    return Proof(planned, world(spec, everything=True), Filter(simulated_calibration(planned), planned))
+    calibration = simulated_calibration(planned)
+    return Proof(planned, world(spec, everything=True), calibration, Filter(calibration, planned))
 
 
-def pictured(of: World) -> Image:
+def pictured(of: World, calibration: Calibration) -> Image:
     """What the product shows: a lit and a dark frame through the head's own calibration."""
-    calibration = simulated_calibration(of)
     recipe = Recipe("evidence", working_bin(calibration.psfs[0]))
+    of.frames = 0  # the same noise in both worlds
     make = Reconstructor(calibration, of.shape, scenes.PLANNER, VirtualClock(), (recipe,))
     return make(exposed(of), exposed(of, lit=False)).picture
 
 
 def test_all_that_is_left_out_together_changes_no_picture(proof: Proof, record_property) -> None:
     colour = proof.planned.spec.light.colour
-    inside = field_mask(proof.planned.shape, field_radius_px(simulated_calibration(proof.planned)))
+    inside = field_mask(proof.planned.shape, field_radius_px(proof.calibration))
     truth = proof.planned.truth(colour).astype(np.float64)
-    planned, everything = (
-        pcc(pictured(of).astype(np.float64), truth, inside) for of in (proof.planned, proof.everything)
-    )
+    heads = (proof.planned, proof.calibration), (proof.everything, simulated_calibration(proof.everything))
+    planned, everything = (pcc(pictured(*head).astype(np.float64), truth, inside) for head in heads)
     record_property("pcc", f"{planned:.4f} {everything - planned:+.5f}")
     assert planned == pytest.approx(everything, abs=0.002)
 
@@ -159,15 +164,58 @@ NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.
 def plain(request: pytest.FixtureRequest) -> Proof:
     spec = coarse(load_head(SCENES / f"{request.param}.toml"), COARSER)
     planned = world(spec)
-    return Proof(planned, planned, Filter(simulated_calibration(planned), planned))
+    calibration = simulated_calibration(planned)
+    return Proof(planned, planned, calibration, Filter(calibration, planned))
 
 
 @pytest.mark.parametrize("name", NEAR)
 def test_near_the_threshold_a_formula_is_a_bound_and_no_wild_one(plain: Proof, name: str, record_property) -> None:
     spec = having(plain.planned.spec, **NEAR[name])
-    near = Proof(world(spec, only=["shot", "read", "quantisation"]), plain.everything, plain.filter)
+    near = replace(plain, planned=world(spec, only=["shot", "read", "quantisation"]))
     told = next(one.eta for one in world(spec).plan if one.name == name)
     measured = seen_by_itself(near, name)
     record_property(name, f"{told:.4f} {measured:.4f}")
     assert 0 < measured < told + ROUNDING
     assert told < 12 * measured
+
+
+class Counted:
+    """An effect that counts how often it is asked and how often it is put in."""
+
+    def __init__(self, effect: Effect, calls: Counter[str]) -> None:
+        self.name, self._effect, self._calls = effect.name, effect, calls
+
+    def size(self, scene: Scene) -> Size:
+        self._calls[f"size {self.name}"] += 1
+        return self._effect.size(scene)
+
+    def apply(self, setup: Setup) -> None:
+        self._calls[f"apply {self.name}"] += 1
+        self._effect.apply(setup)
+
+
+def test_what_is_skipped_is_asked_once_and_never_applied() -> None:
+    calls: Counter[str] = Counter()
+    of = world(coarse(load_head(SCENES / "calm.toml"), 4), effects=[Counted(effect, calls) for effect in EFFECTS])
+    expected(of)
+    assert calls == {f"size {one.name}": 1 for one in of.plan} | {
+        f"apply {one.name}": 1 for one in of.plan if one.simulated
+    }
+
+
+def cost(of: World) -> tuple[int, int]:
+    """Waves carried through the diffuser, and transforms of object and caustics, for one frame."""
+    traced.cache_clear()
+    setup = of.setup(of.spec.light.colour)
+    expected(of)
+    return traced.cache_info().misses * setup.lines, 2 * len(list(zones(setup))) + 1
+
+
+def test_a_relaxed_eye_before_a_screen_costs_a_fifth_or_less_of_everything(record_property) -> None:
+    spec = having(coarse(load_head(SCENES / "healthy.toml"), 4), eye={"shown_by": "screen"})
+    waves, transforms = cost(world(spec))
+    all_waves, all_transforms = cost(world(spec, everything=True))
+    record_property("cost", f"{waves} {all_waves} waves, {transforms} {all_transforms} transforms")
+    assert (waves, transforms) == (1, 3)
+    assert all_waves >= 3
+    assert all_transforms > 5 * transforms
