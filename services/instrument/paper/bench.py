@@ -45,7 +45,7 @@ class Bench:
         self._refractor: tuple[str, Refractor] | None = None
 
     def scene(self, name: str, changes: Mapping[str, Any] | None = None) -> InstrumentSpec:
-        """A shipped scene with changes like {"sim.eye.m_dpt": 4.0}, its pixels merged; ValueError where one is wrong."""
+        """A shipped scene with changes like {"sim.eye.m_dpt": 4.0}, its pixels merged; ValueError for a wrong one."""
         return merged(changed(load_head(SCENES / f"{name}.toml"), changes or {}), self.merged)
 
     def take(self, name: str, changes: Mapping[str, Any] | None = None) -> "Take":
