@@ -372,3 +372,9 @@ def test_a_plan_follows_its_rule_and_its_orders() -> None:
     assert not {one.name: one for one in decide(here, everything=True, without=["stray"])}["stray"].simulated
     assert [one.name for one in decide(here)] == [effect.name for effect in EFFECTS]
     assert all(isinstance(one, Decision) for one in decide(here))
+
+
+def test_the_readme_shows_the_plan_as_the_command_prints_it() -> None:
+    readme = (SCENES.parents[2] / "README.md").read_text()
+    assert table(decide(scene(load_head(SCENES / "calm.toml")))) in readme
+    assert len(EFFECTS) == 23, "the README says how many there are"
