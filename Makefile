@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test browser lint bench bench-peers lock clean
+.PHONY: help run test browser lint bench bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -38,6 +38,9 @@ bench: .venv/ready ## Print figures of speed and truth, measured on this machine
 	@$(BIN)/python -m tests.bench
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
+bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
+	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
+
 bench-peers: .venv/ready ## Install LenslessPiCam beside, in .bench-venv, for make bench to compare with.
 	@$(BIN)/python -m venv .bench-venv
 	@.bench-venv/bin/pip install -qq --disable-pip-version-check --no-deps lensless==1.0.8 && \

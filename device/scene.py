@@ -19,7 +19,8 @@ class ObjectSpec(Table):
 
     `retina` is drawn from the scene's seed with so many lesions; `image` is a photograph of one; `dots` are a lattice
     on a screen, `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
-    one disc. All but the retina's tree are moved to `at_deg` (right, down).
+    one disc. All are moved to `at_deg` (right, down). `size_deg` is how wide a retina is drawn or a photograph shown;
+    None: as wide as the field needs.
     """
 
     kind: Literal["retina", "image", "dots", "ruler", "point"] = "retina"
@@ -35,6 +36,7 @@ class ObjectSpec(Table):
     ticks_um: float = Field(default=1000.0, gt=0, le=10000)
     stroke_um: float = Field(default=220.0, gt=0, le=5000)
     at_deg: tuple[float, float] = (0.0, 0.0)
+    size_deg: float | None = Field(default=None, gt=0, lt=120)
 
     @field_validator("image")
     @classmethod
@@ -91,6 +93,7 @@ class LightFlaws(Table):
     ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
     led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
     falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (optics.md 3.5)
+    vignette_deg: float | None = Field(default=None, gt=0, le=180)  # where exp(-1) of the light is left beside that
 
 
 class SensorFlaws(Table):

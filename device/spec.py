@@ -1,20 +1,28 @@
 """One TOML file describes one head; this turns it into a checked, frozen value or says which line is wrong."""
 
+import difflib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from device.errors import SpecError
 from device.scene import SimSpec
+from device.sensors import SENSORS
 from device.tables import Table, load_toml
 from device.values import Geometry
 
+_NAMES = f"known are {', '.join(sorted(SENSORS))}"
+
 
 class CameraSpec(Table):
-    """The sensor: which driver answers for it, its pixels, and what its counts mean."""
+    """The sensor: which driver answers for it, its pixels, and what its counts mean.
+
+    `sensor` names a profile of `device/sensors.py`, which fills in what this table does not say itself.
+    """
 
     backend: Literal["sim", "replay"]
+    sensor: str | None = None
     rows: int = Field(ge=1, le=8192)
     cols: int = Field(ge=1, le=8192)
     pitch_um: float = Field(gt=0, le=100)
@@ -24,6 +32,17 @@ class CameraSpec(Table):
     read_noise_e: float = Field(ge=0)
     exposure_s: float = Field(default=0.1, gt=0, le=10)
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_the_profile_says(cls, said: dict[str, Any]) -> dict[str, Any]:
+        name = said.get("sensor")
+        if name is None:
+            return said
+        if name not in SENSORS:
+            near = difflib.get_close_matches(str(name), SENSORS, n=1)
+            raise ValueError(f"no sensor is called {name!r}; " + (f"did you mean {near[0]!r}?" if near else _NAMES))
+        return {key: value for key, value in SENSORS[name]._asdict().items() if key in cls.model_fields} | said
 
     @property
     def white_dn(self) -> int:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from device.clock import SystemClock
 from device.errors import DiffuscopeError
 from device.head import recording
 from device.recon.geometry import Grid
@@ -72,9 +73,12 @@ def reconstruct(
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
     report: Annotated[Path | None, typer.Option(help="Where to write the report as JSON.")] = None,
+    sweep: Annotated[
+        Path | None, typer.Option(help="Where to draw how well each of several PSFs fits, as SVG.")
+    ] = None,
 ) -> None:
     """Turn one raw frame into a picture, without a head and without a page."""
-    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report)
+    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report, sweep)
     made = reconstruct_file(order)
     text = json.dumps(asdict(made.report), indent=1)
     if report is not None:
@@ -136,6 +140,24 @@ def frontier(
     wish = measured.Wish(scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, _cache())
     typer.echo(measured.table(measured.frontier(wish, lambda line: typer.echo(line, err=True))))
     typer.echo(f"{json_file}, {plot}")
+
+
+@app.command()
+def paper(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for report.html.")],
+    only: Annotated[
+        list[str] | None, typer.Option(help="Just this experiment (N, S0 ... S12); may be repeated.")
+    ] = None,
+    merged: Annotated[int, typer.Option(min=1, max=3, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
+) -> None:
+    """Repeat the paper's experiments in the simulator and report them; fails if an assertion does not hold."""
+    from services.instrument.paper import report  # the simulator, which a picture does not need
+
+    ran = report.rerun(output, SystemClock(), lambda line: typer.echo(line, err=True), only or (), merged)
+    typer.echo(report.table(ran))
+    typer.echo(f"{output / 'report.html'}: {sum(one.seconds for one in ran):.0f} s")
+    if not report.all_hold(ran):
+        raise typer.Exit(1)
 
 
 @app.command()

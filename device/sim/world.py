@@ -7,8 +7,8 @@ import numpy as np
 
 from device.clock import Clock
 from device.errors import SettingError
-from device.sim.fundus import Fundus, fundus
-from device.sim.photo import photograph
+from device.sim.fundus import Fundus
+from device.sim.objects import drawn
 from device.sim.plan import Decision, decide, prepared
 from device.sim.render import electrons_per_s, fitted, psf
 from device.sim.sensor import SensorModel
@@ -84,15 +84,10 @@ class World:
 
         Rows and columns are even or odd as the sensor's are, so that their middles fall together.
         """
-        geometry, what = self.geometry, self.scene.sim.object
-        wide = int(np.ceil(geometry.px_per_deg * self.optics.field_deg)) + 4
+        px_per_deg = self.geometry.px_per_deg
+        wide = int(np.ceil(px_per_deg * self.optics.field_deg)) + 4
         shape = (wide + (wide - self.shape[0]) % 2, wide + (wide - self.shape[1]) % 2)
-        if what.image is not None:
-            return photograph(what.image, shape, geometry.px_per_deg, self.optics.field_deg)
-        return fundus(
-            shape, geometry.px_per_deg, self.optics.field_deg, self.seed, eye=self.eye,
-            haemorrhages=what.haemorrhages, microaneurysms=what.microaneurysms, exudates=what.exudates,
-        )  # fmt: skip
+        return drawn(self.scene.sim, self.optics, self.eye, shape, px_per_deg)
 
     def setup(self, colour: Colour) -> Setup:
         """The light's way in one colour, with the effects that it calls for."""

@@ -19,6 +19,7 @@ from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Geometry, Image, Reconstruction, Sensor
+from services.instrument import sweep_plot
 from services.records.picture import to_png
 
 
@@ -38,6 +39,7 @@ class Order:
     even: bool
     plans: Path
     report: Path | None = None
+    sweep: Path | None = None
 
 
 def reconstruct_file(order: Order) -> Reconstruction:
@@ -51,7 +53,9 @@ def reconstruct_file(order: Order) -> Reconstruction:
     raw = as_raw(read_image(order.raw))
     calibration = calibrated(order, raw)
     planner = Planner(order.plans)
-    index, _ = sharpest(calibration, raw.pixels, planner)
+    index, scores = sharpest(calibration, raw.pixels, planner)
+    if order.sweep is not None:
+        _draw_sweep(order.sweep, order, scores)
     shape = (raw.pixels.shape[0], raw.pixels.shape[1])
     reconstructor = Reconstructor(calibration, shape, planner, clock, _recipes(order, calibration, shape, index), index)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
@@ -67,9 +71,16 @@ def _refuse_places(order: Order) -> None:
     """Refuse an ending or a folder that nothing can be written to."""
     if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
         raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png", "Choose one of these.")
-    for place in (order.output, order.report):
+    if order.sweep is not None and len(order.psfs) < 2:
+        raise SettingError("a sweep compares several PSFs", "Give --psf more than once, or leave --sweep out.")
+    for place in (order.output, order.report, order.sweep):
         if place is not None:
             refuse_place(place)
+
+
+def _draw_sweep(place: Path, order: Order, scores: list[float]) -> None:
+    drawn = sweep_plot.drawn(order.raw.name, [path.stem for path in order.psfs], scores)
+    written(place, lambda: place.write_text(drawn, encoding="utf-8"))
 
 
 def refuse_place(place: Path) -> None:

@@ -16,7 +16,7 @@ STYLE = """
   .s0 { --ink: #8a5a00; } .s1 { --ink: #0067a3; } .s2 { --ink: #00795c; } .s3 { --ink: #a8327f; }
   .s4 { --ink: #555b66; }
   .mark { fill: var(--ink); stroke: #ffffff; stroke-width: 1.2; }
-  .trail { fill: none; stroke: var(--ink); opacity: .55; }
+  .trail { fill: none; stroke: var(--ink); opacity: .55; } .line { opacity: .9; stroke-width: 1.5; }
   .label { fill: var(--ink); paint-order: stroke; stroke: #ffffff; stroke-width: 4px; stroke-linejoin: round; }
   .edge { fill: none; stroke: #1d2330; stroke-width: 1.6; }
   .limit { stroke: #b3261e; stroke-width: 1.5; stroke-dasharray: 6 4; } .limit-word { fill: #b3261e; }
@@ -35,7 +35,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Mark:
-    """One measured point: where, in which series, what its label and its tooltip say; `weight` scales it."""
+    """One point: where, what its label and its tooltip say; `weight` scales it, and 0 leaves just the trail."""
 
     x: float
     y: float
@@ -208,8 +208,11 @@ def _series(plot: Plot) -> list[str]:
         for trail in series.trails:
             places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
             if len(places) > 1:
-                out.append(f'<polyline class="trail" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+                kind = "trail" if any(mark.weight for mark in trail) else "trail line"
+                out.append(f'<polyline class="{kind}" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
             for mark, (x, y) in zip(trail, places, strict=True):
+                if not mark.weight:
+                    continue
                 shape = _shape(k, x, y, 6.5 * mark.weight)
                 out.append(f"{shape}<title>{escape(mark.says)}</title></path>" if mark.says else f"{shape}</path>")
         out.append("</g>")

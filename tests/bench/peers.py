@@ -96,7 +96,7 @@ def peers(scene: Staged, planner: Planner) -> None:
     judge = judge_of(scene)
     timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "PSNR dB", "PCC", "SSIM", "detail")
     for recipe in (Recipe("gradient", N), Recipe("variation", N)):
-        make = Reconstructor(scene.calibration, shape, planner, SystemClock(), (recipe,))
+        make = Reconstructor(scene.calibration, shape, planner, SystemClock(), (recipe,), refract=False)
         (ms,) = timing.side_by_side_ms(lambda make=make: make(scene.counts), rounds=3)
         scored(f"ours: {recipe.method}", ms, judge, make(scene.counts).picture)
     y = binned(scene.counts.astype(np.float32) - np.float32(scene.calibration.sensor.black_dn))

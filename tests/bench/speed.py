@@ -26,7 +26,9 @@ def closed_forms(scene: Staged, planner: Planner) -> None:
     The pair is `tikhonov`'s own: two plans of one shape differ by up to a half on one machine, as their arrays come to
     lie on large pages of memory or on small ones.
     """
-    makers = [Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,)) for recipe in CLOSED]
+    makers = [
+        Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,), refract=False) for recipe in CLOSED
+    ]
     pair = makers[0].rungs[0].model.fft
     acts: list[Callable[[], object]] = [lambda: (pair.forward(), pair.inverse())]
     acts += [partial(make, scene.counts) for make in makers]
@@ -43,7 +45,7 @@ def rounds(scene: Staged, planner: Planner) -> None:
     timing.head("one round of `variation`", "ms", "ratio", "limit")
     for n in (1, 2, 3):
         recipe = Recipe("variation", n)
-        make = Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,))
+        make = Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,), refract=False)
         make(scene.counts, rounds=1)
         shape = make.rungs[0].grid.shape
         one, other = make.rungs[0].solver._data, make.rungs[0].solver._image

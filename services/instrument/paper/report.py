@@ -1,0 +1,145 @@
+"""All experiments, one after the other, and the page that shows them: `diffuscope paper`."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from device.clock import Clock
+from device.errors import SettingError
+from services.instrument.once import written
+from services.instrument.paper import caustics, hard, numbers, printed, screen, sensors, trainer
+from services.instrument.paper.bench import Bench
+from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown
+from services.instrument.paper.style import CLAIMED, STYLE
+
+ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12")
+_ALL = (numbers, caustics, screen, printed, trainer, sensors, hard)
+EXPERIMENTS: dict[str, Experiment] = {
+    key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
+}
+
+
+@dataclass(frozen=True)
+class Ran:
+    """An experiment, what it found, and how long it took."""
+
+    experiment: Experiment
+    outcome: Outcome
+    seconds: float
+
+
+def rerun(
+    folder: Path, clock: Clock, say: Callable[[str], None], keys: Sequence[str] = (), merged: int = 1
+) -> list[Ran]:
+    """Run experiments (default: all), write `report.html` into a folder, and return what was found.
+
+    `merged` n makes n x n pixels one: quicker, and the report says so. SettingError for a key that no experiment has;
+    StoreError if the folder cannot be written.
+    """
+    for key in keys:
+        if key not in EXPERIMENTS:
+            raise SettingError(f"no experiment is called {key!r}", f"Choose from {', '.join(EXPERIMENTS)}.")
+    written(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
+    bench = Bench(merged, say)
+    ran = []
+    for experiment in EXPERIMENTS.values():
+        if keys and experiment.key not in keys:
+            continue
+        begin_s = clock.now_s()
+        outcome = experiment.run(bench)
+        ran.append(Ran(experiment, outcome, clock.now_s() - begin_s))
+        broken = [claim for claim in outcome.claims if not claim.holds]
+        say(f"{experiment.key}: {len(outcome.claims) - len(broken)} of {len(outcome.claims)} assertions hold")
+    page = folder / "report.html"
+    written(page, lambda: page.write_text(html(ran, merged), encoding="utf-8"))
+    return ran
+
+
+def all_hold(ran: Sequence[Ran]) -> bool:
+    """Whether every assertion of every experiment holds."""
+    return all(claim.holds for one in ran for claim in one.outcome.claims)
+
+
+def table(ran: Sequence[Ran]) -> str:
+    """Every assertion as text."""
+    lines = [f"{'':5}{'':4}{'assertion':<62}{'value':>10}  {'limit':<18}paper"]
+    for one in ran:
+        for claim in one.outcome.claims:
+            mark = "" if claim.holds else "NO"
+            lines.append(f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
+                         f"{claim.paper}".rstrip())  # fmt: skip
+    return "\n".join(lines)
+
+
+def html(ran: Sequence[Ran], merged: int) -> str:
+    """The whole page, self-contained."""
+    every = [claim for one in ran for claim in one.outcome.claims]
+    hold, total_s = sum(claim.holds for claim in every), sum(one.seconds for one in ran)
+    size = "Full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
+    verdict = f"{hold} of {len(every)} assertions hold" + ("." if hold == len(every) else ": the others are marked.")
+    toc = "".join(
+        f'<li><a href="#{one.experiment.key}">{one.experiment.key}</a> {escape(one.experiment.title)}'
+        f"{'' if all(c.holds for c in one.outcome.claims) else ' <b class=no>does not hold</b>'}</li>"
+        for one in ran
+    )
+    return "\n".join(
+        [
+            '<!doctype html><html lang="en"><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width"><title>The paper, rerun</title>',
+            f"<style>{STYLE}</style><main><h1>The paper, rerun</h1>",
+            '<p class="lead">Li, McKay, Durr, Tian: "A diffuser-based computational imaging funduscope", every '
+            "experiment "
+            "repeated in the simulator. <b>All pictures on this page are simulated.</b></p>",
+            f'<p class="verdict">{verdict} {size}; {total_s:.0f} s of computing.</p>',
+            CLAIMED,
+            f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
+            *(_section(one) for one in ran),
+            "</main></html>\n",
+        ]
+    )
+
+
+def _section(one: Ran) -> str:
+    experiment, outcome = one.experiment, one.outcome
+    pictures = "".join(_figure(shown) for shown in outcome.shown if not shown.wide)
+    plots = "".join(_figure(shown) for shown in outcome.shown if shown.wide)
+    return "\n".join(
+        [
+            f'<section id="{experiment.key}"><h2><span>{experiment.key}</span> {escape(experiment.title)}</h2>',
+            f"<p>{escape(experiment.sentence)}</p><p class=paper><b>Paper:</b> {escape(experiment.paper)}</p>",
+            _claims(outcome.claims),
+            *(_sheet(sheet) for sheet in outcome.sheets),
+            f"<div class=pictures>{pictures}</div>" if pictures else "",
+            f"<div class=plots>{plots}</div>" if plots else "",
+            *(f"<p class=note>{escape(note)}</p>" for note in outcome.notes),
+            f"<p class=quiet>{one.seconds:.1f} s</p></section>",
+        ]
+    )
+
+
+def _claims(claims: Sequence[Claim]) -> str:
+    rows = "".join(
+        f"<tr class={'yes' if claim.holds else 'no'}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
+        f"<td>{escape(claim.limit)}</td><td>{'holds' if claim.holds else 'does not hold'}</td>"
+        f"<td>{escape(claim.paper) or '&ndash;'}</td></tr>"
+        for claim in claims
+    )
+    head = "<tr><th>assertion<th class=n>here<th>limit<th><th>printed in the paper</tr>"
+    return f"<table class=claims><thead>{head}</thead><tbody>{rows}</tbody></table>"
+
+
+def _sheet(sheet: Sheet) -> str:
+    head = "".join(f"<th>{escape(word)}" for word in sheet.head)
+    rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}" for cell in row) for row in sheet.rows)
+    return f"<table class=sheet><thead><tr>{head}</thead><tbody>{rows}</tbody></table>"
+
+
+def _figure(shown: Shown) -> str:
+    words = escape(shown.caption)
+    kind = " class=begins" if shown.begins else ""
+    return f'<figure{kind}><img src="{shown.address}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+
+
+def _value(claim: Claim) -> str:
+    return f"{claim.value:.{claim.digits}f}"

@@ -1,0 +1,129 @@
+"""S10, S11: sensors that are too small for the light, and the refraction that a frame tells."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from services.instrument.paper.bench import Bench, Take
+from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown, above, below
+from services.instrument.paper.pictures import compared, trend
+
+PAPER_PITCH_UM, PAPER_PEAK_E = 5.04, 20000.0
+SLACK = 0.02
+SENSORS: dict[str, tuple[int, int, float, int]] = {  # rows, cols, pitch in um, pixels to one
+    "IMX296": (1088, 1456, 3.45, 1), "IMX477": (3040, 4056, 1.55, 3), "OV9281": (800, 1280, 3.0, 1),
+}  # fmt: skip
+NOTES = {"IMX296": (0.078, 0.868, 0.948), "IMX477": (0.422, 0.899, 0.951), "OV9281": (0.150, 0.750, 0.933)}  # 1.5
+TOO_SMALL = ("OV9281",)  # for the PSF itself: 3.4 mm across on 2.4
+EYES = 6
+SPAN_DPT, CYLINDER_DPT = 5.0, 0.5
+
+
+def camera(name: str) -> dict[str, Any]:
+    """The changes that put a small sensor behind the paper's optics, in the paper's light per area."""
+    rows, cols, pitch_um, n = SENSORS[name]
+    peak_e = PAPER_PEAK_E * (pitch_um * n / PAPER_PITCH_UM) ** 2
+    return {
+        "camera.rows": rows // n, "camera.cols": cols // n, "camera.pitch_um": pitch_um * n,
+        "camera.full_well_e": 1.2 * peak_e, "camera.read_noise_e": 2.0 * n, "sim.peak_e": peak_e,
+        "sim.calibration.source_um": 0.0,
+    }  # fmt: skip
+
+
+def whole_psf(bench: Bench, take: Take, name: str) -> Take:
+    """The same frame with a PSF taken in parts: on a sensor that would hold all of it."""
+    changes = camera(name) | {"camera.rows": 1280, "camera.cols": 1280}
+    whole = bench.take("paper_heine", changes).calibration.psfs
+    return Take(take.name, replace(take.staged, calibration=replace(take.calibration, psfs=whole)))
+
+
+def run_sensors(bench: Bench) -> Outcome:
+    """Each sensor with the paper's solver, with the flat field taken out first, and with ours."""
+    claims: list[Claim] = []
+    shown: list[Shown] = []
+    rows, cut = [], 0.0
+    plain = Bench(1)  # these pixels are small already
+    for name in SENSORS:
+        bench.say(f"S10: {name}")
+        take = plain.take("paper_heine", camera(name))
+        if name in TOO_SMALL:
+            cut = take.score(plain.solve(take, "variation")).pcc
+            take = whole_psf(plain, take, name)
+        _, paper, scores = plain.best(take)
+        flat, ours = (plain.solve(take, method) for method in ("evidence", "variation"))
+        found = scores.pcc, take.score(flat).pcc, take.score(ours).pcc
+        claims += [
+            above(f"{name}, PCC of flat-sub", found[1], NOTES[name][1] - SLACK),
+            above(f"{name}, PCC of ours", found[2], NOTES[name][2] - SLACK),
+            above(f"{name}, ours over the paper's solver, PCC", found[2] - found[0], 0.3),
+        ]
+        shown += compared(take, {"paper's solver": paper, "ours": ours}, name)
+        rows.append((name, *(f"{pcc:.3f} ({noted:.3f})" for pcc, noted in zip(found, NOTES[name], strict=True))))
+    sheet = Sheet(("sensor", "paper's solver", "flat-sub", "ours"), tuple(rows))
+    note = (
+        "In brackets what the optics notes found on another simulated retina (with conjugate gradients for ours). The "
+        "rule D > d + 2s of the paper holds for its sensor's long side only: the short one has 5.44 mm where 5.82 are "
+        "needed at 33.4 degrees. With a solver that knows of the crop it is no rule any more."
+    )
+    parts = (
+        "The OV9281 does not even hold the PSF (3.4 mm on 2.4), so its PSF is taken in parts, as by a point that "
+        "moves. "
+        f"With what it sees of a point on the axis alone our default has {cut:.2f}."
+    )
+    return Outcome(tuple(claims), tuple(shown), (sheet,), (note, parts))
+
+
+def run_refraction(bench: Bench) -> Outcome:
+    """Eyes drawn at random, with a little astigmatism; their mean sphere is read from the fundus frame alone."""
+    rng = np.random.default_rng(11)
+    eyes = rng.uniform((-SPAN_DPT, -CYLINDER_DPT, -CYLINDER_DPT), (SPAN_DPT, CYLINDER_DPT, CYLINDER_DPT), (EYES, 3))
+    errors: dict[str, list[float]] = {"round eyes": [], "astigmatic eyes": []}
+    curve: dict[str, dict[float, float]] = {"round eyes": {}, "astigmatic eyes": {}}
+    rows = []
+    for m_dpt, j0_dpt, j45_dpt in eyes.tolist():
+        said = []
+        for kind, (j0, j45) in {"round eyes": (0.0, 0.0), "astigmatic eyes": (j0_dpt, j45_dpt)}.items():
+            bench.say(f"S11: an eye of {m_dpt:+.2f} dpt, {kind}")
+            eye = {
+                "sim.eye.m_dpt": m_dpt,
+                "sim.eye.j0_dpt": j0,
+                "sim.eye.j45_dpt": j45,
+                "sim.calibration.source_um": 0.0,
+            }
+            found = bench.refraction(bench.take("paper_heine", eye))
+            errors[kind].append(found - m_dpt)
+            curve[kind][m_dpt] = found - m_dpt
+            said.append(f"{found:+.2f}")
+        rows.append((f"{m_dpt:+.2f}", f"{j0_dpt:+.2f}", f"{j45_dpt:+.2f}", *said))
+    rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in errors.items()}
+    claims = (
+        below("mean sphere of round eyes, rms error, dpt", rms["round eyes"], 0.15, "promised, not shown"),
+        below("mean sphere of astigmatic eyes, rms error, dpt", rms["astigmatic eyes"], 0.15, "promised, not shown"),
+    )
+    shown = (
+        trend("Error of the refraction that the frame tells", "no beacon; wavefront M", "M of the eye, dpt",
+              "found less true, dpt", curve),
+    )  # fmt: skip
+    note = (
+        "The optics notes also read J0 and J45 (0.06 dpt) this way. The instrument reads the mean sphere only, "
+        "so nothing "
+        "is claimed about cylinder. One diffuser model makes and reads these frames: a simulation, not a measurement."
+    )
+    return Outcome(
+        claims, shown, (Sheet(("M", "J0", "J45", "M found, round", "M found, astigmatic"), tuple(rows)),), (note,)
+    )
+
+
+EXPERIMENTS = (
+    Experiment(
+        "S10", "Sensors that are too small", "The paper's optics before three cheap sensors, in the same light.",
+        "\"One needs to choose an image sensor size D > d + 2s.\"", run_sensors,
+    ),
+    Experiment(
+        "S11", "Refraction from the frame",
+        "The stretch of the caustic that a frame carries tells the eye's mean sphere.",
+        "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
+        run_refraction,
+    ),
+)  # fmt: skip

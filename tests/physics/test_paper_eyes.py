@@ -1,0 +1,19 @@
+"""Eyes and PSFs out of focus, a sensor off its place, and the refraction from the frame (S5, S6, S9, S11).
+
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+"""
+
+import pytest
+
+from services.instrument.paper.bench import Bench
+from services.instrument.paper.report import EXPERIMENTS
+
+BENCH = Bench(merged=2)
+
+
+@pytest.mark.parametrize("key", ["S5", "S6", "S9", "S11"])
+def test_every_assertion_holds(key: str) -> None:
+    claims = EXPERIMENTS[key].run(BENCH).claims
+    broken = [f"{claim.what}: {claim.value:.4g}, not {claim.limit}" for claim in claims if not claim.holds]
+    assert claims
+    assert not broken, "\n".join(broken)
