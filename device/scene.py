@@ -41,14 +41,17 @@ class ObjectSpec(Table):
     @field_validator("image")
     @classmethod
     def _from_the_scene_file(cls, image: Path | None, info: ValidationInfo) -> Path | None:
-        return image if image is None or info.context is None else info.context["folder"] / image
+        path = image if image is None or info.context is None else info.context["folder"] / image
+        if path is not None and not path.is_file():
+            raise ValueError(f"there is no image {path}; give the path of a photograph")
+        return path
 
     @model_validator(mode="after")
     def _image_is_given(self) -> "ObjectSpec":
-        if (self.kind == "image") != (self.image is not None):
-            raise ValueError('kind = "image" and the key image belong together')
-        if self.image is not None and not self.image.is_file():
-            raise ValueError(f"the image {self.image} does not exist; give the path of a photograph")
+        if self.kind == "image" and self.image is None:
+            raise ValueError('kind = "image" needs the key image, the path of a photograph')
+        if self.kind != "image" and self.image is not None:
+            raise ValueError(f'the key image goes with kind = "image", not with "{self.kind}"')
         return self
 
 
@@ -73,11 +76,12 @@ class EyeSpec(Table):
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # right, down
     drift_deg_per_s: float = Field(default=0.0, ge=0, le=200)
 
-    @model_validator(mode="after")
-    def _gaze_can_be_held(self) -> "EyeSpec":
-        if hypot(*self.gaze_deg) > WIDEST_GAZE_DEG:
-            raise ValueError(f"a gaze of {self.gaze_deg} deg is more than {WIDEST_GAZE_DEG:g} deg off the axis")
-        return self
+    @field_validator("gaze_deg")
+    @classmethod
+    def _can_be_held(cls, gaze_deg: tuple[float, float]) -> tuple[float, float]:
+        if hypot(*gaze_deg) > WIDEST_GAZE_DEG:
+            raise ValueError(f"a gaze of {gaze_deg} is {hypot(*gaze_deg):.1f} deg off; allowed: {WIDEST_GAZE_DEG:g}")
+        return gaze_deg
 
 
 class LightFlaws(Table):

@@ -31,9 +31,9 @@ class SensorProfile(NamedTuple):
 
 SENSORS: dict[str, SensorProfile] = {
     "quantalux": SensorProfile(
-        "Thorlabs Quantalux sCMOS (paper)", 1080, 1920, 5.04, 23000, 1.03, 16, 64, False, False, True
+        "Thorlabs Quantalux sCMOS (paper)", 1080, 1920, 5.04, 23000, 1.03, 12, 64, False, False, True
     ),
-    "imx296": SensorProfile("Sony IMX296, Pi Global Shutter", 1088, 1456, 3.45, 10000, 2.2, 10, 60, False, True, False),
+    "imx296": SensorProfile("Sony IMX296, Pi Global Shutter", 1088, 1456, 3.45, 10000, 2.2, 12, 60, False, True, False),
     "imx477": SensorProfile("Sony IMX477, Pi HQ", 3040, 4056, 1.55, 8180, 3.0, 12, 256, True, False, True),
     "imx500": SensorProfile("Sony IMX500, Pi AI", 3040, 4056, 1.55, 8180, 3.0, 10, 64, True, False, False),
     "imx283": SensorProfile("Sony IMX283, 1 inch", 3694, 5496, 2.4, 15000, 3.0, 12, 50, True, False, False),

@@ -1,20 +1,28 @@
 """One TOML file describes one head; this turns it into a checked, frozen value or says which line is wrong."""
 
+import difflib
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from device.errors import SpecError
 from device.scene import SimSpec
+from device.sensors import SENSORS
 from device.tables import Table, load_toml
 from device.values import Geometry
 
+_NAMES = f"known are {', '.join(sorted(SENSORS))}"
+
 
 class CameraSpec(Table):
-    """The sensor: which driver answers for it, its pixels, and what its counts mean."""
+    """The sensor: which driver answers for it, its pixels, and what its counts mean.
+
+    `sensor` names a profile of `device/sensors.py`, which fills in what this table does not say itself.
+    """
 
     backend: Literal["sim", "replay"]
+    sensor: str | None = None
     rows: int = Field(ge=1, le=8192)
     cols: int = Field(ge=1, le=8192)
     pitch_um: float = Field(gt=0, le=100)
@@ -24,6 +32,17 @@ class CameraSpec(Table):
     read_noise_e: float = Field(ge=0)
     exposure_s: float = Field(default=0.1, gt=0, le=10)
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_the_profile_says(cls, said: dict[str, Any]) -> dict[str, Any]:
+        name = said.get("sensor")
+        if name is None:
+            return said
+        if name not in SENSORS:
+            near = difflib.get_close_matches(str(name), SENSORS, n=1)
+            raise ValueError(f"no sensor is called {name!r}; " + (f"did you mean {near[0]!r}?" if near else _NAMES))
+        return {key: value for key, value in SENSORS[name]._asdict().items() if key in cls.model_fields} | said
 
     @property
     def white_dn(self) -> int:
@@ -46,12 +65,12 @@ class LightSpec(Table):
 
 
 class OpticsSpec(Table):
-    """The light path from the eye to the sensor: paper, sections "Optical design" and "Hardware design"."""
+    """The light path from the eye to the sensor, by default the paper's: "Optical design" and "Hardware design"."""
 
-    iris_um: float = Field(gt=0)
-    diffuser_to_sensor_um: float = Field(gt=0)
-    angular_magnification: float = Field(gt=0)
-    field_deg: float = Field(gt=0, lt=180)
+    iris_um: float = Field(default=3200.0, gt=0)
+    diffuser_to_sensor_um: float = Field(default=6000.0, gt=0)
+    angular_magnification: float = Field(default=0.75, gt=0)
+    field_deg: float = Field(default=33.4, gt=0, le=90)  # beyond, a degree is no longer a number of pixels (Geometry)
     wavelength_um: float = Field(default=0.55, gt=0.3, lt=1.2)
     bandwidth_um: float = Field(default=0.04, ge=0, lt=0.2)
     slope_fwhm_deg: float = Field(default=0.5, gt=0, lt=20)
@@ -96,4 +115,18 @@ def load_head(path: Path) -> InstrumentSpec:
                 f"{path}: camera.{key} = {getattr(spec.camera, key):g} is not shorter than "
                 f"light.max_on_s = {spec.light.max_on_s:g}, so the guard would end every exposure"
             )
+    _refuse_a_pupil_beside_the_iris(path, spec)
     return spec
+
+
+def _refuse_a_pupil_beside_the_iris(path: Path, spec: InstrumentSpec) -> None:
+    """No light passes if the pupil, as the relay images it, misses the iris."""
+    if spec.sim is None or spec.optics is None:
+        return
+    eye, iris_um = spec.sim.eye, spec.optics.iris_um * spec.optics.angular_magnification
+    most_um = (eye.pupil_um + iris_um) / 2
+    if eye.decentred_um >= most_um:
+        raise SpecError(
+            f"{path}: sim.eye.decentred_um = {eye.decentred_um:g}: no light of a pupil of {eye.pupil_um:g} um meets "
+            f"the iris; allowed: below {most_um:g}"
+        )

@@ -18,6 +18,7 @@ class Table(BaseModel):
 
 
 T = TypeVar("T", bound=Table)
+LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
 def load_toml(path: Path, kind: type[T]) -> T:
@@ -49,18 +50,38 @@ def _sentence(path: Path, text: str, error: Any, kind: type[Table]) -> str:
     line = next((line for line in lines if line), None)
     where = f"{path}, line {line}" if line else str(path)
     if error["type"] != "extra_forbidden":
-        return f"{where}: {'.'.join(keys)}: {error['msg']}"
+        return f"{where}: {'.'.join(keys)}: {_complaint(error, kind)}"
     near = difflib.get_close_matches(keys[-1], _known_keys(kind, keys[:-1]), n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     return f"{where}: '{'.'.join(keys)}' is not a known key{hint}"
 
 
+def _complaint(error: Any, kind: type[Table]) -> str:
+    """What is wrong, with the value that was given and all that is allowed."""
+    words = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] in ("missing", "value_error"):  # there is no value, or the words hold it
+        return words
+    *tables, key = (part for part in error["loc"] if isinstance(part, str))
+    limits = [
+        f"{phrase} {getattr(bound, name)}"
+        for bound in _table(kind, tables).model_fields[key].metadata
+        for name, phrase in LIMITS.items()
+        if hasattr(bound, name)
+    ]
+    allowed = f"; allowed: {', '.join(limits)}" if limits else ""
+    return f"{words}, not {repr(error['input'])[:60]}{allowed}"
+
+
 def _known_keys(kind: type[Table], tables: list[str]) -> list[str]:
+    return list(_table(kind, tables).model_fields)
+
+
+def _table(kind: type[Table], tables: list[str]) -> type[Table]:
     for table in tables:
         annotation = kind.model_fields[table].annotation
         options = [annotation, *getattr(annotation, "__args__", ())]
         kind = next(option for option in options if isinstance(option, type) and issubclass(option, Table))
-    return list(kind.model_fields)
+    return kind
 
 
 def line_of(text: str, keys: list[str]) -> int | None:

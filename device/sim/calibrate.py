@@ -27,20 +27,40 @@ def simulated_calibration(world: World) -> Calibration:
     size = min(point.shape[0], camera.rows), min(point.shape[1], camera.cols)
     caustic_e = fitted(point, size)
     caustic_e *= np.float32(FILLED * camera.full_well_e / float(caustic_e.max()))
+<<<<<<< HEAD
+    pixels = world.sensor.middle(size)
+    measured = mean_frame(pixels, caustic_e, world.seed, 1)
+    measured -= mean_frame(pixels, np.zeros_like(caustic_e), world.seed, 2)
+=======
     part = middle_of(world.sensor, size)
     measured = mean_frame(part, caustic_e, world.seed, 1)
     measured -= mean_frame(part, np.zeros_like(caustic_e), world.seed, 2)
+>>>>>>> objects
     measured -= _pedestal(measured, world)
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, float(camera.white_dn))
     return Calibration(
         psfs=(Psf(fitted(measured, world.shape), name="simulated point source"),),
         sensor=sensor,
         geometry=world.geometry,
-        flat=world.setup(world.spec.light.colour).response,
+        flat=flat_frame(world),
         bad=hot_pixels(world.scene) if world.scene.sim.sensor.hot_pixels else None,
         field_deg=world.optics.field_deg,
         simulated=True,
     )
+
+
+def flat_frame(world: World) -> Image | None:
+    """How the pixels respond, (rows, cols); each of a colour mosaic's four sites relative to its own mean.
+
+    What a mosaic keeps away must not be made up for: it would be noise. None for pixels that are all alike.
+    """
+    response = world.setup(world.spec.light.colour).response
+    if response is None:
+        return None
+    flat = response.copy()
+    for site in ((slice(row, None, 2), slice(col, None, 2)) for row in (0, 1) for col in (0, 1)):
+        flat[site] /= max(float(flat[site].mean(dtype=np.float64)), 1e-30)
+    return flat
 
 
 def calibration_point(world: World) -> Image:

@@ -33,16 +33,21 @@ class Decision(NamedTuple):
 
 
 def decide(
-    scene: Scene, *, everything: bool = False, only: Collection[str] = (), without: Collection[str] = ()
+    scene: Scene,
+    *,
+    everything: bool = False,
+    only: Collection[str] = (),
+    without: Collection[str] = (),
+    effects: Sequence[Effect] = EFFECTS,
 ) -> tuple[Decision, ...]:
     """Ask every effect, in the order of the light's way; nothing is rendered.
 
     `everything` forces all of them, `only` just those named, `without` leaves those out. SettingError for a name that
     no effect has.
     """
-    _refuse_strangers([*only, *without])
+    _refuse_strangers([*only, *without], [effect.name for effect in effects])
     decisions = []
-    for effect in EFFECTS:
+    for effect in effects:
         eta, why = effect.size(scene)
         chosen = everything or (effect.name in only if only else eta >= SEEN)
         decisions.append(Decision(effect, chosen and effect.name not in without, eta, why))
@@ -70,8 +75,7 @@ def table(decisions: Sequence[Decision], spent_ms: dict[str, float] | None = Non
     return "\n".join(lines)
 
 
-def _refuse_strangers(names: Sequence[str]) -> None:
-    known = [effect.name for effect in EFFECTS]
+def _refuse_strangers(names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)

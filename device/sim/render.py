@@ -6,7 +6,7 @@ the solver's operator.
 
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from math import atan2, cos, hypot, pi, sin
+from math import atan2, ceil, cos, hypot, pi, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from device.sim.setup import Place, Setup
 from device.spec import OpticsSpec
 from device.values import Image
 
+LIT = 0.05  # of the peak: what is darker does not count as lit
 ROUNDOFF = 1e-6  # of the peak: darker than this is the rounding of a single-precision FFT, not light
 RINGS = (0.0, 0.45, 0.75, 1.0)  # where in the field a local effect is evaluated, of the half field; between: mixed
 SPOKES = 8
@@ -33,18 +34,19 @@ class Zone(NamedTuple):
 def electrons_per_s(setup: Setup) -> Image:
     """Expected electrons per second at full drive, float32 (rows, cols) of the sensor.
 
-    The peak before any veil reaches the scene's `peak_e` in one exposure.
+    The peak before any veil reaches the scene's `peak_e` in one exposure. Leaves the mean of the lit pixels, to which
+    veils and the room's light refer, in the setup.
     """
     scene = setup.scene
     arriving = _arriving(setup)
     peak = float(arriving.max())
     arriving *= np.float32(scene.peak_e / scene.spec.camera.exposure_s / max(peak, 1e-30))
-    if setup.veils:
-        lit = arriving > 0.05 * float(arriving.max())
-        mean = float(arriving[lit].mean()) if lit.any() else 0.0
-        for name, veil in setup.veils.items():
-            with setup.timed(name):
-                arriving += veil * np.float32(mean)
+    if setup.veils or setup.ambient:
+        lit = arriving > LIT * float(arriving.max())
+        setup.lit_e_per_s = float(arriving[lit].mean()) if lit.any() else 0.0
+    for name, veil in setup.veils.items():
+        with setup.timed(name):
+            arriving += veil * np.float32(setup.lit_e_per_s)
     return arriving if setup.response is None else arriving * setup.response
 
 
@@ -62,27 +64,29 @@ def psf(setup: Setup, place: Place = (0.0, 0.0)) -> Image:
     scene = setup.scene
     pitch_um = scene.spec.camera.pitch_um
     with setup.timed(*(["bandwidth"] if setup.lines > 1 else [])):
-        return _traced(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
+        return traced(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
 
 
 @lru_cache(maxsize=4)
-def _traced(
+def traced(
     optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None
 ) -> Image:
     """A caustic, traced once: the frame, its truth's PSF and the calibration often share it. Read-only."""
-    traced = caustic(optics, pitch_um, seed, refraction, lines, beam)
-    traced.flags.writeable = False
-    return traced
+    point = caustic(optics, pitch_um, seed, refraction, lines, beam)
+    point.flags.writeable = False
+    return point
 
 
 def _arriving(setup: Setup) -> Image:
     """The object through its caustics, in any unit."""
     with setup.timed(*setup.aberrations, *setup.beams):
-        zones = [(part, psf(setup, place)) for place, part in _zones(setup)]
-        arriving = blurred(zones, setup.shape, setup.drift_px)
+        parts = [(part, psf(setup, place)) for place, part in zones(setup)]
+        rows, cols = setup.shape
+        margin = ceil(abs(setup.lag_px) * rows / 2)  # what a rolling shutter may still bring in from beside the sensor
+        arriving = blurred(parts, (rows, cols + 2 * margin), setup.drift_px)
     if setup.lag_px:
         with setup.timed("shutter"):
-            arriving = _sheared(arriving, setup.lag_px)
+            arriving = _sheared(arriving, setup.lag_px)[:, margin : margin + cols]
     return arriving
 
 
@@ -93,14 +97,14 @@ def blurred(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_
     """
     part, point = parts[0]
     full = part.shape[0] + point.shape[0] - 1, part.shape[1] + point.shape[1] - 1
-    rows, cols = (fft.next_fast_len(n, real=True) for n in full)
+    right, down = drift_px
+    rows, cols = (fft.next_fast_len(n + ceil(abs(way)), real=True) for n, way in zip(full, (down, right), strict=True))
     total = np.zeros((rows, cols // 2 + 1), np.complex64)
     for part, point in parts:
         spectrum = fft.rfft2(part, (rows, cols), workers=2)
         spectrum *= fft.rfft2(point, (rows, cols), workers=2)
         total += spectrum
     if drift_px != (0.0, 0.0):
-        right, down = drift_px
         total *= np.sinc(down * fft.fftfreq(rows)[:, None] + right * fft.rfftfreq(cols)).astype(np.float32)
     whole = fft.irfft2(total, (rows, cols), overwrite_x=True, workers=2)[: full[0], : full[1]]
     middle = part.shape[0] // 2 + point.shape[0] // 2, part.shape[1] // 2 + point.shape[1] // 2
@@ -109,13 +113,13 @@ def blurred(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_
     return arriving
 
 
-def _zones(setup: Setup) -> Iterator[Zone]:
+def zones(setup: Setup) -> Iterator[Zone]:
     """The object in parts that share a caustic: all of it where nothing changes over the field."""
-    spec = setup.scene.sim.object
+    spec, gaze = setup.scene.sim.object, setup.scene.sim.eye.gaze_deg
     if not setup.aberrations and not setup.beams:
         yield Zone((0.0, 0.0), setup.object)
     elif spec.kind == "point":  # one place has one caustic, exactly
-        yield Zone(spec.at_deg, setup.object)
+        yield Zone((spec.at_deg[0] + gaze[0], spec.at_deg[1] + gaze[1]), setup.object)
     else:
         yield from _ring_zones(setup)
 

@@ -16,6 +16,7 @@ from device.values import Counts, Image
 # differ by at most 0.3041 / sqrt(mean) (Shevtsova 2014, Berry-Esseen for Poisson) = 0.03; below it the draw is exact.
 GAUSSIAN_FROM_E = 100.0
 STRIP_ROWS = 64
+ENDLESS_DN = 65535  # what uint16 holds
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,23 @@ class SensorModel:
 
     @classmethod
     def ideal(cls, camera: CameraSpec) -> "SensorModel":
-        """The same without noise, and with wells that are never full: counts are all that is left of it."""
+        """The same without noise, and with wells and a converter that have no end: whole counts are left of it."""
         well_e = camera.full_well_e
-        return cls(camera.gain_e_per_dn, camera.black_dn, camera.white_dn, float("inf"), 0.0, False, 0.0, well_e)
+        return cls(camera.gain_e_per_dn, camera.black_dn, ENDLESS_DN, float("inf"), 0.0, False, 0.0, well_e)
 
     def offset_by(self, pattern_e: Image) -> "SensorModel":
         """With a fixed pattern more."""
         return replace(self, offset_e=pattern_e if self.offset_e is None else self.offset_e + pattern_e)
+
+    def middle(self, shape: tuple[int, int]) -> "SensorModel":
+        """Only the pixels (rows, cols) in the middle."""
+        if self.offset_e is None:
+            return self
+        rows, cols = (
+            slice(have // 2 - n // 2, have // 2 - n // 2 + n)
+            for have, n in zip(self.offset_e.shape, shape, strict=True)
+        )
+        return replace(self, offset_e=self.offset_e[rows, cols])
 
     def read(self, electrons: Image, seed: int | tuple[int, ...], into: Counts | None = None) -> Counts:
         """One noisy frame of the expected `electrons` (rows, cols): uint16, the same for the same seed.

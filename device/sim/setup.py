@@ -26,7 +26,9 @@ from device.values import Colour, Eye, Geometry, Image
 # the exposure is bright, and a red one of the full exposure does not saturate (23 ke- well, 15 ke- green).
 TRIM: dict[Colour, float] = {"red": 1.5, "green": 1.0, "blue": 0.9}
 LED_UM: dict[Colour, float] = {"red": 0.622, "green": 0.522, "blue": 0.467}  # optics.md 2.2
-TABLE_E = 20000.0  # the peak at which optics.md 3.1 gives its etas
+TABLE_E, TABLE_PITCH_UM = 20000.0, 5.04  # the light at which etas are tabulated: peak electrons, and of which pixels
+LIT_SHARE = 0.37  # of the peak: the mean of the lit pixels of a retina behind this diffuser
+SENSOR_SHARE = 0.15  # of the peak: the mean of the paper's whole sensor
 
 Place = tuple[float, float]  # on the retina, as the eye sees it: degrees to the right of the axis, and down
 
@@ -78,14 +80,24 @@ class Scene:
         return TRIM[self.colour] * self.sim.peak_e
 
     @property
+    def lit_e(self) -> float:
+        """The mean of the lit pixels, which shares of the signal refer to."""
+        return LIT_SHARE * self.peak_e
+
+    @property
     def noise_e(self) -> float:
-        """The noise of the brightest pixel: shot and read noise, electrons."""
-        return sqrt(self.peak_e + self.spec.camera.read_noise_e**2)
+        """The noise of a pixel, shot and read noise in the mean over the paper's sensor; electrons."""
+        return sqrt(SENSOR_SHARE * self.peak_e + self.spec.camera.read_noise_e**2)
 
     @property
     def weight(self) -> float:
-        """How a deterministic effect weighs here against the table's light: eta ~ sqrt(electrons), optics.md 3.0."""
-        return sqrt(self.peak_e / TABLE_E)
+        """How a deterministic effect weighs here against the table's light.
+
+        eta ~ sqrt(electrons), optics.md 3.0; but in less light the prior filters more, and the noise falls with it.
+        Electrons of one and the same area: smaller pixels collect less each, and are more.
+        """
+        light = self.peak_e / TABLE_E * (TABLE_PITCH_UM / self.spec.camera.pitch_um) ** 2
+        return light ** (0.5 if light > 1 else 0.15)
 
     @property
     def refraction(self) -> Refraction:
@@ -111,7 +123,8 @@ class Setup:
     `object` is the radiance on a square as wide as the field; `aberrations` and `beams` say, for a place in the field,
     what is added to the refraction, and how far the beam's middle is from the iris's, in um; `drift_px` is how far the
     image moves in an exposure (right, down) and `lag_px` how far to the right between two rows; `veils` are added in
-    shares of the mean signal; `response` multiplies each pixel's light. Each local part carries its effect's name.
+    shares of the mean signal, `lit_e_per_s` once it is known; `response` multiplies each pixel's light. Each local part
+    carries its effect's name.
     """
 
     scene: Scene
@@ -130,6 +143,7 @@ class Setup:
     response: Image | None = None
     dark_e_per_s: float = 0.0
     source_um: float = 0.0
+    lit_e_per_s: float = 0.0
     spent_ms: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -147,10 +161,11 @@ class Setup:
 
     @contextmanager
     def timed(self, *names: str) -> Iterator[None]:
-        """Book what is done here as the cost of these effects, in equal parts."""
-        clock = SystemClock()
+        """Book what is done here, and not booked inside, as the cost of these effects, in equal parts."""
+        clock, booked_ms = SystemClock(), sum(self.spent_ms.values())
         begin_s = clock.now_s()
         yield
-        share_ms = 1000 * (clock.now_s() - begin_s) / max(len(names), 1)
+        inside_ms = sum(self.spent_ms.values()) - booked_ms
+        share_ms = (1000 * (clock.now_s() - begin_s) - inside_ms) / max(len(names), 1)
         for name in names:
             self.spent_ms[name] = self.spent_ms.get(name, 0.0) + share_ms

@@ -116,17 +116,18 @@ class World:
 
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
-        even_e = np.float32((self._always_e_per_s + self.ambient_e_per_s) * exposure_s)
+        always_e = np.asarray((self._always_e_per_s + self.ambient_e_per_s) * exposure_s, np.float32)
         glow = self.glow  # once: a guard may darken the lamp at any moment
         if glow is None:
-            return np.full(self.shape, even_e, np.float32)
-        return self.electrons_per_s(glow.colour) * np.float32(glow.level * exposure_s) + even_e
+            return np.broadcast_to(always_e, self.shape)
+        return self.electrons_per_s(glow.colour) * np.float32(glow.level * exposure_s) + always_e
 
     @cached_property
-    def _always_e_per_s(self) -> float:
+    def _always_e_per_s(self) -> Image | float:
         """What the scene's room and the sensor's warmth add, lamp or no lamp."""
         setup = self.setup(self.spec.light.colour)
         if not setup.ambient:
             return setup.dark_e_per_s
-        rate = self.electrons_per_s(self.spec.light.colour)
-        return setup.dark_e_per_s + setup.ambient * float(rate[rate > 0.05 * rate.max()].mean())
+        self.electrons_per_s(self.spec.light.colour)  # says how bright the picture is, of which this is a share
+        room_e_per_s = np.float32(setup.ambient * setup.lit_e_per_s)
+        return setup.dark_e_per_s + (room_e_per_s if setup.response is None else room_e_per_s * setup.response)

@@ -177,8 +177,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with fundus/ and lensless/")
     parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
     wish = parser.parse_args()
-    if not wish.data.is_dir():
-        raise SystemExit(f"there is no folder {wish.data}: give the one that holds fundus/ and lensless/ with --data")
+    if not (wish.data / "fundus").is_dir():
+        raise SystemExit("say where the real data are: DATA=folder, which holds fundus/ and lensless/")
     for part in wish.only:
         measure, inside = PARTS[part]
         measure(wish.data / inside)

@@ -103,7 +103,7 @@ def test_what_simulate_writes_is_the_simulated_frame(scene: Path) -> None:
         assert read_image(scene / name).shape == (270, 480)
     assert read_image(scene / "raw.tiff").dtype == np.uint16
     plan = json.loads((scene / "plan.json").read_text())
-    assert plan["shot_noise"]["simulated"] is True
+    assert plan["shot"]["simulated"] is True
 
 
 def test_a_frame_becomes_a_picture_and_a_report(

@@ -39,11 +39,12 @@ def test_every_scene_can_be_simulated(path, tmp_path):
     assert (raw.dtype, raw.shape) == (np.dtype(np.uint16), shape)
     assert (truth.dtype, truth.shape) == (np.dtype(np.float32), shape)
     assert (psf.dtype, psf.shape) == (np.dtype(np.float32), shape)
-    vessels = np.asarray(Image.open(tmp_path / "vessels.png"))
-    assert vessels.shape == shape
-    assert set(np.unique(vessels)) == {0, 255}
-    assert truth[vessels > 0].mean() < truth[(vessels == 0) & (truth > 0)].mean()
-    assert raw.max() < spec.camera.white_dn
+    assert (raw == spec.camera.white_dn).mean() <= 2 * spec.sim.sensor.hot_pixels  # nothing else saturates
+    if spec.sim.object.kind == "retina":
+        vessels = np.asarray(Image.open(tmp_path / "vessels.png"))
+        assert vessels.shape == shape
+        assert set(np.unique(vessels)) == {0, 255}
+        assert truth[vessels > 0].mean() < truth[(vessels == 0) & (truth > 0)].mean()
 
 
 def test_the_plan_is_honest_about_every_effect(tmp_path):

@@ -1,5 +1,6 @@
 """Head files: every mistake is named with its file, its line, its key, and what was probably meant."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -151,3 +152,16 @@ def test_lines_are_found_through_comments_quotes_and_dots() -> None:
     assert line_of(text, ["camera", "missing"]) == 2
     assert line_of("camera.rows = 3\n", ["camera", "rows"]) == 1
     assert line_of(text, ["nowhere"]) is None
+
+
+def test_a_sensor_by_name_fills_in_what_the_head_does_not_say(tmp_path: Path) -> None:
+    text = HEAD.read_text()
+    for key in ("rows", "cols", "pitch_um", "bit_depth", "black_dn", "full_well_e", "read_noise_e"):
+        text = re.sub(rf"^{key} = .*\n", "", text, flags=re.MULTILINE)
+    (tmp_path / "head.toml").write_text(text.replace("[camera]\n", '[camera]\nsensor = "imx296"\nread_noise_e = 9\n'))
+    camera = load_head(tmp_path / "head.toml").camera
+    assert (camera.rows, camera.cols, camera.pitch_um) == (1088, 1456, 3.45)
+    assert camera.read_noise_e == 9
+    (tmp_path / "head.toml").write_text(text.replace("[camera]\n", '[camera]\nsensor = "imx269"\n'))
+    with pytest.raises(SpecError, match="did you mean 'imx296'"):
+        load_head(tmp_path / "head.toml")

@@ -1,5 +1,7 @@
 """A colour filter mosaic under one colour of light: most pixels see little of it (optics.md 1.5)."""
 
+from math import sqrt
+
 import numpy as np
 
 from device.sim.setup import Scene, Setup, Size
@@ -11,8 +13,11 @@ SITES = {"red": ((0, 0),), "green": ((0, 1), (1, 0)), "blue": ((1, 1),)}  # RGGB
 
 
 def size(scene: Scene) -> Size:
-    """Nothing on a monochrome sensor; on a mosaic it is no small change."""
-    return Size(20.0 * scene.weight, "RGGB") if scene.sim.sensor.bayer else Size(0.0, "the sensor is monochrome")
+    """Nothing on a monochrome sensor; a mosaic keeps light away, and what is left is noisier by as much."""
+    if not scene.sim.sensor.bayer:
+        return Size(0.0, "the sensor is monochrome")
+    kept = LEAK + (1 - LEAK) * len(SITES[scene.colour]) / 4
+    return Size(sqrt(1 / kept - 1), f"the mosaic lets {kept:.0%} of {scene.colour} light through")
 
 
 def apply(setup: Setup) -> None:

@@ -7,13 +7,13 @@ R_t = f / (3 + 1/n); a flat surface lies behind both, so its edge looks short-si
 from math import cos, hypot, radians, sin, tan
 
 from device.optics.diffuser import Refraction
-from device.sim.effects.refraction import ETA_PER_DPT
 from device.sim.render import azimuth_and_angle
 from device.sim.setup import Place, Scene, Setup, Size
 
 name = "curvature"
 
 GLASS_N = 1.517
+ETA_PER_DPT = 5.0  # of the mean over the field: its edge is blurred most, and shows it most
 
 
 def curvature_dpt(scene: Scene, angle_deg: float) -> tuple[float, float]:

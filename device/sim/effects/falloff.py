@@ -9,7 +9,7 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "falloff"
 
-ETA = 1.4  # at 33.4 degrees (optics.md 3.1), where the edge keeps 0.84 of the light
+ETA = 7.0  # at 33.4 degrees on a sensor that the field fills, where the edge keeps 0.84 of the light
 TABLE_LOSS = 1 - cos(radians(16.7)) ** 4
 
 

@@ -6,7 +6,7 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "nonlinearity"
 
-ETA_PER_SHARE = 21.0
+ETA_PER_SHARE = 140.0
 
 
 def size(scene: Scene) -> Size:

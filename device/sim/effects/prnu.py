@@ -1,18 +1,18 @@
 """Pixels that respond unequally (optics.md 3.9, PRNU): a fixed pattern that a flat frame takes out."""
 
+from math import sqrt
+
 import numpy as np
 
 from device.sim.setup import Scene, Setup, Size
 
 name = "prnu"
 
-ETA_PER_SHARE = 230.0  # 0.23 per 0.1 %, uncorrected
-
 
 def size(scene: Scene) -> Size:
-    """In proportion to its spread."""
+    """White, and so a noise of its own: spread x signal, against sqrt(signal), is the most where it is brightest."""
     spread = scene.sim.sensor.prnu
-    return Size(ETA_PER_SHARE * spread * scene.weight, f"{spread:.2%} from pixel to pixel")
+    return Size(spread * sqrt(scene.peak_e), f"{spread:.2%} from pixel to pixel")
 
 
 def apply(setup: Setup) -> None:

@@ -8,7 +8,7 @@ from device.sim.setup import Place, Scene, Setup, Size
 name = "pupil"
 
 WALK_FROM_DEG, WALK_MM, WALK_POWER = 15.0, 0.12801840, 1.4409122
-ETA_CLIPPED = 5.0  # it is no small change: the caustic of the edge loses a side
+ETA_PER_MM = 220.0  # of the beam's edge inside the iris's: the caustic of the field's edge loses a side
 
 
 def walk_mm(angle_deg: float) -> float:
@@ -32,7 +32,7 @@ def size(scene: Scene) -> Size:
     """Exactly nothing while the beam of the field's edge still fills the iris."""
     shift, room = shift_mm(scene, scene.half_field_deg), room_mm(scene)
     why = f"at the edge the beam is {shift:.2f} mm off, and the iris is filled up to {room:.2f} mm"
-    return Size(0.0 if shift <= room else ETA_CLIPPED * scene.weight, why)
+    return Size(ETA_PER_MM * max(shift - room, 0.0) * scene.weight, why)
 
 
 def apply(setup: Setup) -> None:

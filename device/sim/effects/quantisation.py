@@ -1,6 +1,6 @@
 """Whole counts: what the converter rounds away (optics.md 3.1)."""
 
-from math import sqrt
+from math import hypot, sqrt
 
 from device.sim.setup import Scene, Setup, Size
 
@@ -8,9 +8,11 @@ name = "quantisation"
 
 
 def size(scene: Scene) -> Size:
-    """White noise of a twelfth of a step squared. Little, but files hold whole counts anyway."""
-    eta = scene.spec.camera.gain_e_per_dn / sqrt(12) / scene.noise_e
-    return Size(max(eta, 0.05), f"{scene.spec.camera.bit_depth} bit: {eta:.3f} of the noise; files hold whole counts")
+    """White noise of a twelfth of a step squared: little in the light, but the dark frame shows it."""
+    camera = scene.spec.camera
+    rounding_e = camera.gain_e_per_dn / sqrt(12)
+    why = f"{camera.bit_depth} bit: {rounding_e:.1f} electrons are rounded away, of the noise that a dark frame has"
+    return Size(rounding_e / hypot(rounding_e, camera.read_noise_e), why)
 
 
 def apply(setup: Setup) -> None:

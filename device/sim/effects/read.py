@@ -8,7 +8,7 @@ name = "read"
 
 
 def size(scene: Scene) -> Size:
-    """Little beside the shot noise of a bright pixel; but the dark frame of every scene is made of it."""
+    """Little beside the shot noise of a bright pixel; measured against the dark frame, which is made of it."""
     read_e = scene.spec.camera.read_noise_e
     return Size(1.0 if read_e > 0 else 0.0, f"{read_e:.2f} electrons: all the noise that a dark frame has")
 

@@ -6,13 +6,13 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "refraction"
 
-ETA_PER_DPT = 0.55
+ETA_PER_DPT = 3.0
 
 
 def size(scene: Scene) -> Size:
-    """In proportion to the strongest meridian; d r z a^2 is how far the caustic's edge moves."""
+    """In proportion to the blur strength, the root of the squares; z a^2 r is how far the caustic's edge moves."""
     m, j0, j45 = scene.refraction
-    dpt = abs(m) + hypot(j0, j45)
+    dpt = hypot(m, j0, j45)
     edge_um = dpt * scene.geometry.scale_per_dpt * scene.optics.iris_um / 2
     return Size(ETA_PER_DPT * dpt * scene.weight, f"{dpt:.2f} dpt move the caustic's edge by {edge_um:.1f} um")
 

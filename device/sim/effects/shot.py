@@ -9,8 +9,8 @@ name = "shot"
 
 def size(scene: Scene) -> Size:
     """It is the noise that all others are measured against."""
-    share = scene.peak_e / scene.noise_e**2
-    return Size(1.0, f"{share:.2%} of the variance at {scene.peak_e:.0f} electrons")
+    share = 1 - (scene.spec.camera.read_noise_e / scene.noise_e) ** 2
+    return Size(1.0, f"{share:.2%} of the variance, {scene.peak_e:.0f} electrons at the peak")
 
 
 def apply(setup: Setup) -> None:

@@ -4,7 +4,7 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "shutter"
 
-ETA_PER_DEG = 3.0  # a skew moves vessels at the top and bottom edge against each other
+ETA_PER_DEG = 12.0  # a skew moves vessels at the top and bottom edge against each other
 
 
 def size(scene: Scene) -> Size:

@@ -4,13 +4,15 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "source"
 
-TABLE_ETA, TABLE_UM = 0.89, 275.0
+TABLE_ETA, TABLE_UM, POWER = 0.89, 275.0, 1.4  # .08, .21, .89 for 50, 100, 275 um
 
 
 def size(scene: Scene) -> Size:
-    """With the square of its diameter."""
+    """With a power of its diameter."""
     dot_um = scene.sim.calibration.source_um
-    return Size(TABLE_ETA * (dot_um / TABLE_UM) ** 2 * scene.weight, f"a dot of {dot_um:.0f} um stands for the point")
+    return Size(
+        TABLE_ETA * (dot_um / TABLE_UM) ** POWER * scene.weight, f"a dot of {dot_um:.0f} um stands for the point"
+    )
 
 
 def apply(setup: Setup) -> None:

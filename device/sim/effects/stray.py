@@ -4,7 +4,7 @@ from device.sim.setup import Scene, Setup, Size
 
 name = "stray"
 
-ETA_PER_SHARE = 45.0  # where no constant is fitted; a solver that fits one sees less
+ETA_PER_SHARE = 320.0  # where no constant is fitted; a solver that fits one sees less
 
 
 def size(scene: Scene) -> Size:

@@ -1,0 +1,221 @@
+"""What a plan leaves out is not seen: every shipped scene with everything and with its plan, reconstructed both.
+
+The judge is optics.md 3.0: eta = ||F dY|| / ||F noise||, with F the product's own filter, its taper included, and the
+best common gain taken out of dY. Pixels are twice as wide, which is how the product solves the paper's sensor anyway.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import fft
+
+from device.clock import VirtualClock
+from device.recon.methods import METHODS
+from device.recon.metrics import pcc
+from device.recon.model import field_radius_px
+from device.recon.prepare import Preparer
+from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.resolution import working_bin
+from device.recon.variation import EvidenceWiener
+from device.sim.calibrate import calibration_point, simulated_calibration
+from device.sim.effects import EFFECTS
+from device.sim.effects.effect import Effect
+from device.sim.fundus import field_mask
+from device.sim.plan import SEEN
+from device.sim.render import blurred, fitted, traced, zones
+from device.sim.setup import Scene, Setup, Size
+from device.sim.world import World
+from device.spec import load_head
+from device.values import Calibration, Image
+from tests import scenes
+from tests.simulated import SCENES, coarse, expected, exposed, having, world
+
+COARSER = 2
+NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
+ROUNDING = 2e-3  # what single precision and one-electron counts make of an exact zero
+
+
+class Filter:
+    """The product's linear step: fade, spectrum, conj(H) / (|H|^2 + s2 / g), with the prior of one frame."""
+
+    def __init__(self, calibration: Calibration, of: World) -> None:
+        counts = exposed(of)
+        method = METHODS["evidence"]
+        model = method.model(calibration, counts.shape, working_bin(calibration.psfs[0]), scenes.PLANNER, 0)
+        solver = method.build(model, calibration, scenes.PLANNER)
+        assert isinstance(solver, EvidenceWiener)
+        solver.start(Preparer(calibration, model.grid)(counts))
+        self.grid, self.fade = model.grid, solver.fade
+        self.gain = np.conj(model.otf) / (np.abs(model.otf) ** 2 + solver.reg)
+        self.read_e = of.spec.camera.read_noise_e
+
+    def eta(self, with_it: NDArray[np.float64], without: NDArray[np.float64]) -> float:
+        """How much the picture changes, over its noise, when the frame's expected electrons change so."""
+        seen, ideal = self.binned(with_it), self.binned(without)
+        change = seen - (seen * ideal).sum() / (ideal * ideal).sum() * ideal
+        padded = np.zeros(self.grid.shape)
+        padded[self.grid.slices] = change * self.fade
+        changed = self.energy(fft.rfft2(padded) * self.gain)
+        noise = (ideal.mean() + (self.grid.n * self.read_e) ** 2) * float((self.fade**2).sum())
+        return float(np.sqrt(changed / (noise * self.energy(self.gain))))
+
+    def energy(self, spectrum: NDArray[np.complex128]) -> float:
+        """The sum of squares over the whole plane, of half of it."""
+        twice = np.full(spectrum.shape[1], 2.0)
+        twice[0] = 1
+        if self.grid.shape[1] % 2 == 0:
+            twice[-1] = 1
+        return float((np.abs(spectrum) ** 2 * twice).sum())
+
+    def binned(self, image: NDArray[np.float64]) -> NDArray[np.float64]:
+        n, (rows, cols), (top, left) = self.grid.n, self.grid.window, self.grid.first_px
+        return image[top : top + n * rows, left : left + n * cols].reshape(rows, n, cols, n).sum((1, 3))
+
+
+@dataclass
+class Proof:
+    """One scene, twice: as planned, and with everything."""
+
+    planned: World
+    everything: World
+    calibration: Calibration  # of the planned one
+    filter: Filter
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def proof(request: pytest.FixtureRequest) -> Proof:
+    spec = coarse(load_head(SCENES / f"{request.param}.toml"), COARSER)
+    planned = world(spec)
+    calibration = simulated_calibration(planned)
+    return Proof(planned, world(spec, everything=True), calibration, Filter(calibration, planned))
+
+
+def pictured(of: World, calibration: Calibration) -> Image:
+    """What the product shows: a lit and a dark frame through the head's own calibration."""
+    recipe = Recipe("evidence", working_bin(calibration.psfs[0]))
+    of.frames = 0  # the same noise in both worlds
+    make = Reconstructor(calibration, of.shape, scenes.PLANNER, VirtualClock(), (recipe,))
+    return make(exposed(of), exposed(of, lit=False)).picture
+
+
+def test_all_that_is_left_out_together_changes_no_picture(proof: Proof, record_property) -> None:
+    colour = proof.planned.spec.light.colour
+    inside = field_mask(proof.planned.shape, field_radius_px(proof.calibration))
+    truth = proof.planned.truth(colour).astype(np.float64)
+    heads = (proof.planned, proof.calibration), (proof.everything, simulated_calibration(proof.everything))
+    planned, everything = (pcc(pictured(*head).astype(np.float64), truth, inside) for head in heads)
+    record_property("pcc", f"{planned:.4f} {everything - planned:+.5f}")
+    assert planned == pytest.approx(everything, abs=0.002)
+
+
+def seen_by_itself(proof: Proof, name: str) -> float:
+    """The measured eta of one effect on top of the plan."""
+    spec, chosen = proof.planned.spec, [one.name for one in proof.planned.plan if one.simulated]
+    without = expected(proof.planned)
+    added = world(spec, only=[*chosen, name])
+    if name != "source":
+        return proof.filter.eta(expected(added), without)
+    dotted, point = (calibration_point(of) for of in (added, proof.planned))  # in the calibration, not in the frame
+    both = fitted(dotted, added.shape), fitted(point, added.shape)
+    return dot_eta(proof, *both)
+
+
+def dot_eta(proof: Proof, dotted: Image, point: Image) -> float:
+    """The same for a wrong PSF: the frame of the plan's own object as it and as the right one predict it."""
+    setup = proof.planned.setup(proof.planned.spec.light.colour)
+    seen, ideal = (blurred([(setup.object, psf)], proof.planned.shape).astype(np.float64) for psf in (dotted, point))
+    scale = proof.planned.scene.peak_e / ideal.max()
+    return proof.filter.eta(scale * seen, scale * ideal)
+
+
+def test_each_effect_that_is_left_out_is_smaller_than_a_twentieth_of_the_noise(proof: Proof, record_property) -> None:
+    small = [one for one in proof.planned.plan if not one.simulated and one.eta > 0]
+    assert small, "at least the LED's bandwidth is never exactly nothing"
+    together = proof.filter.eta(expected(proof.everything), expected(proof.planned))
+    record_property("together", f"{together:.4f}")
+    alone = {one.name: seen_by_itself(proof, one.name) if len(small) > 1 else together for one in small}
+    for one in small:
+        record_property(one.name, f"{one.eta:.4f} {alone[one.name]:.4f}")
+        assert alone[one.name] < SEEN, one
+        assert alone[one.name] < one.eta + ROUNDING, f"the formula of {one.name} is no bound"
+    assert together < sum(alone.values()) + ROUNDING, "an effect of size zero is not nothing"
+
+
+NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.1
+    "refraction": {"eye": {"m_dpt": 0.03, "j0_dpt": 0.02}},
+    "motion": {"eye": {"drift_deg_per_s": 2.0}},
+    "shutter": {"eye": {"drift_deg_per_s": 1.0}, "sensor": {"line_s": 2e-5}},
+    "stray": {"light": {"stray": 4e-4}},
+    "ambient": {"light": {"ambient": 4e-4}},
+    "reflex": {"eye": {"shown_by": "human eye"}, "light": {"polariser_leak": 1e-4, "ring_um": 4000.0}},
+    "pupil": {"eye": {"pupil_um": 4000.0, "decentred_um": 801.0}},
+    "prnu": {"sensor": {"prnu": 4e-4}},
+    "dsnu": {"sensor": {"dsnu_e": 12.0}},
+    "dark": {"sensor": {"dark_e_per_s": 100.0}},
+    "nonlinearity": {"sensor": {"nonlinearity": 2e-3}},
+    "source": {"calibration": {"source_um": 60.0}},
+}
+
+
+@pytest.fixture(scope="module", params=["healthy", "crowded_imx296", "dim"])
+def plain(request: pytest.FixtureRequest) -> Proof:
+    spec = coarse(load_head(SCENES / f"{request.param}.toml"), COARSER)
+    planned = world(spec)
+    calibration = simulated_calibration(planned)
+    return Proof(planned, planned, calibration, Filter(calibration, planned))
+
+
+@pytest.mark.parametrize("name", NEAR)
+def test_near_the_threshold_a_formula_is_a_bound_and_no_wild_one(plain: Proof, name: str, record_property) -> None:
+    spec = having(plain.planned.spec, **NEAR[name])
+    near = replace(plain, planned=world(spec, only=["shot", "read", "quantisation"]))
+    told = next(one.eta for one in world(spec).plan if one.name == name)
+    measured = seen_by_itself(near, name)
+    record_property(name, f"{told:.4f} {measured:.4f}")
+    assert 0 < measured < told + ROUNDING
+    assert told < 12 * measured
+
+
+class Counted:
+    """An effect that counts how often it is asked and how often it is put in."""
+
+    def __init__(self, effect: Effect, calls: Counter[str]) -> None:
+        self.name, self._effect, self._calls = effect.name, effect, calls
+
+    def size(self, scene: Scene) -> Size:
+        self._calls[f"size {self.name}"] += 1
+        return self._effect.size(scene)
+
+    def apply(self, setup: Setup) -> None:
+        self._calls[f"apply {self.name}"] += 1
+        self._effect.apply(setup)
+
+
+def test_what_is_skipped_is_asked_once_and_never_applied() -> None:
+    calls: Counter[str] = Counter()
+    of = world(coarse(load_head(SCENES / "calm.toml"), 4), effects=[Counted(effect, calls) for effect in EFFECTS])
+    expected(of)
+    assert calls == {f"size {one.name}": 1 for one in of.plan} | {
+        f"apply {one.name}": 1 for one in of.plan if one.simulated
+    }
+
+
+def cost(of: World) -> tuple[int, int]:
+    """Waves carried through the diffuser, and transforms of object and caustics, for one frame."""
+    traced.cache_clear()
+    setup = of.setup(of.spec.light.colour)
+    expected(of)
+    return traced.cache_info().misses * setup.lines, 2 * len(list(zones(setup))) + 1
+
+
+def test_a_relaxed_eye_before_a_screen_costs_a_fifth_or_less_of_everything(record_property) -> None:
+    spec = having(coarse(load_head(SCENES / "healthy.toml"), 4), eye={"shown_by": "screen"})
+    waves, transforms = cost(world(spec))
+    all_waves, all_transforms = cost(world(spec, everything=True))
+    record_property("cost", f"{waves} {all_waves} waves, {transforms} {all_transforms} transforms")
+    assert (waves, transforms) == (1, 3)
+    assert all_waves >= 3
+    assert all_transforms > 5 * transforms
