@@ -117,7 +117,7 @@ def run_retina(bench: Bench) -> Outcome:
     bench.say("S2: a retina over 48.3 degrees")
     take = bench.take("paper_retina")
     mu, direct, paper = bench.best(take)
-    fine_mu, fine, _ = bench.finest(take)
+    fine_mu, fine = bench.finest(take)
     pictures = {f"paper's, mu {mu:.0e}": direct, "the same, flat field": take.evened(direct)}
     pictures |= {name: bench.solve(take, method) for name, method in (("flat-sub", "gradient"), ("ours", "variation"))}
     evened, flat, ours = (take.score(x) for x in list(pictures.values())[1:])

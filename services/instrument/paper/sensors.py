@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from services.instrument.paper.bench import Bench, Take
+from services.instrument.paper.bench import SAMPLE_UM, Bench, Take
 from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown, above, below
 from services.instrument.paper.pictures import compared, trend
 
@@ -20,9 +20,13 @@ EYES = 6
 SPAN_DPT, CYLINDER_DPT = 5.0, 0.5
 
 
-def camera(name: str) -> dict[str, Any]:
-    """The changes that put a small sensor behind the paper's optics, in the paper's light per area."""
+def camera(name: str, coarse: bool) -> dict[str, Any]:
+    """The changes that put a small sensor behind the paper's optics, in the paper's light per area.
+
+    `coarse` merges its pixels to samples of the scores.
+    """
     rows, cols, pitch_um, n = SENSORS[name]
+    n = round(SAMPLE_UM / pitch_um) if coarse else n
     peak_e = PAPER_PEAK_E * (pitch_um * n / PAPER_PITCH_UM) ** 2
     return {
         "camera.rows": rows // n, "camera.cols": cols // n, "camera.pitch_um": pitch_um * n,
@@ -31,9 +35,10 @@ def camera(name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def whole_psf(bench: Bench, take: Take, name: str) -> Take:
+def whole_psf(bench: Bench, take: Take, name: str, coarse: bool) -> Take:
     """The same frame with a PSF taken in parts: on a sensor that would hold all of it."""
-    changes = camera(name) | {"camera.rows": 1280, "camera.cols": 1280}
+    side = max(take.shape)
+    changes = camera(name, coarse) | {"camera.rows": side, "camera.cols": side}
     whole = bench.take("paper_heine", changes).calibration.psfs
     return Take(take.name, replace(take.staged, calibration=replace(take.calibration, psfs=whole)))
 
@@ -43,13 +48,13 @@ def run_sensors(bench: Bench) -> Outcome:
     claims: list[Claim] = []
     shown: list[Shown] = []
     rows, cut = [], 0.0
-    plain = Bench(1)  # these pixels are small already
+    plain = Bench(1)  # these sensors say themselves what is merged
     for name in SENSORS:
         bench.say(f"S10: {name}")
-        take = plain.take("paper_heine", camera(name))
+        take = plain.take("paper_heine", camera(name, bench.merged > 1))
         if name in TOO_SMALL:
             cut = take.score(plain.solve(take, "variation")).pcc
-            take = whole_psf(plain, take, name)
+            take = whole_psf(plain, take, name, bench.merged > 1)
         _, paper, scores = plain.best(take)
         flat, ours = (plain.solve(take, method) for method in ("evidence", "variation"))
         found = scores.pcc, take.score(flat).pcc, take.score(ours).pcc

@@ -15,16 +15,20 @@ from services.instrument.paper.pictures import compared, cutline, trend
 EYES_DPT = (-4.0, -2.0, 0.0, 2.0, 4.0)
 PSFS_DPT = (-7.619, -4.0, -2.0, 0.0, 2.0, 4.0, 5.517)  # of the screen at 21 and 29 mm: 1/s - 1/f, as wavefronts
 SCALES = np.linspace(0.985, 1.015, 13)
-NEAR_DEG = 12.0  # where two pictures are laid over one another to compare their scales
+NEAR_DEG, MARGIN = 12.0, 0.05  # where two pictures are laid over one another to compare their scales
 
 
 def magnification(one: Image, other: Image, take: Take) -> float:
     """How much larger `one` is than `other`: the stretch about the middle under which their details agree best."""
-    rows, cols = (np.arange(n) - (n - 1) / 2 for n in other.shape)
-    near = np.hypot(rows[:, None], cols[None, :]) < NEAR_DEG * take.px_per_deg
-    details = [ndimage.gaussian_filter(highpass(x.astype(np.float64), take.inside, DETAIL_DEG * take.px_per_deg), 1.5)
-               for x in (one, other)]  # fmt: skip
-    middle = np.array([(n - 1) / 2 for n in other.shape])
+    reach = round(NEAR_DEG * take.px_per_deg)
+    part = tuple(slice(n // 2 - reach, n - n // 2 + reach) for n in other.shape)  # the same middle
+    details = []
+    for picture in (one, other):
+        fine = highpass(picture.astype(np.float64)[part], take.inside[part], DETAIL_DEG * take.px_per_deg)
+        details.append(ndimage.gaussian_filter(fine, 1.5))
+    middle = (np.array(details[0].shape) - 1) / 2
+    rows, cols = (np.arange(n) - m for n, m in zip(details[0].shape, middle, strict=True))
+    near = np.hypot(rows[:, None], cols[None, :]) < (1 - MARGIN) * reach
     agree = []
     for scale in SCALES:
         moved = ndimage.affine_transform(details[0], np.full(2, scale), middle - scale * middle, order=3)
