@@ -34,9 +34,9 @@ WRONG = {
         "field_deg = 120": ("optics.field_deg", "120", "above 0", "at most 90"),
         "wavelength_um = 10.6": ("optics.wavelength_um", "10.6", "above 0.3", "below 1.2"),
     },
-    "read_noise_e = 1.03": {
-        "read_noise_e = 1.03\nexposure_s = -0.1": ("camera.exposure_s", "-0.1", "above 0", "at most 10"),
-        "read_noise_e = -1": ("camera.read_noise_e", "-1", "at least 0"),
+    'sensor = "quantalux"': {
+        'sensor = "quantalux"\nexposure_s = -0.1': ("camera.exposure_s", "-0.1", "above 0", "at most 10"),
+        'sensor = "quantalux"\nread_noise_e = -1': ("camera.read_noise_e", "-1", "at least 0"),
     },
 }
 
