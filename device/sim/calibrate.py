@@ -1,7 +1,5 @@
 """What the factory would measure of a simulated head: a point source, sixteen frames, and their dark."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from device.optics.diffuser import Refraction, steepest_rad
@@ -27,15 +25,9 @@ def simulated_calibration(world: World) -> Calibration:
     size = min(point.shape[0], camera.rows), min(point.shape[1], camera.cols)
     caustic_e = fitted(point, size)
     caustic_e *= np.float32(FILLED * camera.full_well_e / float(caustic_e.max()))
-<<<<<<< HEAD
     pixels = world.sensor.middle(size)
     measured = mean_frame(pixels, caustic_e, world.seed, 1)
     measured -= mean_frame(pixels, np.zeros_like(caustic_e), world.seed, 2)
-=======
-    part = middle_of(world.sensor, size)
-    measured = mean_frame(part, caustic_e, world.seed, 1)
-    measured -= mean_frame(part, np.zeros_like(caustic_e), world.seed, 2)
->>>>>>> objects
     measured -= _pedestal(measured, world)
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, float(camera.white_dn))
     return Calibration(
@@ -74,11 +66,6 @@ def calibration_point(world: World) -> Image:
     scale = setup.optics.angular_magnification * setup.optics.diffuser_to_sensor_um
     on_sensor_um = setup.source_um * scale / world.scene.sim.eye.focal_length_um
     return dotted(point, on_sensor_um / world.spec.camera.pitch_um) if on_sensor_um else point
-
-
-def middle_of(sensor: SensorModel, shape: tuple[int, int]) -> SensorModel:
-    """The part of a sensor on which the caustic falls, with its own fixed pattern."""
-    return sensor if sensor.offset_e is None else replace(sensor, offset_e=fitted(sensor.offset_e, shape))
 
 
 def mean_frame(sensor: SensorModel, electrons: Image, seed: int, part: int) -> Image:
