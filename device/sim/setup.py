@@ -97,7 +97,7 @@ class Scene:
         Electrons of one and the same area: smaller pixels collect less each, and are more.
         """
         light = self.peak_e / TABLE_E * (TABLE_PITCH_UM / self.spec.camera.pitch_um) ** 2
-        return light ** (0.5 if light > 1 else 0.15)
+        return float(light ** (0.5 if light > 1 else 0.15))
 
     @property
     def refraction(self) -> Refraction:

@@ -129,5 +129,8 @@ class World:
         if not setup.ambient:
             return setup.dark_e_per_s
         self.electrons_per_s(self.spec.light.colour)  # says how bright the picture is, of which this is a share
-        room_e_per_s = np.float32(setup.ambient * setup.lit_e_per_s)
-        return setup.dark_e_per_s + (room_e_per_s if setup.response is None else room_e_per_s * setup.response)
+        room_e_per_s = setup.ambient * setup.lit_e_per_s
+        if setup.response is None:
+            return setup.dark_e_per_s + room_e_per_s
+        always: Image = np.float32(setup.dark_e_per_s) + np.float32(room_e_per_s) * setup.response
+        return always

@@ -1,0 +1,72 @@
+"""Scenes that cannot be: refused with the key, the value that was given, and what is allowed."""
+
+from pathlib import Path
+
+import pytest
+
+from device.errors import SpecError
+from device.spec import load_head
+from tests.simulated import SCENES
+
+TEXT = (SCENES / "healthy.toml").read_text()
+
+BAD = {  # what is added to or replaced in a scene, and the words that must be said
+    "a missing image": (
+        '[sim.object]\nkind = "image"\nimage = "nowhere.png"',
+        ("sim.object.image", "nowhere.png", "path of a photograph"),
+    ),
+    "no image": ('[sim.object]\nkind = "image"', ("sim.object", 'kind = "image"', "the path of a photograph")),
+    "an image of a retina that is drawn": (
+        f'[sim.object]\nimage = "{(SCENES / "healthy.toml").as_posix()}"',
+        ("sim.object", 'kind = "image"', '"retina"'),
+    ),
+    "a tiny pupil": ("[sim.eye]\npupil_um = 200", ("sim.eye.pupil_um", "200", "at least 1000", "at most 9000")),
+    "a pupil beside the iris": (
+        "[sim.eye]\npupil_um = 2000\ndecentred_um = 4000",
+        ("sim.eye.decentred_um = 4000", "2000 um", "below 2200"),
+    ),
+    "a wide gaze": ("[sim.eye]\ngaze_deg = [40, 3]", ("sim.eye.gaze_deg", "(40.0, 3.0)", "allowed: 30")),
+    "an unknown light": ('[sim.eye]\nshown_by = "torch"', ("sim.eye.shown_by", "'torch'", "'human eye'")),
+    "a wild pixel": ("[sim.sensor]\nprnu = 3", ("sim.sensor.prnu", "3", "at least 0", "at most 0.2")),
+}
+WRONG = {
+    "field_deg = 33.4": {
+        "field_deg = 120": ("optics.field_deg", "120", "above 0", "at most 90"),
+        "wavelength_um = 10.6": ("optics.wavelength_um", "10.6", "above 0.3", "below 1.2"),
+    },
+    "read_noise_e = 1.03": {
+        "read_noise_e = 1.03\nexposure_s = -0.1": ("camera.exposure_s", "-0.1", "above 0", "at most 10"),
+        "read_noise_e = -1": ("camera.read_noise_e", "-1", "at least 0"),
+    },
+}
+
+
+def message(text: str, folder: Path) -> str:
+    path = folder / "scene.toml"
+    path.write_text(text)
+    with pytest.raises(SpecError) as error:
+        load_head(path)
+    assert error.value.remedy
+    return error.value.message
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_scene_that_cannot_be_is_refused_with_key_value_and_range(case: str, tmp_path: Path) -> None:
+    added, words = BAD[case]
+    said = message(f"{TEXT}\n{added}\n", tmp_path)
+    assert all(word in said for word in words), said
+
+
+@pytest.mark.parametrize(("right", "wrong"), [(right, wrong) for right, some in WRONG.items() for wrong in some])
+def test_optics_and_camera_that_cannot_be_are_refused_likewise(right: str, wrong: str, tmp_path: Path) -> None:
+    assert right in TEXT
+    said = message(TEXT.replace(right, wrong), tmp_path)
+    assert all(word in said for word in WRONG[right][wrong]), said
+
+
+def test_a_scene_says_only_what_is_different(tmp_path: Path) -> None:
+    optics = load_head(SCENES / "healthy.toml").optics
+    assert optics is not None
+    paper = (optics.iris_um, optics.diffuser_to_sensor_um, optics.angular_magnification, optics.field_deg)
+    assert paper == (3200, 6000, 0.75, 33.4)
+    assert max(len(path.read_text().splitlines()) for path in SCENES.glob("*.toml")) < 60
