@@ -22,7 +22,7 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 	@$(BIN)/diffuscope run --port $(PORT)
 
 test: .venv/ready browser ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -m "not bench and not rig" --ignore tests/browser
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser
 	@$(BIN)/python -m pytest tests/browser
 
 browser: ## Install headless Chromium (Debian package) where it is missing.

@@ -38,7 +38,7 @@ def test_a_constant_frame_is_the_same_constant() -> None:
     assert made(np.full(SHAPE, 777, np.uint16), "gradient") == pytest.approx(777, rel=1e-4)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", METHODS[1:])  # the paper's form has a bound of its own, in test_bounds.py
 def test_a_saturated_blob_is_masked_not_believed(method: str) -> None:
     clean = frame()
     blob = clean.copy()
@@ -46,7 +46,7 @@ def test_a_saturated_blob_is_masked_not_believed(method: str) -> None:
     with_blob = made(blob, method, sensor=Sensor(white_dn=4095.0))
     without = made(clean, method, sensor=Sensor(white_dn=4095.0))
     believed = made(blob, method, sensor=Sensor(white_dn=65535.0))
-    assert np.linalg.norm(with_blob - without) < 0.5 * np.linalg.norm(believed - without) or method == "tikhonov"
+    assert np.linalg.norm(with_blob - without) < 0.5 * np.linalg.norm(believed - without)
     assert np.isfinite(with_blob).all()
 
 
