@@ -41,9 +41,9 @@ def diffuscope(tmp_path_factory: pytest.TempPathFactory) -> Run:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The diabetic scene on pixels that are twelve times as wide."""
     text = DIABETIC.read_text()
-    sensor = 'sensor = "quantalux"\n'
-    assert sensor in text
-    text = text.replace(sensor, sensor + "rows = 90\ncols = 160\npitch_um = 60.48\n")
+    said = 'sensor = "quantalux"\n'
+    assert said in text
+    text = text.replace(said, said + "rows = 90\ncols = 160\npitch_um = 60.48\n")
     path = tmp_path_factory.mktemp("scene") / "tiny.toml"
     path.write_text(text)
     return path

@@ -3,10 +3,13 @@
 The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
 """
 
+import numpy as np
 import pytest
+from scipy import ndimage
 
 from services.instrument.paper.bench import Bench
 from services.instrument.paper.report import EXPERIMENTS
+from services.instrument.paper.trainer import magnification
 
 BENCH = Bench(merged=2)
 
@@ -17,3 +20,13 @@ def test_every_assertion_holds(key: str) -> None:
     broken = [f"{claim.what}: {claim.value:.4g}, not {claim.limit}" for claim in claims if not claim.holds]
     assert claims
     assert not broken, "\n".join(broken)
+
+
+@pytest.mark.parametrize("scale", [0.997, 1.004])
+def test_a_stretch_of_a_few_in_a_thousand_would_be_seen(scale: float) -> None:
+    """The limit of S5 is 3 in 1000: its ruler must be finer than that."""
+    take = BENCH.take("paper_heine")
+    picture = BENCH.solve(take, "gradient")
+    middle = (np.array(picture.shape) - 1) / 2
+    larger = ndimage.affine_transform(picture, np.full(2, 1 / scale), middle - middle / scale, order=3)
+    assert magnification(larger, picture, take) == pytest.approx(scale, abs=5e-4)

@@ -53,8 +53,13 @@ def cutline(take: Take, down_deg: float, pictures: Mapping[str, Image], title: s
         lines[name] = matched(picture.astype(np.float64), truth, take.inside)[row, cols]
     peak = max(float(np.abs(truth[take.inside]).max()), 1e-30)
     scaled = {name: values / peak for name, values in lines.items()}
-    return _lines(title, f"{down_deg:+.1f} degrees below the axis", "degrees from the axis", "share of the brightest",
+    return _lines(title, _where(down_deg), "degrees from the axis", "share of the brightest",
                   degrees, scaled)  # fmt: skip
+
+
+def _where(down_deg: float) -> str:
+    side = "below" if down_deg > 0 else "above"
+    return f"{abs(down_deg):g} degrees {side} the axis" if down_deg else "through the axis"
 
 
 def trend(title: str, under: str, across: str, up: str, lines: Mapping[str, Mapping[float, float]]) -> Shown:

@@ -23,7 +23,7 @@ STYLE = """
   --card: #191f28; --yes: #4fd1a5; --no: #ff8a80; --accent: #6cbcf5; } }
 body { margin: 0; background: var(--ground); color: var(--ink);
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "Noto Sans", Arial, sans-serif; }
-main { max-width: 1120px; margin: 0 auto; padding: 32px 24px 80px; }
+main { max-width: 1320px; margin: 0 auto; padding: 32px 24px 80px; }
 h1 { font-size: 34px; line-height: 1.15; margin: 0 0 8px; }
 h2 { font-size: 23px; line-height: 1.25; margin: 0 0 8px; }
 h2 span { display: inline-block; min-width: 2.2em; color: var(--accent); }
@@ -35,13 +35,13 @@ section { border-top: 1px solid var(--line); padding: 28px 0 20px; }
 table { border-collapse: collapse; margin: 12px 0 20px; font-size: 15px; }
 th, td { text-align: left; padding: 5px 16px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { color: var(--quiet); font-weight: 500; } .n { text-align: right; font-variant-numeric: tabular-nums; }
-.claims { width: 100%; table-layout: fixed; } .claims th:first-child { width: 44%; }
+.claims { width: 100%; max-width: 1100px; table-layout: fixed; } .claims th:first-child { width: 44%; }
 .claims th:nth-child(2) { width: 9%; } .claims th:nth-child(4) { width: 11%; }
 .sheet td { font-variant-numeric: tabular-nums; }
 tr.yes td:nth-child(4) { color: var(--yes); } tr.no td, b.no { color: var(--no); font-weight: 600; }
-.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(250px, 1fr)); gap: 16px; margin: 12px 0; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(230px, 1fr)); gap: 16px; margin: 12px 0; }
 .pictures figure.begins { grid-column-start: 1; }
-.plots { display: grid; gap: 16px; margin: 12px 0; } .plots figcaption { display: none; }
+.plots { max-width: 1000px; display: grid; gap: 16px; margin: 12px 0; } .plots figcaption { display: none; }
 figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
 figure img { display: block; width: 100%; } .pictures img { aspect-ratio: 1; object-fit: contain; background: #000; }
 figcaption { padding: 8px 10px; line-height: 1.35; }
