@@ -41,10 +41,10 @@ bench: .venv/ready ## Print figures of speed and truth, measured on this machine
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
 
-bench-peers: .venv/ready ## Install LenslessPiCam beside, in .bench-venv, for make bench to compare with.
+bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.
 	@$(BIN)/python -m venv .bench-venv
 	@.bench-venv/bin/pip install -qq --disable-pip-version-check --no-deps lensless==1.0.8 && \
-		.bench-venv/bin/pip install -qq --disable-pip-version-check numpy scipy matplotlib opencv-python-headless pillow \
+		.bench-venv/bin/pip install -qq --disable-pip-version-check ducc0 pyfftw numpy scipy matplotlib opencv-python-headless pillow \
 		|| { rm -rf .bench-venv; echo "LenslessPiCam could not be installed (is there a network?): make bench leaves it out"; }
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.

@@ -32,7 +32,8 @@ def main(parts: list[str]) -> None:
         if "speed" in wanted:
             speed.closed_forms(scene, planner)
             speed.rounds(scene, planner)
-            speed.libraries(planner)
+            speed.refraction(scene, planner)
+            speed.libraries()
         if "deadline" in wanted:
             deadline.deadlines(scene, planner)
         if "peers" in wanted:

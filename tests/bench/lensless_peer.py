@@ -17,8 +17,10 @@ def main(folder: Path) -> None:
     with np.load(folder / "in.npz") as given:
         y, psf, every = given["y"], given["psf"], given["rounds"]
     psf = np.maximum(psf, 0)
-    solver = ADMM((psf / np.linalg.norm(psf)).astype(np.float32)[None, :, :, None])
-    solver.set_data((np.maximum(y, 0) / y.max()).astype(np.float32)[None, :, :, None])
+    channels = np.atleast_3d(y)
+    spread = np.repeat(np.atleast_3d(psf / np.linalg.norm(psf)), channels.shape[2], axis=2)
+    solver = ADMM(spread.astype(np.float32)[None])
+    solver.set_data((np.maximum(channels, 0) / y.max()).astype(np.float32)[None])
     found = []
     for k, rounds in enumerate(every):
         begin = time.perf_counter()

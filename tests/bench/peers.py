@@ -1,29 +1,26 @@
 """What others do with the same frame, on the same pixels, judged by the same judge: for the bench only, not shipped."""
 
-import json
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy import fft, ndimage
 from skimage.restoration import wiener
 
 from device.clock import SystemClock
-from device.recon.geometry import Grid, disc
+from device.recon.geometry import Grid
 from device.recon.metrics import Judge
-from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.recon.upsample import to_sensor
 from device.sim.staged import Staged
 from device.values import Image
 from tests.bench import timing
+from tests.bench.candidates import candidates
+from tests.bench.elsewhere import lensless_pictures
+from tests.bench.scoring import judge_of, scored
 
 N = 2
-PEER_PYTHON = Path(".bench-venv/bin/python")
 Convolve = Callable[[Image], Image]
 
 
@@ -82,23 +79,16 @@ PEERS: tuple[tuple[str, Callable[[Image, Image, int], Image], tuple[int, ...]], 
 LENSLESS_ROUNDS = (10, 40, 100)
 
 
-def judge_of(scene: Staged) -> Judge:
-    shape = scene.truth.shape
-    middle = ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
-    inside = disc(shape, middle, field_radius_px(scene.calibration) - 2) > 0.5
-    geometry = scene.calibration.geometry
-    return Judge(scene.truth, inside, 2 * geometry.px_per_deg if geometry else 32.0, scene.vessels)
-
-
 def peers(scene: Staged, planner: Planner) -> None:
     """Ours and theirs in one table; theirs at bin 2, on black-subtracted counts, no shading model, no crop model."""
     shape = (scene.truth.shape[0], scene.truth.shape[1])
     judge = judge_of(scene)
     timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "PSNR dB", "PCC", "SSIM", "detail")
-    for recipe in (Recipe("gradient", N), Recipe("variation", N)):
+    for recipe in (Recipe("gradient", N), Recipe("evidence", N), Recipe("variation", N)):
         make = Reconstructor(scene.calibration, shape, planner, SystemClock(), (recipe,), refract=False)
         (ms,) = timing.side_by_side_ms(lambda make=make: make(scene.counts), rounds=3)
         scored(f"ours: {recipe.method}", ms, judge, make(scene.counts).picture)
+    candidates(scene, N, planner)
     y = binned(scene.counts.astype(np.float32) - np.float32(scene.calibration.sensor.black_dn))
     psf = binned(centred(scene.calibration.psfs[0].pixels)) * N**2
     grid = Grid.periodic(shape, N, float("inf"))
@@ -113,23 +103,7 @@ def peers(scene: Staged, planner: Planner) -> None:
     lensless(y, psf, grid, judge)
 
 
-def scored(name: str, ms: float, judge: Judge, picture: Image) -> None:
-    scores = judge(picture)
-    timing.row(name, ms, scores.psnr_db, scores.pcc, scores.ssim, scores.highpass_pcc)
-
-
 def lensless(y: Image, psf: Image, grid: Grid, judge: Judge) -> None:
-    """LenslessPiCam's ADMM in its own environment, which `make bench-peers` makes."""
-    if not PEER_PYTHON.exists():
-        print("LenslessPiCam is left out: `make bench-peers` installs it into .bench-venv")
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        np.savez(Path(folder) / "in.npz", y=y, psf=psf, rounds=LENSLESS_ROUNDS)
-        script = Path(__file__).with_name("lensless_peer.py")
-        done = subprocess.run([PEER_PYTHON, script, folder], capture_output=True, text=True, check=False)
-        if done.returncode:
-            print(f"LenslessPiCam is left out, it ended with: {(done.stderr.splitlines() or ['nothing'])[-1]}")
-            return
-        for k, found in enumerate(json.loads(done.stdout.splitlines()[-1])):
-            picture = to_sensor(np.load(Path(folder) / f"{k}.npy"), grid)
-            scored(f"LenslessPiCam {found['version']} ADMM, {found['rounds']} rounds", found["ms"], judge, picture)
+    """LenslessPiCam's ADMM in its own environment."""
+    for name, ms, picture in lensless_pictures(y, psf, LENSLESS_ROUNDS):
+        scored(name, ms, judge, to_sensor(picture, grid))

@@ -1,31 +1,23 @@
 """How tight the code around the FFT is: ratios to bare planned FFT pairs in the same run."""
 
-import importlib
 from collections.abc import Callable
 from functools import partial
-from types import ModuleType
-
-import numpy as np
-from scipy import fft as scipy_fft
 
 from device.clock import SystemClock
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.sim.staged import Staged
-from device.values import Image
 from tests.bench import timing
+from tests.bench.elsewhere import peer
 
 SHAPE = (1080, 1920)
+PAIRS = (SHAPE, (540, 960), (576, 640))  # the paper's sensor, the same binned by 2, and the tight grid of that
 CLOSED_LIMIT, ROUND_LIMIT = 1.25, 1.6
 CLOSED = (Recipe("tikhonov"), Recipe("gradient"), Recipe("gradient", 2), Recipe("gradient", 3), Recipe("evidence", 2))
 
 
 def closed_forms(scene: Staged, planner: Planner) -> None:
-    """Counts to picture, binning and upsampling included, against one bare pair of the sensor's size.
-
-    The pair is `tikhonov`'s own: two plans of one shape differ by up to a half on one machine, as their arrays come to
-    lie on large pages of memory or on small ones.
-    """
+    """Counts to picture, binning and upsampling included, against one bare pair of the sensor's size."""
     makers = [
         Reconstructor(scene.calibration, SHAPE, planner, SystemClock(), (recipe,), refract=False) for recipe in CLOSED
     ]
@@ -38,6 +30,15 @@ def closed_forms(scene: Staged, planner: Planner) -> None:
     for recipe, ms, ratio in zip(CLOSED, made_ms, ratios, strict=True):
         limit = CLOSED_LIMIT if recipe.method != "evidence" else None  # two pairs and a fit: not one closed form
         timing.row(f"{recipe.method}, bin {recipe.bin}", ms, ratio, limit=limit, value=ratio)
+
+
+def refraction(scene: Staged, planner: Planner) -> None:
+    """The search for the eye's refraction: its share of a budget of one second."""
+    make = Reconstructor(scene.calibration, SHAPE, planner, SystemClock())
+    assert make.refractor is not None
+    (ms,) = timing.side_by_side_ms(partial(make.refractor.find, scene.counts), rounds=7)
+    timing.head("the eye's refraction from one frame", "ms", "share", "limit")
+    timing.row("of a budget of 1 s", ms, ms / 1000, limit=0.3, value=ms / 1000)
 
 
 def rounds(scene: Staged, planner: Planner) -> None:
@@ -58,32 +59,12 @@ def rounds(scene: Staged, planner: Planner) -> None:
         timing.row(f"a round, bin {n}", round_ms, ratio, limit=ROUND_LIMIT, value=ratio)
 
 
-def libraries(planner: Planner) -> None:
-    """The same pair by the libraries that could do it; float32 throughout, one thread each."""
-    pair = planner.plan(SHAPE)
-    image = np.random.default_rng(0).random(SHAPE, np.float32)
-    acts: dict[str, Callable[[], object]] = {
-        "pyFFTW, planned in place": lambda: (pair.forward(), pair.inverse()),
-        "scipy.fft": lambda: scipy_fft.irfft2(scipy_fft.rfft2(image), SHAPE, overwrite_x=True),
-    }
-    ducc0 = installed("ducc0")
-    if ducc0 is not None:
-        acts["ducc0"] = partial(ducc_pair, ducc0, image)
-    times_ms, ratios = timing.against_the_first(*acts.values())
-    timing.head("a real FFT pair, 1080 x 1920, float32", "ms", "ratio")
-    for name, ms, ratio in zip(acts, times_ms, ratios, strict=True):
-        timing.row(name, ms, ratio)
-    if ducc0 is None:
-        print("ducc0 is not installed here, so it is left out")
-
-
-def installed(name: str) -> ModuleType | None:
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError:
-        return None
-
-
-def ducc_pair(ducc0: ModuleType, image: Image) -> Image:
-    spectrum = ducc0.fft.r2c(image, nthreads=1)
-    return np.asarray(ducc0.fft.c2r(spectrum, lastsize=image.shape[1], forward=False, inorm=2, nthreads=1))
+def libraries() -> None:
+    """A real FFT pair by the libraries that could do it, one thread each, in turns, in the peers' environment."""
+    for rows, cols in PAIRS:
+        found = peer("fft_peer.py", str(rows), str(cols))
+        if found is None:
+            return
+        timing.head(f"a real FFT pair, {rows} x {cols}, float32", "ms", "ratio")
+        for name, ms in found.items():
+            timing.row(name, ms, ms / next(iter(found.values())))
