@@ -37,10 +37,10 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
-# Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
 
+# Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.
 	@$(BIN)/python -m venv .bench-venv
 	@.bench-venv/bin/pip install -qq --disable-pip-version-check --no-deps lensless==1.0.8 && \

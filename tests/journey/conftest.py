@@ -2,6 +2,9 @@
 
 import asyncio
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import ExitStack
@@ -31,6 +34,8 @@ from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
 from services.records.store import Store
 
+ROOT = Path(__file__).parents[2]
+COMMAND = str(Path(sys.executable).parent / "diffuscope")
 SMALL_HEAD = """\
 name = "Small simulated head"
 
@@ -259,3 +264,26 @@ def parsed(block: str) -> tuple[int | None, str, dict[str, Any]]:
 @pytest.fixture
 def read_events() -> Callable[..., Any]:
     return lambda *args, **options: asyncio.run(follow(*args, **options))
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The processes' own: caches and captures of a test do not go to the home of whoever runs it."""
+    home = tmp_path_factory.mktemp("home")
+    return os.environ | {"XDG_CACHE_HOME": str(home / "cache"), "XDG_DATA_HOME": str(home / "data")}
+
+
+Diffuscope = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def diffuscope(environment: dict[str, str]) -> Diffuscope:
+    """Run one command as a process."""
+
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [COMMAND, *map(str, words)]
+        return subprocess.run(
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
+
+    return run

@@ -1,24 +1,12 @@
-"""The `diffuscope` command: real processes where they matter, the same `main` in this process where only words do."""
+"""The words of `diffuscope`: real processes where they matter, the same `main` in this process where only words do."""
 
-import http.client
 import json
-import os
-import signal
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
-from io import BytesIO
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
 from PIL import Image
 
 from device.errors import InputError
@@ -26,36 +14,12 @@ from device.images import read_image
 from services.cli import main
 from services.instrument.once import Order, reconstruct_file
 from services.instrument.serve import bound
+from tests.journey.conftest import Diffuscope
 
-ROOT = Path(__file__).parents[2]
-COMMAND = str(Path(sys.executable).parent / "diffuscope")
 REPORT_KEYS = {  # DESIGN.md, "Fixed interfaces"
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
     "noise_dn", "residual", "quality", "warnings",
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The processes' own: caches and captures of a test do not go to the home of whoever runs it."""
-    home = tmp_path_factory.mktemp("home")
-    return os.environ | {"XDG_CACHE_HOME": str(home / "cache"), "XDG_DATA_HOME": str(home / "data")}
-
-
-Diffuscope = Callable[..., subprocess.CompletedProcess[str]]
-
-
-@pytest.fixture(scope="module")
-def diffuscope(environment: dict[str, str]) -> Diffuscope:
-    """Run one command as a process."""
-
-    def run(*words: object) -> subprocess.CompletedProcess[str]:
-        command = [COMMAND, *map(str, words)]
-        return subprocess.run(
-            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False
-        )
-
-    return run
 
 
 @pytest.fixture(scope="module")
@@ -322,101 +286,3 @@ def test_an_address_that_is_not_ours_has_another_remedy() -> None:
             bound(host, 8000)
         assert "--host" in error.value.remedy
         assert "Another program" not in error.value.remedy
-
-
-# The server as a process
-
-
-class Server:
-    """`diffuscope run` on the small head, and ways to talk to it."""
-
-    def __init__(self, head: Path, data: Path, environment: dict[str, str]) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
-        self._command = [COMMAND, "run", "--head", str(head), "--port", str(self.port), "--data", str(data)]
-        self._log = data.with_suffix(".log")
-        self._environment = environment
-
-    @contextmanager
-    def running(self) -> Iterator[subprocess.Popen[bytes]]:
-        with self._log.open("ab") as log:
-            process = subprocess.Popen(self._command, cwd=ROOT, env=self._environment, stdout=log, stderr=log)
-        try:
-            self._wait(process)
-            yield process
-        finally:
-            process.kill()
-            process.wait()
-
-    def said(self) -> str:
-        return self._log.read_text()
-
-    def _wait(self, process: subprocess.Popen[bytes]) -> None:
-        end = time.monotonic() + 40
-        while time.monotonic() < end:
-            assert process.poll() is None, self.said()
-            try:
-                self.ask("GET", "/api/status")
-                return
-            except OSError:
-                time.sleep(0.05)
-        raise AssertionError(f"no answer in 40 s: {self.said()}")
-
-    def ask(self, method: str, path: str, body: Any = None) -> Any:
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(
-            f"http://127.0.0.1:{self.port}{path}", data, {"Content-Type": "application/json"}, method=method
-        )
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            content = answer.read()
-        return json.loads(content) if answer.headers["content-type"] == "application/json" else content
-
-    def listed(self) -> list[str]:
-        return [capture["id"] for capture in self.ask("GET", "/api/captures")["captures"]]
-
-    @contextmanager
-    def listening(self) -> Iterator[http.client.HTTPResponse]:
-        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)) as connection:
-            connection.request("GET", "/api/events")
-            stream = connection.getresponse()
-            assert stream.readline() == b"event: beat\n"
-            yield stream
-
-
-def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_told(
-    head_file: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
-) -> None:
-    server = Server(head_file, tmp_path / "data", environment)
-    with server.running() as process:
-        kept = [server.ask("POST", "/api/captures", {"eye": eye})["id"] for eye in ("OD", "OS")]
-        second = diffuscope("run", "--head", head_file, "--port", server.port, "--data", tmp_path / "other")
-        assert second.returncode == 2
-        assert "cannot be served" in second.stderr
-        assert f"--port {server.port + 1}" in second.stderr
-        assert not (tmp_path / "other").exists()
-        with ThreadPoolExecutor(1) as aside:
-            pressed = aside.submit(server.ask, "POST", "/api/captures", {"eye": "OD"})
-            while server.ask("GET", "/api/status")["state"] != "busy" and not pressed.done():
-                time.sleep(0.002)
-            process.send_signal(signal.SIGKILL)
-            interrupted = pressed.exception(20)
-        assert isinstance(interrupted, (OSError, http.client.HTTPException))
-    with server.running() as process:
-        listed = server.listed()
-        assert listed[-2:] == kept[::-1]
-        for id in listed:  # also a third, if it was killed after it had been kept
-            for name in ("raw.tiff", "picture.png", "quick.jpg", "report.json"):
-                assert server.ask("GET", f"/api/captures/{id}/{name}")
-            assert tifffile.imread(BytesIO(server.ask("GET", f"/api/captures/{id}/raw.tiff"))).shape == (270, 480)
-        assert server.ask("POST", "/api/captures", {"eye": "OD"})["id"] not in listed
-        with ExitStack() as undo:
-            streams = [undo.enter_context(server.listening()) for _ in range(3)]
-            before = time.monotonic()
-            process.send_signal(signal.SIGTERM)
-            process.wait(10)
-            assert time.monotonic() - before < 3
-            for stream in streams:
-                stream.read()  # ended, not cut off: a chunked body that was cut off raises
-    assert "Traceback" not in server.said()
-    assert "Cancel" not in server.said()

@@ -1,0 +1,217 @@
+"""What stands beside the code is judged too: heads, the tree of errors, `make`, the wheel, READMEs, units."""
+
+import ast
+import builtins
+import configparser
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+import typer
+
+from device import errors
+from device.spec import load_head
+from services.cli import app
+from tests.house import BIN, ROOMS, ROOT, Offence, files, judge, nodes, python, text
+
+
+def test_every_head_and_every_scene_loads() -> None:
+    """A head file that does not load is found here, not in the clinic."""
+    tomls = [name for name in files() if re.fullmatch(r"(hardware/heads|device/sim/scenes)/[^/]+\.toml", name)]
+    assert {Path(name).parent.name for name in tomls} == {"heads", "scenes"}
+    names = [load_head(ROOT / name).name for name in tomls]
+    assert len(set(names)) == len(names), "two heads of one name cannot be told apart on the page"
+
+
+def test_the_tree_of_errors_is_the_one_that_is_drawn() -> None:
+    """The drawing in errors.py is what a newcomer reads first."""
+    kinds = {
+        name: kind for name, kind in vars(errors).items() if isinstance(kind, type) and issubclass(kind, Exception)
+    }
+    drawn: dict[str, list[str]] = {}
+    branch: list[str] = []
+    for indent, name, builtin in re.findall(
+        r"^([│├└─ ]*)([A-Z]\w+)(?: \((\w+)\))?(?: {2,}.*)?$", errors.__doc__ or "", re.M
+    ):
+        branch[len(indent) // 4 :] = [name]
+        drawn[name] = [branch[-2] if len(branch) > 1 else "Exception", *([builtin] if builtin else [])]
+    assert drawn == {name: [base.__name__ for base in kind.__bases__] for name, kind in kinds.items()}
+
+
+def test_every_error_has_its_own_code_and_every_leaf_its_own_remedy() -> None:
+    """Each leaf tells the operator what to do; the code finds it in the log."""
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, Exception)]
+    assert len({kind.__dict__["code"] for kind in kinds}) == len(kinds)
+    for leaf in (kind for kind in kinds if not kind.__subclasses__()):
+        assert re.fullmatch(r"[A-Z].{20,}\.", leaf.__dict__.get("default_remedy", "")), f"{leaf.__name__} has no remedy"
+
+
+def new_errors(source: str) -> Iterator[Offence]:
+    for node in nodes(source):
+        if isinstance(node, ast.ClassDef):
+            bases = {ast.unparse(base).split(".")[-1] for base in node.bases}
+            if bases & ({*vars(errors)} | {n for n in vars(builtins) if n.endswith(("Error", "Exception"))}) - {
+                "ClassVar"
+            }:
+                yield node.lineno, node.name, "an error outside the tree"
+
+
+def test_errors_grow_on_one_tree() -> None:
+    """The API maps class to status in one table, which can only be whole if the tree is in one place."""
+    rooms = [name for name in python("device", "services") if name != "device/errors.py"]
+    judge(new_errors, rooms, {}, "errors live in device/errors.py")
+
+
+def make_targets() -> dict[str, str]:
+    """The words of `make`, each with its explanation."""
+    rows = re.findall(r"^([a-z][\w-]*):[^=\n]*?(?:## *(.*))?$", text("Makefile"), re.M)
+    return dict(rows)
+
+
+def test_every_make_word_explains_itself() -> None:
+    """`make help` prints them; a word without a sentence is a riddle."""
+    targets = make_targets()
+    assert {"run", "test", "bench", "lint", "clean"} <= set(targets)
+    assert not [name for name, sentence in targets.items() if not re.fullmatch(r"[A-Z].{10,}\.", sentence)]
+    phony = re.search(r"^\.PHONY: (.*)$", text("Makefile"), re.M)
+    assert phony is not None
+    assert set(phony[1].split()) == set(targets)
+
+
+def test_make_clean_removes_all_that_git_ignores() -> None:
+    """What git is told to overlook was made here, and can be made again."""
+    recipe = text("Makefile").split("\nclean:")[1].split("\n\n")[0]
+    assert not [line for line in text(".gitignore").split() if line.rstrip("/") not in recipe]
+
+
+def test_the_wheel_holds_what_the_instrument_needs_at_run_time(tmp_path: Path) -> None:
+    """Page, migrations, scenes and heads are not Python, and are easily left behind."""
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
+        held = set(wheel.namelist())
+    needed = {name for name in files() if re.match(r"(device|services|web)/(?!pictures/)|hardware/heads/", name)}
+    needed |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
+    assert needed - held == set()
+
+
+# READMEs
+
+
+def readmes() -> list[str]:
+    return [name for name in files() if Path(name).name == "README.md"]
+
+
+def code_in(markdown: str) -> list[str]:
+    """Every line of fenced code, continued lines joined, and every code span."""
+    fences = re.findall(r"^```\w*\n(.*?)^```", markdown, re.M | re.S)
+    lines = [line for fence in fences for line in fence.replace("\\\n", " ").splitlines()]
+    return lines + re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", markdown, flags=re.M | re.S))
+
+
+def commands() -> dict[str, set[str]]:
+    """The words of `diffuscope`, each with its options."""
+    group = typer.main.get_group(app)
+    return {name: {"--help"}.union(*(p.opts for p in command.params)) for name, command in group.commands.items()}
+
+
+def unknown_words(command_line: str) -> list[str]:
+    """What a command line says that `diffuscope` does not know."""
+    known = commands()
+    found = re.search(r"\bdiffuscope ([a-z][\w-]*)(.*)", command_line)
+    if found is None or found[1] not in known:
+        return [found[1]] if found else []
+    return [o for o in re.findall(r"(?<!\S)--?[a-z][\w-]*", found[2]) if o not in known[found[1]]]
+
+
+def test_a_wrong_command_line_is_noticed() -> None:
+    assert unknown_words("diffuscope fly") == ["fly"]
+    assert unknown_words(".venv/bin/diffuscope run --port 1 --fly=1 -y") == ["--fly", "-y"]
+    assert unknown_words("diffuscope reconstruct a.tiff --psf p.tiff -o out.png") == []
+
+
+@pytest.mark.parametrize("readme", readmes())
+def test_commands_in_a_readme_exist(readme: str) -> None:
+    """The first command that fails is the last one that a newcomer tries."""
+    code = code_in(text(readme))
+    words = [word for line in code for word in re.findall(r"(?:^|\s)make ([a-z][\w-]*)", line)]
+    assert not [word for word in words if word not in make_targets()]
+    assert not [word for line in code for word in unknown_words(line)]
+
+
+def named_paths(markdown: str) -> set[str]:
+    """Links and pictures, spans that begin with a room, and the first column of a table of files, rooms or folders."""
+    named = set(re.findall(r"\]\((?!https?:|#)([^)]+)\)", markdown))
+    named |= {span for span in re.findall(r"`([^`\s<>{}]+)`", markdown) if span.split("/")[0] in ROOMS and "/" in span}
+    for table in re.findall(r"^\| *(?:file|room|folder)s? *\|.*\n\|.*\n((?:\|.*\n?)+)", markdown, re.M):
+        for row in table.splitlines():
+            named |= set(re.findall(r"`([^`\s]+)`", row.split("|")[1]))
+    return named
+
+
+@pytest.mark.parametrize("readme", readmes())
+def test_paths_in_a_readme_exist(readme: str) -> None:
+    """A map with a street that is not there is worse than none."""
+    there = {str(parent) for name in files() for parent in (Path(name), *Path(name).parents)}
+    here = Path(readme).parent
+    missing = []
+    for path in sorted(named_paths(text(readme))):
+        at = [str(base / path.split("#")[0]) for base in (Path(), here)]
+        if not any(place in there or any(fnmatch(one, place) for one in there) for place in at):
+            missing.append(path)
+    assert not missing, f"{readme} names what is not there"
+
+
+def test_every_room_has_a_readme() -> None:
+    """Each room has a short README: its map, how to extend it, dated decisions."""
+    there = {str(parent) for name in files() for parent in Path(name).parents}
+    inner = {str(Path(n).parent) for n in files() if re.fullmatch(r"(device|services)/\w+/__init__\.py", n)}
+    rooms = {room for room in ROOMS if room in there} | inner
+    assert not sorted(room for room in rooms if f"{room}/README.md" not in files()), "rooms without a README"
+
+
+@pytest.mark.parametrize("room", [room for room in ROOMS if f"{room}/README.md" in files()])
+def test_a_map_names_every_folder(room: str) -> None:
+    """A folder that is not on the map was put there without saying what for."""
+    there = {str(parent) for name in files() for parent in Path(name).parents}
+    folders = {path for path in there if Path(path).parent == Path(room)}
+    assert not [f for f in folders if f"`{Path(f).name}/" not in text(f"{room}/README.md")], f"folders of {room}"
+
+
+# systemd
+
+HARDENING = re.findall(
+    r"\w+",
+    """
+    NoNewPrivileges ProtectHome PrivateTmp ProtectKernelTunables ProtectKernelModules ProtectKernelLogs
+    ProtectControlGroups ProtectClock RestrictSUIDSGID LockPersonality RestrictRealtime RestrictNamespaces
+    """,
+)
+
+
+@pytest.mark.parametrize("name", [name for name in files() if name.endswith(".service")])
+def test_a_unit_starts_what_exists_restarts_it_and_locks_it_in(name: str, tmp_path: Path) -> None:
+    """Checked by systemd where it is installed; where it is not, at least sections, keys and the command line are."""
+    unit = configparser.ConfigParser(interpolation=None, delimiters="=", comment_prefixes="#")
+    unit.optionxform = str  # type: ignore[assignment, method-assign]  # keys of systemd are case-sensitive
+    unit.read_string(text(name))
+    assert unit.sections() == ["Unit", "Service", "Install"]
+    service = unit["Service"]
+    program, *words = shlex.split(service["ExecStart"])
+    assert not unknown_words(shlex.join(["diffuscope", *words]))
+    assert service["Restart"] == "always"
+    assert not [key for key in HARDENING if service.get(key) != "yes"]
+    assert service["ProtectSystem"] == "strict"
+    assert "MemoryDenyWriteExecute" not in service, "numba compiles at run time, so memory must become executable"
+    if analyze := shutil.which("systemd-analyze"):
+        here = tmp_path / Path(name).name  # the same unit, with the program that this machine has
+        here.write_text(text(name).replace(program, str(BIN / "diffuscope")), encoding="utf-8")
+        done = subprocess.run([analyze, "verify", "--man=no", here], capture_output=True, text=True)
+        assert (done.returncode, done.stdout + done.stderr) == (0, "")
