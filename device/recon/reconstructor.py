@@ -146,6 +146,7 @@ class Reconstructor:
         """Run on noise, so that the first press meets compiled code, touched memory and a known cost."""
         noise = np.random.default_rng(0).integers(100, 200, self.shape, dtype=np.uint16)
         self(noise, rounds=1)  # compiles, where no compiled code is kept
+        self(noise, np.zeros_like(noise), quick=True)  # with a dark frame it is other code
         for rung in self.rungs:
             rung.start_cost, rung.round_cost, rung.finish_cost = Cost(), Cost(), Cost()
         self._find_cost = Cost()
@@ -323,7 +324,12 @@ class _Climb:
 
 
 def _plane(image: Pixels, c: int) -> Pixels:
+    """One channel, read-only: to compiled code that is part of the type, and only one of the two is compiled early."""
     image = image if image.ndim == 2 else image[..., c]
+    plane: Pixels
     if image.dtype == np.uint16:
-        return np.ascontiguousarray(image, np.uint16)
-    return np.ascontiguousarray(image, np.float32)
+        plane = np.ascontiguousarray(image, np.uint16)[:]
+    else:
+        plane = np.ascontiguousarray(image, np.float32)[:]
+    plane.flags.writeable = False  # of this view, not of the caller's array
+    return plane
