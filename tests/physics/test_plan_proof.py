@@ -97,7 +97,7 @@ def pictured(of: World, calibration: Calibration) -> Image:
     """What the product shows: a lit and a dark frame through the head's own calibration."""
     recipe = Recipe("evidence", working_bin(calibration.psfs[0]))
     of.frames = 0  # the same noise in both worlds
-    make = Reconstructor(calibration, of.shape, scenes.PLANNER, VirtualClock(), (recipe,))
+    make = Reconstructor(calibration, of.shape, scenes.PLANNER, VirtualClock(), (recipe,), refract=False)
     return make(exposed(of), exposed(of, lit=False)).picture
 
 
