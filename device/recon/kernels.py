@@ -13,6 +13,7 @@ from device.values import Image
 Single = np.float32
 Series = NDArray[np.float64]
 Box = tuple[int, int, int, int]
+Axes = tuple[Image, Image]
 Sums = tuple[float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
@@ -112,16 +113,25 @@ def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[i
             out[at[0] + i, at[1] + j] = (y[i, j] - a32 * flat[i, j] - b32) * good[i, j]
 
 
+FLATTEST = 1e-6  # added to |D|^2 where it divides: less than that of one cycle across any frame
+
+
 @_jit
-def wiener(spectrum: Spectrum, otf: Spectrum, row_g: Image, col_g: Image, floor: float, scale: float) -> None:
-    """Multiply a spectrum in place by scale conj(H) / (|H|^2 + row_g + col_g + floor)."""
+def wiener(
+    spectrum: Spectrum, otf: Spectrum, gradient: Axes, slope: float, floor: float, doubt: float, scale: float
+) -> None:
+    """Multiply a spectrum in place by scale conj(H) / (|H|^2 + slope |D|^2 + floor + doubt / |D|^2).
+
+    `gradient` holds |D|^2 as its rows' and its columns' part.
+    """
     rows, cols = spectrum.shape
-    floor32, scale32 = np.float32(floor), np.float32(scale)
+    slope32, floor32, doubt32, scale32 = np.float32(slope), np.float32(floor), np.float32(doubt), np.float32(scale)
     for i in range(rows):
         for j in range(cols):
             h = otf[i, j]
+            steep = gradient[0][i] + gradient[1][j] + np.float32(FLATTEST)
             power = h.real * h.real + h.imag * h.imag
-            weight = scale32 / (power + row_g[i] + col_g[j] + floor32)
+            weight = scale32 * steep / ((power + slope32 * steep + floor32) * steep + doubt32)  # one division
             s = spectrum[i, j]
             spectrum[i, j] = complex(
                 (s.real * h.real + s.imag * h.imag) * weight, (s.imag * h.real - s.real * h.imag) * weight
@@ -140,13 +150,13 @@ def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
 
 @_jit
 def cross_validation(
-    power: Series, prior: Series, delta: float, energies: Series, ladder: Series, scores: Series
+    power: Series, prior: Series, delta: Series, energies: Series, ladder: Series, scores: Series
 ) -> None:
     """scores = n sum(phi^2 |Y|^2) / (sum phi)^2 for each mu; phi = reg / (|H|^2 + reg), reg = mu R + delta."""
     for k in range(ladder.size):
         misfit = freedom = 0.0
         for i in range(power.size):
-            reg = ladder[k] * prior[i] + delta
+            reg = ladder[k] * prior[i] + delta[i]
             phi = reg / (power[i] + reg)
             misfit += phi * phi * energies[i]
             freedom += phi
