@@ -50,8 +50,9 @@ class ClosedForm:
         if mu is not None and not 0 < mu < float("inf"):
             raise SettingError(f"a weight mu of {mu} is not a positive number", "Leave mu out: the frame chooses it.")
         self.model, self.prior, self.mu = model, prior, mu
-        self.x: Image = np.zeros(model.grid.shape, np.float32)
         self.facts: dict[str, Any] = {}
+        whole = model.grid.window == model.grid.shape
+        self.inbox: Image | None = model.fft.space if whole and not prior.subtract_flat else None
         self.refocus()
 
     def refocus(self) -> None:
@@ -64,17 +65,12 @@ class ClosedForm:
         self._delta = self.doubt / (self.sample.gradient + kernels.FLATTEST)
 
     def start(self, frame: Linear) -> None:
-        """Solve: `x` is the picture on the grid, `facts` what was chosen and the number that decided.
+        """Solve, but for the flat field; `facts` is what was chosen and the number that decided.
 
         Facts: `mu` (relative to |H|^2), `gcv`, `flat_dn`, `background_dn`, `noise_dn`, `residual` (rms over noise).
         """
         model, prior, size = self.model, self.prior, self.model.grid.size
-        sums = kernels.dots(frame.y, model.flat, frame.good)
-        level, background = flat_fit(sums) if prior.subtract_flat else (0.0, 0.0)
-        if model.fade is not None:
-            np.multiply(frame.good, model.fade, out=frame.good)
-        model.grid.clear_outside(model.fft.space)
-        kernels.residual(frame.y, model.flat, frame.good, level, background, model.grid.at, model.fft.space)
+        level, background = self._take_in(frame)
         spectrum = model.fft.forward()
         energies = self.sample.energies(spectrum)
         share = model.grid.window[0] * model.grid.window[1] / size
@@ -83,20 +79,35 @@ class ClosedForm:
         misfit = self.sample.misfit(mu * self._weights + self._delta, energies, size)
         gradient = model.row_gradient, model.col_gradient
         kernels.wiener(spectrum, model.otf, gradient, mu * prior.slope, mu * prior.floor, self.doubt, 1 / size)
-        kernels.add_flat(model.fft.inverse(), model.mask, level, model.box, self.x)
+        model.fft.inverse()
         self.facts = {
             "mu": mu, "gcv": score, "psf_error": prior.psf_error, "flat_dn": level, "background_dn": background,
-            "noise_dn": noise, "mean_dn": sums[1] / sums[4] if sums[4] > 0 else 0.0,
+            "noise_dn": noise, "mean_dn": frame.mean_dn,
             "residual": misfit / (noise * share**0.5) if noise > 0 else 0.0,
         }  # fmt: skip
+
+    def _take_in(self, frame: Linear) -> tuple[float, float]:
+        """Put what the flat field leaves of the frame before the FFT; the flat's level and the background, in DN."""
+        model, space = self.model, self.model.fft.space
+        model.grid.clear_outside(space)
+        if not self.prior.subtract_flat:
+            if frame.y is not self.inbox:
+                space[model.grid.slices] = frame.y  # 0 where nothing was seen
+            if model.fade is not None:
+                space[model.grid.slices] *= model.fade
+            return 0.0, 0.0
+        level, background = flat_fit(kernels.dots(frame.y, model.flat, frame.good))
+        if model.fade is not None:
+            np.multiply(frame.good, model.fade, out=frame.good)
+        kernels.residual(frame.y, model.flat, frame.good, level, background, model.grid.at, space)
+        return level, background
 
     def step(self) -> None:
         """Nothing more to do: it is a closed form."""
 
     def finish(self, out: Image) -> None:
-        """Hand the picture over."""
-        top, bottom, left, right = self.model.box
-        out[top:bottom, left:right] = self.x[top:bottom, left:right]
+        """Hand the picture over: the flat goes back."""
+        kernels.add_flat(self.model.fft.space, self.model.mask, self.facts["flat_dn"], self.model.box, out)
 
     def _weight_of_the_prior(self, energies: Energies) -> tuple[float, float | None]:
         if self.mu is not None:

@@ -24,28 +24,29 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 @_jit
 def linearise(
     counts: Pixels, dark: Pixels, gain: Image, white_dn: float, first: tuple[int, int], n: int, out: Image, good: Image
-) -> tuple[int, int]:
+) -> tuple[int, int, float]:
     """Counts to linear DN from pixel `first` on, n x n to one: out = mean of (counts - dark) * gain over good pixels.
 
     `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
-    `good` becomes the good share of each block, 0 to 1; a block without a good pixel becomes 0. Returns the numbers of
-    saturated and of good pixels.
+    A `dark` or a `gain` of one row holds for all rows. `good` becomes the good share of each block, 0 to 1; a block
+    without a good pixel becomes 0. Returns the numbers of saturated and of good pixels, and the light on these in DN.
     """
     rows, cols = out.shape
     wide = cols * n
     total, used = np.empty(wide, np.float32), np.empty(wide, np.float32)
-    saturated = believed = np.float64(0)
+    saturated = believed = light = np.float64(0)
     for i in range(rows):
         if n == 1:
             total, used = out[i], good[i]
         total[:], used[:] = 0, 0
         for a in range(first[0] + i * n, first[0] + i * n + n):
             begin, end = first[1], first[1] + wide
-            saturated += _add_row(
-                counts[a][begin:end], dark[a][begin:end], gain[a][begin:end], np.float32(white_dn), total, used
-            )
-        believed += _bin_row(total, used, n, out[i], good[i])
-    return int(saturated), int(believed)
+            dark_row, gain_row = dark[a % len(dark)][begin:end], gain[a % len(gain)][begin:end]
+            saturated += _add_row(counts[a][begin:end], dark_row, gain_row, np.float32(white_dn), total, used)
+        row = _bin_row(total, used, n, out[i], good[i])
+        believed += row[0]
+        light += row[1]
+    return int(saturated), int(believed), float(light)
 
 
 @_jit
@@ -62,13 +63,14 @@ def _add_row(counts: Pixels, dark: Pixels, gain: Image, white_dn: Single, total:
 
 
 @_jit
-def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> Single:
+def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tuple[Single, Single]:
     zero, one = np.float32(0), np.float32(1)
-    believed = zero
+    believed = light = zero
     if n == 1:  # `total` and `used` are `out` and `good` themselves
         for j in range(good.size):
             believed += good[j]
-        return believed
+            light += out[j]
+        return believed, light
     for j in range(out.size):
         v = u = zero
         for b in range(j * n, j * n + n):
@@ -77,7 +79,8 @@ def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> Sing
         out[j] = v / max(u, one)
         good[j] = u / np.float32(n * n)
         believed += u
-    return believed
+        light += v
+    return believed, light
 
 
 @_jit

@@ -16,10 +16,13 @@ from device.values import Calibration, Image
 
 
 class Solver(Protocol):
-    """One planned way from a linear frame to a picture; the caller owns the loop, and so the clock."""
+    """One planned way from a linear frame to a picture; the caller owns the loop, and so the clock.
+
+    `inbox` is where it would like to find the frame, if it matters to it: there nothing has to be copied.
+    """
 
     model: Model
-    x: Image
+    inbox: Image | None
     facts: dict[str, Any]
     rounds: int
 
@@ -27,7 +30,7 @@ class Solver(Protocol):
         """Measure anew what depends on the model's OTF, which has changed."""
 
     def start(self, frame: Linear) -> None:
-        """Take a frame and make a first picture in `x`."""
+        """Take a frame and make a first picture."""
 
     def step(self) -> None:
         """Make it better by one round; called at most `rounds` times."""

@@ -23,7 +23,9 @@ def solved(psf: Image, y: Image, prior: Prior, mu: float, **changes: object) -> 
     model.fade = None
     solver = ClosedForm(model, prior, mu)
     solver.start(Preparer(cal, model.grid)(y))
-    return solver.x
+    out = np.zeros(model.grid.shape, np.float32)
+    solver.finish(out)
+    return out
 
 
 def scene(rows: int, cols: int, seed: int) -> tuple[Image, Image]:
