@@ -77,11 +77,11 @@ METHODS = {
     for method in (
         Method(
             "tikhonov", "the paper's closed form: periodic, L2 prior, mu by cross-validation",
-            1, 0, 0, 7, True, lambda model, _, __: ClosedForm(model, TIKHONOV),
+            1, 0, 0, 6, True, lambda model, _, __: ClosedForm(model, TIKHONOV),
         ),
         Method(
             "gradient", "flat field taken out first, gradient prior with an L2 floor, mu by cross-validation",
-            1, 0, 0, 7, False, lambda model, _, __: ClosedForm(model, GRADIENT),
+            1, 0, 0, 6, False, lambda model, _, __: ClosedForm(model, GRADIENT),
         ),
         Method(
             "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
