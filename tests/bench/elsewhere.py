@@ -36,7 +36,7 @@ def peer(script: str, *words: str) -> Any:
 
 
 def lensless_pictures(y: Image, psf: Image, rounds: tuple[int, ...]) -> list[tuple[str, float, float, Image]]:
-    """Name, milliseconds, peak MB and picture of LenslessPiCam's ADMM after each number of rounds, one channel or three."""
+    """Name, milliseconds, peak MB and picture of LenslessPiCam's ADMM for each number of rounds; 1 or 3 channels."""
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder) / "in.npz", y=y, psf=psf, rounds=rounds)
         found = peer("lensless_peer.py", folder) or []
