@@ -10,11 +10,15 @@ PORT ?= 8000
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
 
-.venv/ready: requirements.lock pyproject.toml
+# The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
+PI_LOCK := tests/ports/emulators/requirements.lock
+
+.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml
 	@echo "Setting up .venv (a minute, once)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Diffuscope needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -m venv .venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
 	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
 	@$(BIN)/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 

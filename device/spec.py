@@ -21,7 +21,7 @@ class CameraSpec(Table):
     `sensor` names a profile of `device/sensors.py`, which fills in what this table does not say itself.
     """
 
-    backend: Literal["sim", "replay"]
+    backend: Literal["sim", "replay", "picamera2", "v4l2"]
     sensor: str | None = None
     rows: int = Field(ge=1, le=8192)
     cols: int = Field(ge=1, le=8192)

@@ -104,7 +104,7 @@ def test_a_refractive_error_warps_the_caustic_exactly(eye):
 
 @pytest.mark.parametrize("m_dpt", [10.0, -10.0])
 def test_the_warp_holds_to_ten_dioptres(m_dpt):
-    """optics.md 2.4 gives 0.999; three diffusers give 0.99897 to 0.9992: the plane moves a little with the refraction."""
+    """optics.md 2.4 gives 0.999; three diffusers 0.99897 to 0.9992: the plane moves a little with the refraction."""
     found = []
     for seed in (1, 2, 3):
         relaxed, strained = (caustic_on(GRID, PAPER, seed, Refraction(m)) for m in (0.0, m_dpt))

@@ -1,14 +1,17 @@
 """The parts under contract. A new camera or lamp joins by one line in IMPLEMENTATIONS."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
-from device.clock import Clock, VirtualClock
+from device.clock import Clock, SystemClock, VirtualClock
+from device.drivers.pi_camera import PiCamera
 from device.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
@@ -16,6 +19,9 @@ from device.sim.light import SimLight
 from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
 from device.spec import InstrumentSpec, ReplaySpec, load_head
+from tests.ports.emulators.timeline import Timeline
+
+sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
@@ -58,17 +64,35 @@ def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
     return Rig(camera, lamp, clock, recorded=True)
 
 
+def pi_rig(*, wide: bool = False) -> Rig:
+    """The real picamera2 over an emulated libcamera, whose sensor looks at a simulated world in real time."""
+    import libcamera
+
+    from tests.ports.emulators.memory import MemoryAllocator
+    from tests.ports.emulators.sensor import Sensor
+
+    timeline, clock = Timeline(), SystemClock()
+    spec = small_head().camera.model_copy(update={"backend": "picamera2", "sensor": "imx296", "exposure_s": 0.02})
+    libcamera.plugged.append(Sensor(World(small_head(), clock), timeline, wide=wide))
+    light = SimLight(timeline)
+    camera = PiCamera(spec, light, clock, allocator=MemoryAllocator(), simulated=True)
+    return Rig(camera, light, clock)
+
+
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "sim": sim_rig,
     "sim, guarded": guarded_rig,
     "replay": replay_rig,
-    # drivers over a fake bus join here (over real parts: tests/rig)
+    "picamera2 as on a Pi 4": pi_rig,
+    "picamera2 as on a Pi 5": partial(pi_rig, wide=True),
 }
 
 
 @pytest.fixture(params=sorted(IMPLEMENTATIONS), scope="module")
 def rig_of_module(request):
-    return IMPLEMENTATIONS[request.param]()
+    rig = IMPLEMENTATIONS[request.param]()
+    yield rig
+    rig.camera.close()
 
 
 @pytest.fixture
@@ -90,4 +114,7 @@ def live_rig(rig):
 @pytest.fixture(params=sorted(IMPLEMENTATIONS))
 def fresh_rig(request):
     """A rig of one's own, to be broken or closed."""
-    return IMPLEMENTATIONS[request.param]()
+    rig = IMPLEMENTATIONS[request.param]()
+    yield rig
+    rig.light.off()
+    rig.camera.close()
