@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test browser lint bench bench-retinas bench-peers lock clean
+.PHONY: help run test browser buses lint bench bench-kills bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -25,12 +25,16 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
-test: .venv/ready browser ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser
+test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser --ignore tests/ports
+	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
+
+buses: ## Install umockdev (Debian packages) where it is missing.
+	@tests/ports/emulators/install
 
 lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/ruff check --quiet .
@@ -40,6 +44,9 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 
 bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
+
+bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
+	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"

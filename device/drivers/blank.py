@@ -20,6 +20,7 @@ import time
 SPEED_HZ = 4_000_000
 WR_MODE, WR_MAX_SPEED_HZ = 0x40016B01, 0x40046B04  # <linux/spi/spidev.h>: _IOW('k', 1, u8), _IOW('k', 4, u32)
 LEDS = 64
+TRIES, AGAIN_S = 200, 0.05
 
 
 def dark_frame(leds: int) -> bytes:
@@ -41,6 +42,17 @@ def blank(device: str, leds: int) -> None:
         os.close(wire)
 
 
+def insist(device: str, leds: int) -> None:
+    """Darken, again and again while the bus does not listen. Raises OSError when it never does."""
+    for _ in range(TRIES):
+        try:
+            blank(device, leds)
+            return
+        except OSError:
+            time.sleep(AGAIN_S)
+    blank(device, leds)
+
+
 def guard(device: str, leds: int) -> None:
     """Darken when a lease runs out, and when whoever holds the other end of standard input is gone."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -50,12 +62,12 @@ def guard(device: str, leds: int) -> None:
         patience_s = None if until_s is None else max(0.0, until_s - time.monotonic())
         ready, _, _ = select.select([0], [], [], patience_s)
         if not ready:
-            blank(device, leds)
+            insist(device, leds)
             until_s = None
             continue
         said = os.read(0, 4096).decode("ascii")
         if not said:
-            blank(device, leds)
+            insist(device, leds)
             return
         last = said.split("\n")[-2]
         until_s = time.monotonic() + float(last.split()[1]) if last.startswith("lit") else None

@@ -4,6 +4,7 @@ import select
 import subprocess
 import sys
 from pathlib import Path
+from types import TracebackType
 
 from device.errors import LightFault
 
@@ -38,12 +39,20 @@ class Guardian:
         self._tell("dark\n")
 
     def close(self) -> None:
-        """Let it go: it darkens once more and ends."""
+        """Let it go: it darkens once more and ends; closing twice is harmless."""
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         self._child.stdin.close()
         self._child.wait(timeout=5)
         self._child.stdout.close()
+
+    def __enter__(self) -> "Guardian":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def _tell(self, words: str) -> None:
         assert self._child.stdin is not None

@@ -95,7 +95,7 @@ class Apa102Ring:
     def _send(self, frame: bytes) -> None:
         try:
             self._wire.writebytes2(frame)
-        except OSError as error:
+        except (OSError, SystemError) as error:  # spidev answers a short write with the latter
             raise LightFault(f"the lamp's bus does not take its message: {error}") from error
 
 
