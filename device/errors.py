@@ -13,7 +13,9 @@ DiffuscopeError
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
 │   ├── BusFault                 a chip on the I2C bus does not answer
-│   └── HeadMismatch             the head's memory names another head
+│   ├── HeadMismatch             the head's memory names another head
+│   ├── TooHot                   the head is too warm to go on
+│   └── PowerLow                 the battery is nearly empty
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -126,6 +128,20 @@ class HeadMismatch(HardwareError):
 
     code = "head.mismatch"
     default_remedy = "This head was calibrated as another one. Do not take pictures; call the technician."
+
+
+class TooHot(HardwareError):
+    """The head is too warm to go on."""
+
+    code = "head.hot"
+    default_remedy = "The device is too warm. Turn it off, and let it cool in the shade."
+
+
+class PowerLow(HardwareError):
+    """The battery is nearly empty."""
+
+    code = "power.low"
+    default_remedy = "The battery is nearly empty. Charge the device before the next picture."
 
 
 class Busy(DiffuscopeError):

@@ -97,6 +97,18 @@ class LightSpec(Table):
     max_on_s: float = Field(default=1.0, gt=0, le=30)
 
 
+class BusSpec(Table):
+    """The chips on I2C, by address; what is not named is not there. Beyond the limits no picture is taken."""
+
+    backend: Literal["sim", "smbus"]
+    device: str = Field(default="/dev/i2c-1", pattern=r"^/dev/i2c-\d+$")
+    thermometer: int | None = Field(default=None, ge=0x08, le=0x77)  # TMP117
+    battery: int | None = Field(default=None, ge=0x08, le=0x77)  # MAX17048
+    memory: int | None = Field(default=None, ge=0x08, le=0x77)  # 24LC32
+    warmest_c: float = Field(default=55.0, gt=0, le=100)
+    emptiest: float = Field(default=0.05, ge=0, lt=1)
+
+
 class OpticsSpec(Table):
     """The light path from the eye to the sensor, by default the paper's: "Optical design" and "Hardware design"."""
 
@@ -131,6 +143,7 @@ class InstrumentSpec(Table):
     camera: CameraSpec
     light: LightSpec
     optics: OpticsSpec | None = None
+    bus: BusSpec | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 
