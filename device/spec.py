@@ -151,6 +151,8 @@ class InstrumentSpec(Table):
 def load_head(path: Path) -> InstrumentSpec:
     """Read a head TOML (`hardware/heads/*.toml`); a missing table that its backends need is refused."""
     spec = load_toml(path, InstrumentSpec)
+    if spec.light.backend == "apa102" and spec.camera.backend != "replay" and spec.optics is None:
+        raise SpecError(f"{path}: a head needs the table [optics]")
     if "sim" in (spec.camera.backend, spec.light.backend) and (spec.sim is None or spec.optics is None):
         raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
     if spec.light.backend == "apa102" and spec.light.chain is None:

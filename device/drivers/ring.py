@@ -67,8 +67,10 @@ class Apa102Ring:
         return RingLit(self, glow)
 
     def off(self) -> None:
-        """Be dark; always allowed, harmless when it is dark already. Raises LightFault if the chain does not listen."""
+        """Be dark; always allowed, harmless when dark or closed already. LightFault if the chain does not listen."""
         with self._lock:
+            if self._wire is None:
+                return
             self._glow = None
             self._send(self._dark)
             self._send(self._dark)

@@ -3,7 +3,7 @@
 Prints the root that UMOCKDEV_DIR must name. Every message on SPI is written to FOLDER/spi.jsonl with its moment
 (CLOCK_MONOTONIC, seconds) and the LEDs that shine after it. FOLDER/faults holds what is broken, one word to a line:
 "spi.short" (half a message arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is
-dead), "power" (brown-out: the chain loses its latch).
+dead), "power" (brown-out: the chain loses its latch), "memory.blank" (the head's memory is as from the shop).
 """
 
 import json
@@ -128,7 +128,10 @@ class I2c(Bus):
         return -1, ENOTTY
 
     def chip(self, address):
-        return None if "i2c.silent" in faults() else self.chips.get(address)
+        broken = faults()
+        if "memory.blank" in broken:
+            self.chips[0x50] = Eeprom()
+        return None if "i2c.silent" in broken else self.chips.get(address)
 
     def messages(self, arg):
         head = arg.resolve(0, 16)
