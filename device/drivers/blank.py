@@ -67,7 +67,7 @@ def guard(device: str, leds: int) -> None:
             continue
         said = os.read(0, 4096).decode("ascii")
         if not said:
-            insist(device, leds)
+            (blank if until_s is None else insist)(device, leds)
             return
         last = said.split("\n")[-2]
         until_s = time.monotonic() + float(last.split()[1]) if last.startswith("lit") else None
