@@ -2,7 +2,7 @@
 
 import difflib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -10,7 +10,7 @@ from device.errors import SpecError
 from device.scene import SimSpec
 from device.sensors import SENSORS
 from device.tables import Table, load_toml
-from device.values import Geometry
+from device.values import Colour, Geometry
 
 _NAMES = f"known are {', '.join(sorted(SENSORS))}"
 
@@ -56,12 +56,58 @@ class CameraSpec(Table):
 
 
 class LightSpec(Table):
-    """The LED ring: colours for the picture and for aiming, and how long the guard lets it shine at once."""
+    """The LED ring: which driver answers for it, its colours, its place on the board, how long it may shine.
 
-    backend: Literal["sim", "replay"]
+    The ring is that of `ring_mm`, or the widest that passes a pupil of `pupil_mm` through the relay.
+    `led_output` says how bright each LED of the board is beside the others: the driver evens them out.
+    """
+
+    backend: Literal["sim", "replay", "apa102"]
     colour: Literal["red", "green", "blue"] = "green"
     preview_colour: Literal["red", "green"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
+    spi_device: str = "/dev/spidev0.0"
+    rows: int = Field(default=8, ge=1, le=32)
+    cols: int = Field(default=8, ge=1, le=32)
+    pitch_mm: float = Field(default=3.175, gt=0, le=50)
+    led_mm: float = Field(default=2.0, gt=0, le=50)
+    centre: tuple[float, float] | None = None  # (row, col) where the axis meets the board, from LED 0; None: its middle
+    ring_mm: float = Field(default=10.04, gt=0, le=200)
+    ring_tolerance_mm: float = Field(default=0.05, ge=0, le=10)
+    pupil_mm: float | None = Field(default=None, gt=0, le=12)
+    relay_magnification: float = Field(default=1.0, gt=0, le=10)
+    led_output: tuple[float, ...] = ()
+    red_um: float = Field(default=0.6225, gt=0.58, lt=0.7)  # the family's typical values: measure yours
+    green_um: float = Field(default=0.5225, gt=0.49, lt=0.58)
+    blue_um: float = Field(default=0.47, gt=0.4, lt=0.49)
+    max_current_ma: float = Field(default=500.0, gt=0, le=4000)
+    heartbeat_gpio: int | None = Field(default=None, ge=0, le=64)
+    gpio_chip: str = "/dev/gpiochip0"
+
+    @property
+    def leds(self) -> int:
+        """How many LEDs the chain has."""
+        return self.rows * self.cols
+
+    @property
+    def axis(self) -> tuple[float, float]:
+        """(row, col) where the axis meets the board, counted from LED 0."""
+        return self.centre or ((self.rows - 1) / 2, (self.cols - 1) / 2)
+
+    def peak_um(self, colour: Colour) -> float:
+        """The wavelength at which a colour of the LEDs is brightest."""
+        return {"red": self.red_um, "green": self.green_um, "blue": self.blue_um}[colour]
+
+    def colour_near(self, wavelength_um: float) -> Colour:
+        """The colour of the LEDs whose wavelength is nearest."""
+        colours: tuple[Colour, ...] = ("red", "green", "blue")
+        return min(colours, key=lambda colour: abs(self.peak_um(colour) - wavelength_um))
+
+    @model_validator(mode="after")
+    def _every_led_has_its_output(self) -> Self:
+        if self.led_output and (len(self.led_output) != self.leds or min(self.led_output) <= 0):
+            raise ValueError(f"led_output needs one number above 0 for each of the {self.leds} LEDs")
+        return self
 
 
 class OpticsSpec(Table):
