@@ -57,8 +57,8 @@ def insist(device: str, leds: int) -> bool:
 def watch(device: str, leds: int, door: socket.socket, owner: int) -> bool:
     """Be the guardian until the owner dies or says "quit", and leave darkness behind; whether that worked.
 
-    The owner says "lit N" (for at most N ms from now), "dark" or "quit"; "lit" is answered with "ok". Once a lease has run
-    out, the chain is darkened again and again until the owner speaks: it may have been stopped while it lit up.
+    The owner says "lit N" (for at most N ms from now), "dark" or "quit"; "lit" is answered with "ok". Once a lease has
+    run out, the chain is darkened again and again until the owner speaks: it may have been stopped while it lit up.
     """
     gone = os.pidfd_open(owner)
     ears = select.poll()

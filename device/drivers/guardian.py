@@ -2,6 +2,7 @@
 
 import math
 import os
+import select
 import socket
 import subprocess
 import sys
@@ -24,7 +25,6 @@ class Guardian:
 
     def __init__(self, device: str, leds: int = 64) -> None:
         self._door, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._door.settimeout(10 * ANSWER_S)  # an interpreter starts
         self.was_cut = False
         command = [
             sys.executable, "-I", "-S", blank.__file__, "--device", device, "--leds", str(leds),
@@ -34,8 +34,7 @@ class Guardian:
             self._child = subprocess.Popen(
                 command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
             )
-        self._answer()
-        self._door.settimeout(ANSWER_S)
+        self._answer(10 * ANSWER_S)  # an interpreter starts
 
     @property
     def pid(self) -> int:
@@ -46,7 +45,7 @@ class Guardian:
         """Before light: darken it in `lease_s` seconds unless told otherwise; LightFault if nobody listens."""
         self.notice()
         try:
-            self._door.send(b"lit %d" % math.ceil(lease_s * 1000))
+            self._door.send(b"lit %d" % math.ceil(lease_s * 1000), socket.MSG_DONTWAIT)
         except OSError as error:
             raise LightFault(f"the lamp's guardian does not listen: {error}", _GONE) from error
         self._answer()
@@ -75,11 +74,11 @@ class Guardian:
             self._child.kill()
             self._child.wait()
 
-    def _answer(self) -> None:
+    def _answer(self, within_s: float = ANSWER_S) -> None:
         try:
-            while said := self._door.recv(64):
+            while select.select([self._door], [], [], within_s)[0] and (said := self._door.recv(64)):
                 if said == b"ok":
                     return
         except OSError as error:
             raise LightFault(f"the lamp's guardian does not answer: {error}", _GONE) from error
-        raise LightFault("the lamp's guardian has ended", _GONE)
+        raise LightFault("the lamp's guardian does not answer", _GONE)

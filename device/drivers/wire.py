@@ -26,5 +26,5 @@ def current_ma(rgb: NDArray[np.uint8]) -> float:
 
 def levels(level: float, output: NDArray[np.float64]) -> NDArray[np.uint8]:
     """The drive, 1 to 255, that makes LEDs of relative `output` equally bright: all as the weakest at `level`."""
-    drive = np.rint(255 * level * output.min() / output)
-    return np.clip(drive, 1, 255).astype(np.uint8)
+    drive: NDArray[np.uint8] = np.clip(np.rint(255 * level * output.min() / output), 1, 255).astype(np.uint8)
+    return drive
