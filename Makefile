@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test browser lint bench bench-retinas bench-peers lock clean
+.PHONY: help run test browser buses lint bench bench-kills bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -21,12 +21,16 @@ help: ## List the words that make knows.
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
-test: .venv/ready browser ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser
+test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser --ignore tests/ports
+	@umockdev-wrapper $(BIN)/python -m pytest tests/ports -m "not bench and not rig"
 	@$(BIN)/python -m pytest tests/browser
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
+
+buses: ## Install umockdev (Debian package), which emulates SPI and I2C, where it is missing.
+	@tests/ports/install
 
 lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/ruff check --quiet .
@@ -39,6 +43,9 @@ bench: .venv/ready ## Print figures of speed and truth, measured on this machine
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
+
+bench-kills: .venv/ready buses ## Kill the owner of the ring 200 times and print when it was dark.
+	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.

@@ -53,7 +53,7 @@ class Apa102Ring:
 
         self.spec, self.leds = spec, chosen_leds(spec)
         self._output = np.array(spec.led_output or [1.0] * spec.leds)
-        self._guardian, self._pulse = guardian, pulse
+        self.guardian, self._pulse = guardian, pulse
         self._blank = blank_frame(spec.leds)
         self._glow: Glow | None = None
         self._turn = Lock()  # the guard's timer darkens from a thread of its own
@@ -70,7 +70,7 @@ class Apa102Ring:
     @property
     def glow(self) -> Glow | None:
         """What it shines now; None when it is dark, also if the guardian made it so."""
-        if self._glow is not None and self._guardian.notice():
+        if self._glow is not None and self.guardian.notice():
             self._glow = None
         return self._glow
 
@@ -100,7 +100,7 @@ class Apa102Ring:
         with self._turn:
             if not self._open:
                 raise LightFault("the ring has been closed")
-            self._guardian.lit(self.spec.max_on_s)
+            self.guardian.lit(self.spec.max_on_s)
             if self._pulse is not None:
                 self._pulse.start(self.spec.max_on_s)
             try:
@@ -126,7 +126,7 @@ class Apa102Ring:
             finally:
                 self._open = False
                 self._wire.close()
-                self._guardian.close()  # darkens once more
+                self.guardian.close()  # darkens once more
 
     def _darken(self) -> None:
         """Say darkness twice. Until the bus has taken it, the guardian's lease goes on."""
@@ -135,7 +135,7 @@ class Apa102Ring:
         self._send(self._blank)
         self._send(self._blank)
         self._glow = None
-        self._guardian.dark()
+        self.guardian.dark()
 
     def _send(self, frame: bytes) -> None:
         try:

@@ -16,6 +16,7 @@ from device.sim.light import SimLight
 from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
 from device.spec import InstrumentSpec, ReplaySpec, load_head
+from tests.ports.emulators.bus.rig import wired
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
@@ -28,6 +29,7 @@ class Rig:
     light: Light
     clock: Clock
     recorded: bool = False  # what it shows was exposed long ago: colour and duration change nothing
+    close: Callable[[], None] = lambda: None  # lets go what a test's end would leave open
 
 
 def small_head() -> InstrumentSpec:
@@ -58,17 +60,26 @@ def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
     return Rig(camera, lamp, clock, recorded=True)
 
 
+def ring_rig() -> Rig:
+    """The real ring driver over the emulated bus, seen by the simulated camera."""
+    camera, ring, clock = wired(small_head())
+    return Rig(camera, ring, clock, close=ring.close)
+
+
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "sim": sim_rig,
     "sim, guarded": guarded_rig,
     "replay": replay_rig,
+    "apa102": ring_rig,
     # drivers over a fake bus join here (over real parts: tests/rig)
 }
 
 
 @pytest.fixture(params=sorted(IMPLEMENTATIONS), scope="module")
 def rig_of_module(request):
-    return IMPLEMENTATIONS[request.param]()
+    rig = IMPLEMENTATIONS[request.param]()
+    yield rig
+    rig.close()
 
 
 @pytest.fixture
@@ -90,4 +101,6 @@ def live_rig(rig):
 @pytest.fixture(params=sorted(IMPLEMENTATIONS))
 def fresh_rig(request):
     """A rig of one's own, to be broken or closed."""
-    return IMPLEMENTATIONS[request.param]()
+    rig = IMPLEMENTATIONS[request.param]()
+    yield rig
+    rig.close()

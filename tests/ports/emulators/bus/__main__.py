@@ -53,7 +53,7 @@ class Answering(UMockdev.IoctlBase):
         try:
             done, errno = self.ioctl(client.get_request() & 0xFFFFFFFF, client.get_arg())
         except (ValueError, IndexError, KeyError, struct.error, TypeError, GLib.Error) as error:
-            print(f"emulator: {error!r}", file=sys.stderr, flush=True)
+            sys.stderr.write(f"emulator: {error!r}\n")
             done, errno = -1, EINVAL
         client.complete(done, errno)
         return True
@@ -207,6 +207,11 @@ class Emulator:
             raise ValueError(f"what is {word!r}?")
 
 
+def say(line):
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
 def main():
     emulator = Emulator(sys.argv[1])
     testbed = UMockdev.Testbed.new()
@@ -221,11 +226,11 @@ def main():
             loop.quit()
             return False
         emulator.obey(line)
-        print("ok", flush=True)
+        say("ok")
         return True
 
     GLib.io_add_watch(sys.stdin.fileno(), GLib.IO_IN | GLib.IO_HUP, hear)
-    print(testbed.get_root_dir(), flush=True)
+    say(testbed.get_root_dir())
     loop.run()
 
 

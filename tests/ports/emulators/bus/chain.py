@@ -1,8 +1,8 @@
-"""An APA102 chain as its wire sees it: bytes in, colours out, and every colour stays until another one comes (the latch)."""
+"""An APA102 chain as its wire sees it: bytes in, colours out; each colour stays until another comes (the latch)."""
 
 
 class Chain:
-    """`rgb` is what each LED shows. Message borders mean nothing to it: it looks for 32 zero bits, then takes frames."""
+    """`rgb` is what each LED shows. Borders of messages mean nothing: it waits for 32 zero bits, then takes frames."""
 
     def __init__(self, leds: int = 64) -> None:
         self.rgb: list[tuple[int, int, int]] = [(0, 0, 0)] * leds
