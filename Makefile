@@ -10,11 +10,15 @@ PORT ?= 8000
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
 
-.venv/ready: requirements.lock pyproject.toml
+# The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
+PI_LOCK := tests/ports/emulators/requirements.lock
+
+.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml
 	@echo "Setting up .venv (a minute, once)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Diffuscope needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -m venv .venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
 	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
 	@$(BIN)/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
@@ -23,14 +27,14 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 
 test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser --ignore tests/ports
-	@umockdev-wrapper $(BIN)/python -m pytest tests/ports -m "not bench and not rig"
+	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
 
-buses: ## Install umockdev (Debian package), which emulates SPI and I2C, where it is missing.
-	@tests/ports/install
+buses: ## Install umockdev (Debian packages) where it is missing.
+	@tests/ports/emulators/install
 
 lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/ruff check --quiet .
@@ -41,11 +45,11 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
+bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
+	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
+
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
-
-bench-kills: .venv/ready buses ## Kill the owner of the ring 200 times and print when it was dark.
-	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.

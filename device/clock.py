@@ -26,7 +26,7 @@ class SystemClock:
 
     def now_s(self) -> float:
         """Seconds since some fixed moment; never goes back."""
-        return time.perf_counter()
+        return time.monotonic()  # as cameras stamp their frames
 
     def wall(self) -> datetime:
         """The date and time of day in UTC."""

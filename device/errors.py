@@ -9,8 +9,13 @@ DiffuscopeError
 ├── HardwareError (OSError)      something that we hold is wrong
 │   ├── CameraMissing            the camera does not answer
 │   ├── CameraStalled            the camera answered, and then stopped
+│   ├── CameraMismatch           another sensor than the head file says, or not its raw counts
 │   ├── LightFault               the lamp does not do what it was told
-│   └── LightLimit               the guard refuses more light
+│   ├── LightLimit               the guard refuses more light
+│   ├── BusFault                 a chip on the I2C bus does not answer
+│   ├── HeadMismatch             the head's memory names another head
+│   ├── TooHot                   the head is too warm to go on
+│   └── PowerLow                 the battery is nearly empty
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -88,6 +93,13 @@ class CameraStalled(HardwareError):
     default_remedy = "The live picture has stopped. Wait a moment; if it stays, turn the device off and on."
 
 
+class CameraMismatch(HardwareError):
+    """The camera is another one than the head file says, or does not give the counts of its sensor."""
+
+    code = "camera.mismatch"
+    default_remedy = "This camera does not belong to this head. Call the technician."
+
+
 class LightFault(HardwareError):
     """The lamp does not do what it was told."""
 
@@ -100,6 +112,36 @@ class LightLimit(HardwareError):
 
     code = "light.limit"
     default_remedy = "This eye has had enough light for now. Let it rest before the next picture."
+
+
+class BusFault(HardwareError):
+    """A chip on the I2C bus does not answer, or answers nonsense."""
+
+    code = "bus.fault"
+    default_remedy = (
+        "A sensor inside the device does not answer. Turn the device off and on; if it stays, call the technician."
+    )
+
+
+class HeadMismatch(HardwareError):
+    """The head's memory names another head or another calibration than the one that is loaded."""
+
+    code = "head.mismatch"
+    default_remedy = "This head was calibrated as another one. Do not take pictures; call the technician."
+
+
+class TooHot(HardwareError):
+    """The head is too warm to go on."""
+
+    code = "head.hot"
+    default_remedy = "The device is too warm. Turn it off, and let it cool in the shade."
+
+
+class PowerLow(HardwareError):
+    """The battery is nearly empty."""
+
+    code = "power.low"
+    default_remedy = "The battery is nearly empty. Charge the device before the next picture."
 
 
 class Busy(DiffuscopeError):

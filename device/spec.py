@@ -2,7 +2,7 @@
 
 import difflib
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -10,7 +10,7 @@ from device.errors import SpecError
 from device.scene import SimSpec
 from device.sensors import SENSORS
 from device.tables import Table, load_toml
-from device.values import Colour, Geometry
+from device.values import Geometry
 
 _NAMES = f"known are {', '.join(sorted(SENSORS))}"
 
@@ -21,7 +21,7 @@ class CameraSpec(Table):
     `sensor` names a profile of `device/sensors.py`, which fills in what this table does not say itself.
     """
 
-    backend: Literal["sim", "replay"]
+    backend: Literal["sim", "replay", "picamera2", "v4l2"]
     sensor: str | None = None
     rows: int = Field(ge=1, le=8192)
     cols: int = Field(ge=1, le=8192)
@@ -55,59 +55,58 @@ class CameraSpec(Table):
         return self.full_well_e / (self.white_dn - self.black_dn)
 
 
-class LightSpec(Table):
-    """The LED ring: which driver answers for it, its colours, its place on the board, how long it may shine.
+class ChainSpec(Table):
+    """A matrix of APA102 LEDs on SPI, and which of them are the ring; by default SparkFun's LuMini 8 x 8.
 
-    The ring is that of `ring_mm`, or the widest that passes a pupil of `pupil_mm` through the relay.
-    `led_output` says how bright each LED of the board is beside the others: the driver evens them out.
+    `axis` is where the light path goes through it, (row, column) from the bottom left, LEDs facing you; by default its
+    middle. `leds` names the ring's LEDs where geometry does not; `trims` dims each of them to the weakest.
     """
 
+    device: str = Field(default="/dev/spidev0.0", pattern=r"^/dev/spidev\d+\.\d+$")
+    rows: int = Field(default=8, ge=1, le=16)
+    cols: int = Field(default=8, ge=1, le=16)
+    pitch_mm: float = Field(default=3.175, gt=0, le=20)
+    axis: tuple[float, float] | None = None
+    ring_mm: float = Field(default=10.04, gt=0, le=100)
+    tolerance_mm: float = Field(default=0.2, gt=0, le=10)
+    leds: tuple[int, ...] | None = Field(default=None, min_length=1)
+    trims: tuple[float, ...] | None = None
+    most_lit: int = Field(default=16, ge=1)  # at 20 mA each: what the head's supply was built for
+
+    @model_validator(mode="after")
+    def _the_ring_is_on_the_matrix(self) -> "ChainSpec":
+        if self.leds is not None:
+            if max(self.leds) >= self.rows * self.cols or min(self.leds) < 0 or len(set(self.leds)) < len(self.leds):
+                raise ValueError(f"leds are different numbers from 0 to {self.rows * self.cols - 1}")
+            if len(self.leds) > self.most_lit:
+                raise ValueError(f"{len(self.leds)} leds are more than most_lit = {self.most_lit}")
+        if self.trims is not None and (self.leds is None or len(self.trims) != len(self.leds)):
+            raise ValueError("trims are as many as leds")
+        if self.trims is not None and not all(0 < trim <= 1 for trim in self.trims):
+            raise ValueError("trims are above 0 and at most 1")
+        return self
+
+
+class LightSpec(Table):
+    """The LED ring: colours for the picture and for aiming, and how long the guard lets it shine at once."""
+
     backend: Literal["sim", "replay", "apa102"]
+    chain: ChainSpec | None = None
     colour: Literal["red", "green", "blue"] = "green"
     preview_colour: Literal["red", "green"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
-    spi_device: str = "/dev/spidev0.0"
-    rows: int = Field(default=8, ge=1, le=32)
-    cols: int = Field(default=8, ge=1, le=32)
-    pitch_mm: float = Field(default=3.175, gt=0, le=50)
-    led_mm: float = Field(default=2.0, gt=0, le=50)
-    centre: tuple[float, float] | None = None  # (row, col) where the axis meets the board, from LED 0; None: its middle
-    ring_mm: float = Field(default=10.04, gt=0, le=200)
-    ring_tolerance_mm: float = Field(default=0.05, ge=0, le=10)
-    pupil_mm: float | None = Field(default=None, gt=0, le=12)
-    relay_magnification: float = Field(default=1.0, gt=0, le=10)
-    led_output: tuple[float, ...] = ()
-    red_um: float = Field(default=0.6225, gt=0.58, lt=0.7)  # the family's typical values: measure yours
-    green_um: float = Field(default=0.5225, gt=0.49, lt=0.58)
-    blue_um: float = Field(default=0.47, gt=0.4, lt=0.49)
-    max_current_ma: float = Field(default=500.0, gt=0, le=4000)
-    heartbeat_gpio: int | None = Field(default=None, ge=0, le=64)
-    gpio_chip: str = "/dev/gpiochip0"
 
-    @property
-    def leds(self) -> int:
-        """How many LEDs the chain has."""
-        return self.rows * self.cols
 
-    @property
-    def axis(self) -> tuple[float, float]:
-        """(row, col) where the axis meets the board, counted from LED 0."""
-        return self.centre or ((self.rows - 1) / 2, (self.cols - 1) / 2)
+class BusSpec(Table):
+    """The chips on I2C, by address; what is not named is not there. Beyond the limits no picture is taken."""
 
-    def peak_um(self, colour: Colour) -> float:
-        """The wavelength at which a colour of the LEDs is brightest."""
-        return {"red": self.red_um, "green": self.green_um, "blue": self.blue_um}[colour]
-
-    def colour_near(self, wavelength_um: float) -> Colour:
-        """The colour of the LEDs whose wavelength is nearest."""
-        colours: tuple[Colour, ...] = ("red", "green", "blue")
-        return min(colours, key=lambda colour: abs(self.peak_um(colour) - wavelength_um))
-
-    @model_validator(mode="after")
-    def _every_led_has_its_output(self) -> Self:
-        if self.led_output and (len(self.led_output) != self.leds or min(self.led_output) <= 0):
-            raise ValueError(f"led_output needs one number above 0 for each of the {self.leds} LEDs")
-        return self
+    backend: Literal["sim", "smbus"]
+    device: str = Field(default="/dev/i2c-1", pattern=r"^/dev/i2c-\d+$")
+    thermometer: int | None = Field(default=None, ge=0x08, le=0x77)  # TMP117
+    battery: int | None = Field(default=None, ge=0x08, le=0x77)  # MAX17048
+    memory: int | None = Field(default=None, ge=0x08, le=0x77)  # 24LC32
+    warmest_c: float = Field(default=55.0, gt=0, le=100)
+    emptiest: float = Field(default=0.05, ge=0, lt=1)
 
 
 class OpticsSpec(Table):
@@ -144,6 +143,7 @@ class InstrumentSpec(Table):
     camera: CameraSpec
     light: LightSpec
     optics: OpticsSpec | None = None
+    bus: BusSpec | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 
@@ -151,8 +151,12 @@ class InstrumentSpec(Table):
 def load_head(path: Path) -> InstrumentSpec:
     """Read a head TOML (`hardware/heads/*.toml`); a missing table that its backends need is refused."""
     spec = load_toml(path, InstrumentSpec)
+    if spec.light.backend == "apa102" and spec.camera.backend != "replay" and spec.optics is None:
+        raise SpecError(f"{path}: a head needs the table [optics]")
     if "sim" in (spec.camera.backend, spec.light.backend) and (spec.sim is None or spec.optics is None):
         raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
+    if spec.light.backend == "apa102" and spec.light.chain is None:
+        raise SpecError(f"{path}: a ring of APA102 LEDs needs the table [light.chain]")
     if spec.camera.backend == "replay" and spec.replay is None:
         raise SpecError(f"{path}: a replayed head needs the table [replay]")
     for key in ("exposure_s", "preview_exposure_s"):

@@ -1,84 +1,67 @@
-"""The guardian: a small process of its own that makes the LED chain dark when this one dies, hangs or is stopped."""
+"""The other process that darkens the ring: it hears before every light, and acts when this process is gone or hangs."""
 
-import math
-import os
 import select
-import socket
 import subprocess
 import sys
-from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
 
-from device.drivers import blank
 from device.errors import LightFault
 
-ANSWER_S = 0.5  # a guardian that takes longer is not one
-
-_GONE = "The safety part of the lamp has stopped. Turn the device off and on."
+ANSWER_S = 0.5  # a guardian that does not answer in that time will not be in time either
+BLANK = Path(__file__).with_name("blank.py")
 
 
 class Guardian:
-    """Runs `blank.py --watch` beside us and tells it until when the lamp may be lit.
+    """A child that runs `blank.py --guard`: it knows nothing but the bus, and needs nothing but the standard library.
 
-    A fresh interpreter, not a bare fork: it shares no memory, thread, lock or open file with a process that fails.
-    Raises LightFault if it does not answer within half a second, here or when a lease begins.
+    Raises LightFault where it does not come up, or does not answer; then nothing may shine.
     """
 
-    def __init__(self, device: str, leds: int = 64) -> None:
-        self._door, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.was_cut = False
-        command = [
-            sys.executable, "-I", "-S", blank.__file__, "--device", device, "--leds", str(leds),
-            "--watch", str(theirs.fileno()), "--owner", str(os.getpid()),
-        ]  # fmt: skip
-        with theirs:
-            self._child = subprocess.Popen(
-                command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, start_new_session=True
-            )
-        self._answer(10 * ANSWER_S)  # an interpreter starts
+    def __init__(self, device: str, leds: int) -> None:
+        command = [sys.executable, "-I", "-S", str(BLANK), "--device", device, "--leds", str(leds), "--guard"]
+        self._child = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
+        )
+        self.dark()
 
     @property
     def pid(self) -> int:
-        """Its process."""
+        """Of the child."""
         return self._child.pid
 
     def lit(self, lease_s: float) -> None:
-        """Before light: darken it in `lease_s` seconds unless told otherwise; LightFault if nobody listens."""
-        self.notice()
-        try:
-            self._door.send(b"lit %d" % math.ceil(lease_s * 1000), socket.MSG_DONTWAIT)
-        except OSError as error:
-            raise LightFault(f"the lamp's guardian does not listen: {error}", _GONE) from error
-        self._answer()
-        self.was_cut = False
+        """There will be light, for at most `lease_s` from now. It has answered when this returns."""
+        self._tell(f"lit {lease_s:.3f}\n")
 
     def dark(self) -> None:
-        """After darkness: no lease runs. If nobody listens there is nothing to end."""
-        with suppress(OSError):
-            self._door.send(b"dark", socket.MSG_DONTWAIT)
-
-    def notice(self) -> bool:
-        """Whether the guardian ended the present lease by itself."""
-        with suppress(OSError):  # nothing was said, or nobody is there
-            while said := self._door.recv(64, socket.MSG_DONTWAIT):
-                self.was_cut |= said == b"cut"
-        return self.was_cut
+        """It is dark."""
+        self._tell("dark\n")
 
     def close(self) -> None:
-        """Let it go: it darkens the chain once more and ends. Closing twice is harmless."""
-        with suppress(OSError):
-            self._door.send(b"quit", socket.MSG_DONTWAIT)
-        self._door.close()
-        try:
-            self._child.wait(timeout=10)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()
+        """Let it go: it darkens once more and ends; closing twice is harmless."""
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
+        self._child.stdin.close()
+        self._child.wait(timeout=5)
+        self._child.stdout.close()
 
-    def _answer(self, within_s: float = ANSWER_S) -> None:
+    def __enter__(self) -> "Guardian":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _tell(self, words: str) -> None:
+        assert self._child.stdin is not None
+        assert self._child.stdout is not None
         try:
-            while select.select([self._door], [], [], within_s)[0] and (said := self._door.recv(64)):
-                if said == b"ok":
-                    return
+            self._child.stdin.write(words.encode("ascii"))
+            ready, _, _ = select.select([self._child.stdout], [], [], ANSWER_S)
+            answer = self._child.stdout.read(64) if ready else b""
         except OSError as error:
-            raise LightFault(f"the lamp's guardian does not answer: {error}", _GONE) from error
-        raise LightFault("the lamp's guardian does not answer", _GONE)
+            raise LightFault(f"the lamp's guardian is gone: {error}") from error
+        if not answer:
+            raise LightFault("the lamp's guardian does not answer")

@@ -56,7 +56,7 @@ class Sample:
         )  # |Y|^2 of noise is exponential: median = ln 2 mean
 
 
-def cross_validated(power: Energies, prior: Energies, delta: float, energies: Energies) -> tuple[float, float]:
+def cross_validated(power: Energies, prior: Energies, delta: Energies, energies: Energies) -> tuple[float, float]:
     """The mu of the ladder with the least generalised cross-validation score, and that score.
 
     GCV(mu) = n sum(phi^2 |Y|^2) / (sum phi)^2, phi = reg / (|H|^2 + reg), reg = mu R + delta: the noise need not be

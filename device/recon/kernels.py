@@ -13,6 +13,7 @@ from device.values import Image
 Single = np.float32
 Series = NDArray[np.float64]
 Box = tuple[int, int, int, int]
+Axes = tuple[Image, Image]
 Sums = tuple[float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
@@ -23,28 +24,29 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 @_jit
 def linearise(
     counts: Pixels, dark: Pixels, gain: Image, white_dn: float, first: tuple[int, int], n: int, out: Image, good: Image
-) -> tuple[int, int]:
+) -> tuple[int, int, float]:
     """Counts to linear DN from pixel `first` on, n x n to one: out = mean of (counts - dark) * gain over good pixels.
 
     `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
-    `good` becomes the good share of each block, 0 to 1; a block without a good pixel becomes 0. Returns the numbers of
-    saturated and of good pixels.
+    A `dark` or a `gain` of one row holds for all rows. `good` becomes the good share of each block, 0 to 1; a block
+    without a good pixel becomes 0. Returns the numbers of saturated and of good pixels, and the light on these in DN.
     """
     rows, cols = out.shape
     wide = cols * n
     total, used = np.empty(wide, np.float32), np.empty(wide, np.float32)
-    saturated = believed = np.float64(0)
+    saturated = believed = light = np.float64(0)
     for i in range(rows):
         if n == 1:
             total, used = out[i], good[i]
         total[:], used[:] = 0, 0
         for a in range(first[0] + i * n, first[0] + i * n + n):
             begin, end = first[1], first[1] + wide
-            saturated += _add_row(
-                counts[a][begin:end], dark[a][begin:end], gain[a][begin:end], np.float32(white_dn), total, used
-            )
-        believed += _bin_row(total, used, n, out[i], good[i])
-    return int(saturated), int(believed)
+            dark_row, gain_row = dark[a % len(dark)][begin:end], gain[a % len(gain)][begin:end]
+            saturated += _add_row(counts[a][begin:end], dark_row, gain_row, np.float32(white_dn), total, used)
+        row = _bin_row(total, used, n, out[i], good[i])
+        believed += row[0]
+        light += row[1]
+    return int(saturated), int(believed), float(light)
 
 
 @_jit
@@ -61,13 +63,14 @@ def _add_row(counts: Pixels, dark: Pixels, gain: Image, white_dn: Single, total:
 
 
 @_jit
-def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> Single:
+def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tuple[Single, Single]:
     zero, one = np.float32(0), np.float32(1)
-    believed = zero
+    believed = light = zero
     if n == 1:  # `total` and `used` are `out` and `good` themselves
         for j in range(good.size):
             believed += good[j]
-        return believed
+            light += out[j]
+        return believed, light
     for j in range(out.size):
         v = u = zero
         for b in range(j * n, j * n + n):
@@ -76,7 +79,8 @@ def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> Sing
         out[j] = v / max(u, one)
         good[j] = u / np.float32(n * n)
         believed += u
-    return believed
+        light += v
+    return believed, light
 
 
 @_jit
@@ -112,16 +116,25 @@ def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[i
             out[at[0] + i, at[1] + j] = (y[i, j] - a32 * flat[i, j] - b32) * good[i, j]
 
 
+FLATTEST = 1e-6  # added to |D|^2 where it divides: less than that of one cycle across any frame
+
+
 @_jit
-def wiener(spectrum: Spectrum, otf: Spectrum, row_g: Image, col_g: Image, floor: float, scale: float) -> None:
-    """Multiply a spectrum in place by scale conj(H) / (|H|^2 + row_g + col_g + floor)."""
+def wiener(
+    spectrum: Spectrum, otf: Spectrum, gradient: Axes, slope: float, floor: float, doubt: float, scale: float
+) -> None:
+    """Multiply a spectrum in place by scale conj(H) / (|H|^2 + slope |D|^2 + floor + doubt / |D|^2).
+
+    `gradient` holds |D|^2 as its rows' and its columns' part.
+    """
     rows, cols = spectrum.shape
-    floor32, scale32 = np.float32(floor), np.float32(scale)
+    slope32, floor32, doubt32, scale32 = np.float32(slope), np.float32(floor), np.float32(doubt), np.float32(scale)
     for i in range(rows):
         for j in range(cols):
             h = otf[i, j]
+            steep = gradient[0][i] + gradient[1][j] + np.float32(FLATTEST)
             power = h.real * h.real + h.imag * h.imag
-            weight = scale32 / (power + row_g[i] + col_g[j] + floor32)
+            weight = scale32 * steep / ((power + slope32 * steep + floor32) * steep + doubt32)  # one division
             s = spectrum[i, j]
             spectrum[i, j] = complex(
                 (s.real * h.real + s.imag * h.imag) * weight, (s.imag * h.real - s.real * h.imag) * weight
@@ -140,13 +153,13 @@ def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
 
 @_jit
 def cross_validation(
-    power: Series, prior: Series, delta: float, energies: Series, ladder: Series, scores: Series
+    power: Series, prior: Series, delta: Series, energies: Series, ladder: Series, scores: Series
 ) -> None:
     """scores = n sum(phi^2 |Y|^2) / (sum phi)^2 for each mu; phi = reg / (|H|^2 + reg), reg = mu R + delta."""
     for k in range(ladder.size):
         misfit = freedom = 0.0
         for i in range(power.size):
-            reg = ladder[k] * prior[i] + delta
+            reg = ladder[k] * prior[i] + delta[i]
             phi = reg / (power[i] + reg)
             misfit += phi * phi * energies[i]
             freedom += phi

@@ -16,10 +16,13 @@ from device.values import Calibration, Image
 
 
 class Solver(Protocol):
-    """One planned way from a linear frame to a picture; the caller owns the loop, and so the clock."""
+    """One planned way from a linear frame to a picture; the caller owns the loop, and so the clock.
+
+    `inbox` is where it would like to find the frame, if it matters to it: there nothing has to be copied.
+    """
 
     model: Model
-    x: Image
+    inbox: Image | None
     facts: dict[str, Any]
     rounds: int
 
@@ -27,7 +30,7 @@ class Solver(Protocol):
         """Measure anew what depends on the model's OTF, which has changed."""
 
     def start(self, frame: Linear) -> None:
-        """Take a frame and make a first picture in `x`."""
+        """Take a frame and make a first picture."""
 
     def step(self) -> None:
         """Make it better by one round; called at most `rounds` times."""
@@ -74,11 +77,11 @@ METHODS = {
     for method in (
         Method(
             "tikhonov", "the paper's closed form: periodic, L2 prior, mu by cross-validation",
-            1, 0, 0, 7, True, lambda model, _, __: ClosedForm(model, TIKHONOV),
+            1, 0, 0, 6, True, lambda model, _, __: ClosedForm(model, TIKHONOV),
         ),
         Method(
             "gradient", "flat field taken out first, gradient prior with an L2 floor, mu by cross-validation",
-            1, 0, 0, 7, False, lambda model, _, __: ClosedForm(model, GRADIENT),
+            1, 0, 0, 6, False, lambda model, _, __: ClosedForm(model, GRADIENT),
         ),
         Method(
             "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",

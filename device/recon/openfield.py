@@ -54,7 +54,7 @@ class OpenField(Variation):
         """The evidence solution on the sensor, dark beyond it; then weights, stiffness and a first tau."""
         super().start(frame)
         noise, grid = self.noise, self.model.grid
-        self._typical = 1 / noise.variance_dn2(float(frame.y.mean()))
+        self._typical = 1 / noise.variance_dn2(frame.mean_dn)
         self.rho = RHO * self._typical * self._psf_norm**2
         self.stiffness = STIFF * self._typical
         self.blurred[grid.slices] = frame.y  # the frame says its own weights: the dark rim of this start does not

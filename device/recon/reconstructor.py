@@ -88,9 +88,9 @@ class _Rung:
         self.recipe = recipe
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
-        self.preparer = Preparer(calibration, self.grid)
         self.scale = 1.0
         self.solver: Solver = method.build(self.model, calibration, planner)
+        self.preparer = Preparer(calibration, self.grid, self.solver.inbox)
         self.most = self.solver.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
         self.start_cost, self.round_cost, self.finish_cost = Cost(), Cost(), Cost()

@@ -176,7 +176,7 @@ class Refractor:
         """Noise per frequency of the tapered window, from the sensor's gain or from the silent frequencies."""
         silent = np.abs(self.fft.spectrum.ravel()[self._silent].astype(np.complex128)) ** 2
         weight = float(np.vdot(self._seen, self._seen))
-        noise = Noise.of(self.sensor, self.grid.n, float(np.median(silent)) / np.log(2) / weight, float(frame.y.mean()))
+        noise = Noise.of(self.sensor, self.grid.n, float(np.median(silent)) / np.log(2) / weight, frame.mean_dn)
         lit = float(np.einsum("ij,ij,ij->", frame.y, self._seen, self._seen))
         return max(noise.per_dn * lit + noise.floor_dn2 * weight, 1e-20)
 

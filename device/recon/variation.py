@@ -32,6 +32,7 @@ class EvidenceWiener:
     """Shading fit plus Wiener filter with the prior that the frame's evidence supports. One round; no knob."""
 
     rounds = 1
+    inbox: Image | None = None
 
     def __init__(self, model: Model, calibration: Calibration) -> None:
         self.model, self.sensor, self.geometry = model, calibration.sensor, calibration.geometry
@@ -62,7 +63,7 @@ class EvidenceWiener:
         spectrum = fft.forward()
         measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
         energy = float(np.vdot(self.fade, self.fade))
-        mean = float(frame.y.mean())
+        mean = frame.mean_dn
         self.noise = Noise.of(self.sensor, grid.n, measured / energy, mean)
         lit = float(np.einsum("ij,ij,ij->", frame.y, self.fade, self.fade))
         self.noise_dn2 = max(self.noise.per_dn * lit + self.noise.floor_dn2 * energy, 1e-20)

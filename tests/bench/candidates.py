@@ -18,6 +18,7 @@ from device.recon.upsample import to_sensor
 from device.recon.variation import EvidenceWiener
 from device.sim.staged import Staged
 from device.values import Image
+from tests.bench import timing
 from tests.bench.scoring import judge_of, scored
 
 SEEN = 0.7  # of the torus, by which the preconditioner believes that the data term is weighted
@@ -134,4 +135,5 @@ def candidates(scene: Staged, n: int, planner: Planner) -> None:
             picture = solve(start, rounds)
             ms = (time.perf_counter() - begin) * 1e3
             grid = start.solver.model.grid
-            scored(f"{name}{f', {rounds} rounds' if rounds > 1 else ''}", ms, judge, to_sensor(picture, grid))
+            mb = timing.peak_mb(lambda solve=solve: solve(Start.of(scene, n, planner), 1))
+            scored(f"{name}{f', {rounds} rounds' if rounds > 1 else ''}", ms, mb, judge, to_sensor(picture, grid))

@@ -35,12 +35,13 @@ def peer(script: str, *words: str) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def lensless_pictures(y: Image, psf: Image, rounds: tuple[int, ...]) -> list[tuple[str, float, Image]]:
-    """Name, milliseconds and picture of LenslessPiCam's ADMM after each number of rounds; of one channel or three."""
+def lensless_pictures(y: Image, psf: Image, rounds: tuple[int, ...]) -> list[tuple[str, float, float, Image]]:
+    """Name, milliseconds, peak MB and picture of LenslessPiCam's ADMM for each number of rounds; 1 or 3 channels."""
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder) / "in.npz", y=y, psf=psf, rounds=rounds)
         found = peer("lensless_peer.py", folder) or []
         return [
-            (f"LenslessPiCam {one['version']} ADMM, {one['rounds']} rounds", one["ms"], np.load(f"{folder}/{k}.npy"))
+            (f"LenslessPiCam {one['version']} ADMM, {one['rounds']} rounds", one["ms"], one["mb"],
+             np.load(f"{folder}/{k}.npy"))
             for k, one in enumerate(found)
-        ]
+        ]  # fmt: skip

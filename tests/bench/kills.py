@@ -1,41 +1,36 @@
-"""`make bench-kills`: the owner of the ring ends 200 times in five ways; how long did the LEDs shine after it?"""
+"""`make bench-kills`: how long an eye still has light after the process that holds the lamp is killed, 200 times."""
 
-import sys
-from collections.abc import Sequence
-from statistics import median
+import random
+import signal
 
-from tests.ports.emulators.bus.client import the_bus
-from tests.ports.emulators.kills import LINGERING, WAYS, Death, death
-from tests.ports.emulators.victim import LEASE_S, STEPS
+import numpy as np
 
-KILLS = 200
+from tests.bench import timing
+from tests.ports.emulators.kills import Death, Victim
+from tests.ports.emulators.wires import wires
 
-
-def row(name: str, deaths: Sequence[Death]) -> None:
-    """One line: in time of all, how many were lit at the end, median of those, worst."""
-    lit_ms = [1000 * died.shone_s for died in deaths if died.shone_s > 0]
-    in_time = sum(died.shone_s <= died.allowed_s for died in deaths)
-    figures = f"{median(lit_ms):>6.1f} | {max(lit_ms):>6.1f}" if lit_ms else f"{'-':>6} | {'-':>6}"
-    allowed = f"{1000 * max(died.allowed_s for died in deaths):>8.0f}"
-    print(f"| {name:<22} | {in_time:>3} of {len(deaths):<3} | {len(lit_ms):>3} | {figures} | {allowed} |", flush=True)
+KILLS, STOPS = 200, 20
+LEASE_S, DARK_S = 0.4, 0.1
+ENDS = {"hang": LEASE_S + DARK_S, "raise": DARK_S, "exit": DARK_S}
 
 
-def main(kills: int = KILLS) -> int:
-    """Print the table; 1 if an eye was lit for too long."""
-    deaths = [death(the_bus(), WAYS[number % len(WAYS)], number) for number in range(kills)]
-    print(f"{kills} ends of the ring's owner, emulated bus, lease {1000 * LEASE_S:.0f} ms; ms of light after the end,")
-    print(f"or of the last light in all where the owner lingers ({', '.join(LINGERING)})\n")
-    print("| end | dark in time | lit | median, ms | worst, ms | allowed, ms |\n|---|---|---|---|---|---|")
-    for way in WAYS:
-        row(way, [died for died in deaths if died.way == way])
-    for step in STEPS.values():
-        of_step = [died for died in deaths if died.step == step and died.way not in LINGERING]
-        if of_step:
-            row(f"died while {step}", of_step)
-    late = [died for died in deaths if died.shone_s > died.allowed_s]
-    print(f"\ntoo late: {late or 'none'}")
-    return int(bool(late))
+def main() -> None:
+    """Kill at random moments of random phases, and print what it came to."""
+    timing.head("dark after (emulated bus)", "times", "lit then", "median ms", "worst ms", "limit")
+    draw = random.Random(1)
+    for how, times, limit_s in ((signal.SIGKILL, KILLS, DARK_S), (signal.SIGSTOP, STOPS, LEASE_S + DARK_S)):
+        told(how.name, [Victim(wires(), LEASE_S).die(how, draw.uniform(0, 0.5)) for _ in range(times)], limit_s)
+    for end, limit_s in ENDS.items():
+        told(f"{end}, with the lamp on", [Victim(wires(), LEASE_S, end).end(end) for _ in range(5)], limit_s)
+
+
+def told(name: str, deaths: list[Death], limit_s: float) -> None:
+    """One line: those that died with the lamp on count for the median."""
+    lit = [death.dark_after_s * 1e3 for death in deaths if death.was_lit]
+    worst = max(death.dark_after_s * 1e3 for death in deaths)
+    middle = float(np.median(lit)) if lit else 0.0
+    timing.row(name, str(len(deaths)), str(len(lit)), middle, worst, limit=limit_s * 1e3, value=worst)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

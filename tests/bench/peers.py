@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy import fft, ndimage
@@ -83,11 +84,13 @@ def peers(scene: Staged, planner: Planner) -> None:
     """Ours and theirs in one table; theirs at bin 2, on black-subtracted counts, no shading model, no crop model."""
     shape = (scene.truth.shape[0], scene.truth.shape[1])
     judge = judge_of(scene)
-    timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "PSNR dB", "PCC", "SSIM", "detail")
+    timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "peak MB", "PSNR dB", "PCC", "SSIM", "detail")
     for recipe in (Recipe("gradient", N), Recipe("evidence", N), Recipe("variation", N)):
-        make = Reconstructor(scene.calibration, shape, planner, SystemClock(), (recipe,), refract=False)
-        (ms,) = timing.side_by_side_ms(lambda make=make: make(scene.counts), rounds=3)
-        scored(f"ours: {recipe.method}", ms, judge, make(scene.counts).picture)
+        planned = partial(Reconstructor, scene.calibration, shape, planner, SystemClock(), (recipe,), refract=False)
+        make = planned()
+        (ms,) = timing.side_by_side_ms(partial(make, scene.counts), rounds=3)
+        mb = timing.peak_mb(lambda planned=planned: planned()(scene.counts))
+        scored(f"ours: {recipe.method}", ms, mb, judge, make(scene.counts).picture)
     candidates(scene, N, planner)
     y = binned(scene.counts.astype(np.float32) - np.float32(scene.calibration.sensor.black_dn))
     psf = binned(centred(scene.calibration.psfs[0].pixels)) * N**2
@@ -99,11 +102,12 @@ def peers(scene: Staged, planner: Planner) -> None:
             for _ in range(repeats):
                 picture = solve(y, psf, rounds)
             ms = (time.perf_counter() - begin) / repeats * 1e3
-            scored(f"{name}{f', {rounds} rounds' if rounds > 1 else ''}", ms, judge, to_sensor(picture, grid))
+            mb = timing.peak_mb(partial(solve, y, psf, 1))
+            scored(f"{name}{f', {rounds} rounds' if rounds > 1 else ''}", ms, mb, judge, to_sensor(picture, grid))
     lensless(y, psf, grid, judge)
 
 
 def lensless(y: Image, psf: Image, grid: Grid, judge: Judge) -> None:
     """LenslessPiCam's ADMM in its own environment."""
-    for name, ms, picture in lensless_pictures(y, psf, LENSLESS_ROUNDS):
-        scored(name, ms, judge, to_sensor(picture, grid))
+    for name, ms, mb, picture in lensless_pictures(y, psf, LENSLESS_ROUNDS):
+        scored(name, ms, mb, judge, to_sensor(picture, grid))

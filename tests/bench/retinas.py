@@ -157,7 +157,7 @@ def dlmd(folder: Path) -> None:
         psnr_db = butterfly_db(picture, truth)
         timing.row(f"{name}, ours", psnr_db, took_s)
         said(f"{name}: PSNR >= {mark_db} dB", psnr_db, mark_db)
-        for title, ms, theirs in lensless_pictures(frame.pixels, psf.pixels, (100,)):
+        for title, ms, _, theirs in lensless_pictures(frame.pixels, psf.pixels, (100,)):
             timing.row(f"{name}, {title}", butterfly_db(theirs, truth), ms / 1000)
             said(f"{name}: their PSNR is not higher, dB", psnr_db - butterfly_db(theirs, truth), 0.0)
             said(f"{name}: times of theirs >= 5", ms / 1000 / took_s, 5.0)

@@ -17,7 +17,7 @@ def judge_of(scene: Staged) -> Judge:
     return Judge(scene.truth, inside, 2 * geometry.px_per_deg if geometry else 32.0, scene.vessels)
 
 
-def scored(name: str, ms: float, judge: Judge, picture: Image) -> None:
-    """Time and scores of one picture."""
+def scored(name: str, ms: float, mb: float, judge: Judge, picture: Image) -> None:
+    """Time, peak memory and scores of one picture."""
     scores = judge(picture)
-    timing.row(name, ms, scores.psnr_db, scores.pcc, scores.ssim, scores.highpass_pcc)
+    timing.row(name, ms, mb, scores.psnr_db, scores.pcc, scores.ssim, scores.highpass_pcc)

@@ -1,6 +1,7 @@
 """Acts that take turns, and a table of figures with their limits and a verdict."""
 
 import time
+import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,15 @@ def against_the_first(*acts: Callable[[], object], rounds: int = 31) -> tuple[li
     """
     times = turns_ms(*acts, rounds=rounds)
     return [float(v) for v in np.median(times, axis=0)], [float(v) for v in np.median(times / times[:, :1], axis=0)]
+
+
+def peak_mb(act: Callable[[], object]) -> float:
+    """The most memory that Python's allocators, numpy's arrays among them, held while an act ran, over that before."""
+    tracemalloc.start()
+    act()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak / 2**20
 
 
 def head(title: str, *columns: str) -> None:

@@ -104,9 +104,13 @@ def test_a_refractive_error_warps_the_caustic_exactly(eye):
 
 @pytest.mark.parametrize("m_dpt", [10.0, -10.0])
 def test_the_warp_holds_to_ten_dioptres(m_dpt):
-    """optics.md 2.4 gives 0.999; here 0.99895 and 0.99903: the plane itself moves a little with the refraction."""
-    relaxed, strained = (caustic_on(GRID, PAPER, 1, Refraction(m), 1) for m in (0.0, m_dpt))
-    assert correlation(warped(relaxed, Refraction(m_dpt).warp(PAPER)), strained) == pytest.approx(0.999, abs=2e-4)
+    """optics.md 2.4 gives 0.999; three diffusers 0.99897 to 0.9992: the plane moves a little with the refraction."""
+    found = []
+    for seed in (1, 2, 3):
+        relaxed, strained = (caustic_on(GRID, PAPER, seed, Refraction(m)) for m in (0.0, m_dpt))
+        found.append(correlation(warped(relaxed, Refraction(m_dpt).warp(PAPER)), strained))
+    assert np.mean(found) >= 0.999
+    assert min(found) > 0.9989
 
 
 def test_myopia_shrinks_the_caustic_by_the_golden_number():

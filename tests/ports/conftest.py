@@ -1,22 +1,29 @@
 """The parts under contract. A new camera or lamp joins by one line in IMPLEMENTATIONS."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
-from device.clock import Clock, VirtualClock
+from device.clock import Clock, SystemClock, VirtualClock
+from device.drivers.guardian import Guardian
+from device.drivers.pi_camera import PiCamera
+from device.drivers.ring import Apa102Ring
 from device.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
-from device.spec import InstrumentSpec, ReplaySpec, load_head
-from tests.ports.emulators.bus.rig import wired
+from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
+from tests.ports.emulators.timeline import Timeline
+
+sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
@@ -29,7 +36,13 @@ class Rig:
     light: Light
     clock: Clock
     recorded: bool = False  # what it shows was exposed long ago: colour and duration change nothing
-    close: Callable[[], None] = lambda: None  # lets go what a test's end would leave open
+
+    def close(self) -> None:
+        """Dark, and gone."""
+        self.light.off()
+        self.camera.close()
+        if isinstance(self.light, Apa102Ring):
+            self.light.close()
 
 
 def small_head() -> InstrumentSpec:
@@ -60,18 +73,43 @@ def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
     return Rig(camera, lamp, clock, recorded=True)
 
 
+def pi_rig(*, wide: bool = False) -> Rig:
+    """The real picamera2 over an emulated libcamera, whose sensor looks at a simulated world in real time."""
+    timeline = Timeline()
+    light = SimLight(timeline)
+    return Rig(emulated_camera(timeline, light, wide=wide), light, SystemClock())
+
+
 def ring_rig() -> Rig:
-    """The real ring driver over the emulated bus, seen by the simulated camera."""
-    camera, ring, clock = wired(small_head())
-    return Rig(camera, ring, clock, close=ring.close)
+    """That camera, lit by the real spidev's bytes: the LEDs that shine are decoded from the emulated wire."""
+    from tests.ports.emulators.wires import wires
+
+    chain = ChainSpec()
+    wires().break_()
+    light = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s=30)
+    return Rig(emulated_camera(wires(), light), light, SystemClock())
+
+
+def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCamera:
+    """picamera2's camera on a sensor of its own, which sees what `lamp` says."""
+    import libcamera
+
+    from tests.ports.emulators.memory import MemoryAllocator
+    from tests.ports.emulators.sensor import Sensor
+
+    clock = SystemClock()
+    libcamera.plugged.append(Sensor(World(small_head(), clock), lamp, wide=wide))
+    spec = small_head().camera.model_copy(update={"backend": "picamera2", "sensor": "imx296", "exposure_s": 0.02})
+    return PiCamera(spec, light, clock, allocator=MemoryAllocator(), simulated=True)
 
 
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "sim": sim_rig,
     "sim, guarded": guarded_rig,
     "replay": replay_rig,
-    "apa102": ring_rig,
-    # drivers over a fake bus join here (over real parts: tests/rig)
+    "picamera2 as on a Pi 4": pi_rig,
+    "picamera2 as on a Pi 5": partial(pi_rig, wide=True),
+    "picamera2, spidev": ring_rig,
 }
 
 

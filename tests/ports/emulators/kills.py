@@ -1,88 +1,88 @@
-"""Kills, stops and hangs the owner of the ring at random moments, and reads off the wire when the eye was dark."""
+"""Killing a process that holds the lamp, and measuring how long the eye still has light."""
 
-import os
-import random
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
-from tests.ports.emulators import victim
-from tests.ports.emulators.bus.client import Bus, Seen
+from tests.ports.emulators.wires import Wires
 
-ROOT = Path(victim.__file__).parents[3]
-DEADLY = ("SIGKILL", "SIGTERM", "exception")  # the process ends, and the guardian hears of it
-LINGERING = ("SIGSTOP", "hang")  # the process stays, and only the lease ends
-WAYS = DEADLY + LINGERING
-LIMIT_S = 0.1
+PATIENCE_S = 5.0
+STEP_S = 0.005
 
 
 @dataclass(frozen=True)
 class Death:
-    """How an owner ended, in which step, and how long the LEDs shone: after its end, or in all if it lingers.
+    """How a victim died, whether the lamp was on at that moment, and how long it still was."""
 
-    `shone_s` is infinite if they were never seen dark again; 0 if they were dark already.
-    """
-
-    way: str
-    step: str
-    shone_s: float
-
-    @property
-    def allowed_s(self) -> float:
-        """100 ms, after the lease if the process lingers."""
-        return LIMIT_S + (victim.LEASE_S if self.way in LINGERING else 0)
+    how: str
+    was_lit: bool
+    dark_after_s: float
 
 
-def death(bus: Bus, way: str, seed: int) -> Death:
-    """Start an owner, end it in that way at a moment chosen by `seed`, and watch the wire."""
-    began = len(bus.messages())
-    mode = {"exception": "raise", "hang": "hang"}.get(way, "work")
-    owner = subprocess.Popen(
-        [sys.executable, victim.__file__, mode, str(seed)],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    try:
-        said = _heard(owner, until=b"d")
-        if mode == "work":
-            time.sleep(random.Random(seed).uniform(0, 0.2))
-            ended_s = time.monotonic()
-            owner.send_signal(getattr(signal, way))
-        else:
-            said += _heard(owner, until=b"h")
-            ended_s = time.monotonic()
-        time.sleep(LIMIT_S + 0.05 + (victim.LEASE_S if way in LINGERING else 0))
-        seen = bus.messages()[began:]
-    finally:
-        owner.kill()
-    said += _heard(owner)
-    owner.wait()
-    assert owner.stdout is not None
-    owner.stdout.close()
-    time.sleep(0.1)  # its guardian's last words
-    last = said.replace(b"h", b"")[-1:].decode()
-    return Death(way, victim.STEPS[last], shone_s(seen, 0.0 if way in LINGERING else ended_s))
+class Victim:
+    """A process that takes pictures with the emulated ring."""
+
+    def __init__(self, wires: Wires, lease_s: float, end: str = "never") -> None:
+        self._wires = wires
+        command = [sys.executable, "-m", "tests.ports.emulators.victim", str(lease_s), end]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._hear(b"ready")
+
+    def _hear(self, word: bytes) -> None:
+        assert self._process.stdout is not None
+        heard = self._process.stdout.readline().strip()
+        if heard != word:
+            raise RuntimeError(f"the victim said {heard!r} instead of {word!r}")
+
+    def die(self, how: signal.Signals, after_s: float) -> Death:
+        """Send a signal after a while, and wait for the dark."""
+        time.sleep(after_s)
+        self._process.send_signal(how)
+        if how == signal.SIGKILL:
+            self._process.wait()
+        return self._darkness(how.name)
+
+    def end(self, how: str) -> Death:
+        """Wait until it ends by itself with the lamp on, and then for the dark."""
+        self._hear(b"ending")
+        return self._darkness(how)
+
+    def _darkness(self, how: str) -> Death:
+        died_s = time.monotonic()
+        was_lit = bool(self._before(died_s))
+        while self._wires.lit:
+            if time.monotonic() - died_s > PATIENCE_S:
+                return self._buried(Death(how, was_lit, float("inf")))
+            time.sleep(STEP_S)
+        dark_s = died_s
+        for one in reversed(self._wires.messages):  # the first of the dark messages at the end
+            if one["lit"]:
+                break
+            dark_s = one["at_s"]
+        return self._buried(Death(how, was_lit, max(0.0, dark_s - died_s) if was_lit else 0.0))
+
+    def _before(self, moment_s: float) -> dict:
+        earlier = [one for one in self._wires.messages if one["at_s"] <= moment_s]
+        return earlier[-1]["lit"] if earlier else {}
+
+    def _buried(self, death: Death) -> Death:
+        self._process.kill()
+        self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        return death
 
 
-def shone_s(seen: list[Seen], since_s: float) -> float:
-    """How long after `since_s` the last light ended; all of it, if that began later."""
-    lit = [at for at, message in enumerate(seen) if message.lit]
-    if not lit:
-        return 0.0
-    if lit[-1] + 1 == len(seen):
-        return float("inf")
-    began_s = seen[max(at for at in lit if at == 0 or not seen[at - 1].lit)].at_s
-    return max(0.0, seen[lit[-1] + 1].at_s - max(began_s, since_s))
+def guardians() -> int:
+    """How many guardians are still there."""
+    found = subprocess.run(["pgrep", "-c", "-f", "blank.py --device"], capture_output=True, text=True, check=False)
+    return int(found.stdout or 0)
 
 
-def _heard(owner: "subprocess.Popen[bytes]", until: bytes = b"") -> bytes:
-    """What it says, up to and with a letter, or to its end."""
-    assert owner.stdout is not None
-    said = b""
-    while not (until and until in said) and (more := os.read(owner.stdout.fileno(), 64)):
-        said += more
-    if until == b"d" and not said:
-        raise RuntimeError("the owner of the ring did not start")
-    return said
+def pause_until_alone() -> None:
+    """Give guardians of the dead the time to end."""
+    until_s = time.monotonic() + PATIENCE_S
+    while guardians() and time.monotonic() < until_s:
+        time.sleep(STEP_S)

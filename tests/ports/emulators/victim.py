@@ -1,54 +1,46 @@
-"""A process that holds the ring as an exam does, until it is killed or stopped, raises or hangs: `victim.py MODE SEED`.
+"""A process that takes pictures with the real ring until it dies: `python -m tests.ports.emulators.victim LEASE_S END`.
 
-It says the step it is about to take on standard output, one letter each: see STEPS. MODE is "work" (on and on), or
-"raise" or "hang" (after a random number of steps, lit or dark; "h" says that it hangs now).
+Its phases are an exam's: aiming in red, a pause, the lit exposure, the dark one, the making. END is how it ends by
+itself inside a lit phase, if at all: "hang", "raise", "exit", or "never".
 """
 
+import itertools
 import os
-import random
 import sys
 import time
 
 from device.drivers.guardian import Guardian
 from device.drivers.ring import Apa102Ring
-from device.spec import LightSpec
+from device.spec import ChainSpec
 from device.values import Glow
 
-STEPS = {"d": "dark", "u": "lighting up", "r": "lit, red", "g": "lit, green", "o": "darkening"}
-LEASE_S = 0.3
+AIM_S, PAUSE_S, PICTURE_S, MAKE_S = 0.05, 0.02, 0.1, 0.03
+ENDS_AT_ROUND = 3
 
 
-class Life:
-    """The steps of an exam, at random paces, and the one in which it fails."""
-
-    def __init__(self, mode: str, seed: int) -> None:
-        self.mode, self.chance = mode, random.Random(seed)
-        self.left = self.chance.randrange(2, 30)
-
-    def step(self, letter: str, most_s: float = 0.0) -> None:
-        """Say where we are, stay a while, and perhaps fail here."""
-        os.write(1, letter.encode())
-        time.sleep(self.chance.uniform(0, most_s))
-        self.left -= 1
-        if self.left <= 0 and self.mode == "raise":
-            raise ZeroDivisionError("as any code above the light may")
-        if self.left <= 0 and self.mode == "hang":
-            os.write(1, b"h")
-            while True:
-                sum(range(10**6))
-
-
-def main(mode: str, seed: int) -> None:
-    spec = LightSpec(backend="apa102", max_on_s=LEASE_S)
-    ring, life = Apa102Ring(spec, Guardian(spec.spi_device, spec.leds)), Life(mode, seed)
-    while True:
-        for letter, glow in (("r", Glow("red", 0.5)), ("g", Glow("green"))):
-            life.step("d", 0.01)
-            life.step("u")
+def main(lease_s: float, end: str) -> None:
+    chain = ChainSpec()
+    ring = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s)
+    os.write(1, b"ready\n")
+    for turn in itertools.count():
+        for glow, lit_s, dark_s in ((Glow("red", 0.4), AIM_S, PAUSE_S), (Glow("green"), PICTURE_S, PICTURE_S + MAKE_S)):
             with ring.on(glow):
-                life.step(letter, 0.03)
-                life.step("o")
+                time.sleep(lit_s)
+                if turn == ENDS_AT_ROUND and glow.colour == "green":
+                    finish(end)
+            time.sleep(dark_s)
+
+
+def finish(end: str) -> None:
+    """End as told, with the lamp on."""
+    os.write(1, b"ending\n")
+    if end == "hang":
+        time.sleep(3600)
+    if end == "raise":
+        raise MemoryError("no room for another picture")
+    if end == "exit":
+        os._exit(1)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(float(sys.argv[1]), sys.argv[2])

@@ -1,50 +1,31 @@
-"""An APA102 chain as its wire sees it: bytes in, colours out; each colour stays until another comes (the latch)."""
+"""A chain of APA102 LEDs as it is wired: what arrives is latched, and stays for as long as there is power."""
+
+START = bytes(4)
+FULL = 31
 
 
 class Chain:
-    """`rgb` is what each LED shows. Borders of messages mean nothing: it waits for 32 zero bits, then takes frames."""
+    """`count` LEDs; `dead` ones stay dark; `power` off darkens all and forgets."""
 
-    def __init__(self, leds: int = 64) -> None:
-        self.rgb: list[tuple[int, int, int]] = [(0, 0, 0)] * leds
+    def __init__(self, count: int = 64) -> None:
+        self.levels: list[tuple[int, int, int]] = [(0, 0, 0)] * count
         self.dead: set[int] = set()
-        self._zeros = self._next = 0
-        self._listening = False
-        self._part = b""
+
+    def take(self, wire: bytes) -> None:
+        """Shift a message in: a frame reaches as many LEDs as it holds, and the rest keep what they had."""
+        begin = wire.find(START)
+        if begin < 0:
+            return
+        words = wire[begin + len(START) :]
+        for index in range(len(self.levels)):
+            word = words[4 * index : 4 * index + 4]
+            if len(word) < 4 or word[0] >> 5 != 0b111:
+                return
+            share, (blue, green, red) = (word[0] & FULL) / FULL, word[1:]
+            shown = tuple(round(level * share) for level in (red, green, blue))
+            self.levels[index] = (0, 0, 0) if index in self.dead else shown
 
     @property
-    def lit(self) -> int:
-        """How many LEDs shine."""
-        return sum(any(rgb) for rgb in self.rgb)
-
-    def power_lost(self) -> None:
-        """A brown-out: what was latched is forgotten."""
-        self.rgb = [(0, 0, 0)] * len(self.rgb)
-        self._listening, self._part, self._zeros = False, b"", 0
-
-    def take(self, data: bytes) -> None:
-        """Shift bytes in."""
-        for byte in data:
-            if self._listening:
-                self._word(byte)
-            else:
-                self._wait(byte)
-
-    def _wait(self, byte: int) -> None:
-        if byte == 0:
-            self._zeros += 1
-        elif self._zeros >= 4 and byte >= 0xE0:
-            self._listening, self._next, self._part = True, 0, bytes([byte])
-        else:
-            self._zeros = 0
-
-    def _word(self, byte: int) -> None:
-        if not self._part and byte < 0xE0:  # not an LED's frame: the tail, or the next start
-            self._listening, self._zeros = False, 1 if byte == 0 else 0
-            return
-        self._part += bytes([byte])
-        if len(self._part) == 4:
-            brightness, blue, green, red = self._part
-            if self._next < len(self.rgb):
-                dark = self._next in self.dead or brightness == 0xE0
-                self.rgb[self._next] = (0, 0, 0) if dark else (red, green, blue)
-            self._next, self._part = self._next + 1, b""
+    def lit(self) -> dict[int, tuple[int, int, int]]:
+        """The LEDs that shine now, with their red, green and blue."""
+        return {index: levels for index, levels in enumerate(self.levels) if any(levels)}

@@ -1,0 +1,19 @@
+"""The properties that the emulated sensors have."""
+
+from enum import IntEnum
+from types import SimpleNamespace
+
+from libcamera._libcamera import ControlId
+
+
+class _ColorFilterArrangement(IntEnum):
+    RGGB = 0
+    MONO = 4
+
+
+draft = SimpleNamespace(ColorFilterArrangementEnum=_ColorFilterArrangement)
+Model = ControlId("Model")
+Location = ControlId("Location")
+Rotation = ControlId("Rotation")
+PixelArraySize = ControlId("PixelArraySize")
+ColorFilterArrangement = ControlId("ColorFilterArrangement")

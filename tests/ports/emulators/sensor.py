@@ -1,0 +1,110 @@
+"""The sensor behind the emulated libcamera: it exposes a simulated world in real time, late and padded as real ones."""
+
+import mmap
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from device.sim.world import World
+from device.values import Glow
+
+DELAY = 2  # frames until a control that was asked for takes effect
+ROW_US = 14.8  # exposures are whole rows, rounded down
+SHARE_16 = 16
+Lamp = Callable[[float, float], list[tuple[Glow | None, float]]]
+
+
+class Sensor:
+    """A monochrome sensor in a World whose own lamp stays off; `lamp` tells what shone between two moments, how long.
+
+    Faults are switched by `faults`: "stall" (no frame comes), "packed" (no unpacked format), "compressed" (a lossy
+    format is granted), "justified" (values on the other side of their words), "stale" (controls never land).
+    """
+
+    def __init__(self, world: World, lamp: Lamp, *, model: str = "imx296", bits: int = 12, wide: bool = False) -> None:
+        self.world, self.lamp, self.model, self.bits, self.wide = world, lamp, model, bits, wide
+        self.faults: set[str] = set()
+        self.held = False
+        self.frames = 0
+        self.shortest_frame_us = 2000
+        self._coming: deque[dict[str, float]] = deque()
+        self._now: dict[str, float] = {}
+
+    @property
+    def size(self):
+        import libcamera
+
+        return libcamera.Size(self.world.shape[1], self.world.shape[0])
+
+    @property
+    def formats(self) -> list[str]:
+        packed = f"R{self.bits}_CSI2P"
+        return [packed] if "packed" in self.faults else [f"R{self.bits}", packed]
+
+    @property
+    def known(self) -> set[str]:
+        return {"R8", "R10", "R12", "R16", "R10_CSI2P", "R12_CSI2P", "MONO_PISP_COMP1"}
+
+    def granted(self, asked: str) -> str:
+        """A Pi 5 rewrites every request: to words of 16 bits, or to its lossy compression."""
+        unpacked = asked in self.formats and not asked.endswith("_CSI2P")
+        if "compressed" in self.faults or (self.wide and not unpacked):
+            return "MONO_PISP_COMP1"
+        if self.wide:
+            return "R16"
+        return asked if asked in self.formats else self.formats[0]
+
+    def stride(self, pixel_format: str) -> int:
+        """Bytes to a row, padded to 32."""
+        wide = self.world.shape[1] * (1 if "COMP" in pixel_format else 2)
+        return -(-wide // 32) * 32 + 32
+
+    def refuse_if_held(self) -> None:
+        if self.held:
+            raise RuntimeError("Pipeline handler in use by another process")
+        self.held = True
+
+    def begin(self, first: dict[str, float]) -> None:
+        """Start: the first controls hold from the first frame."""
+        self._now, self._coming = dict(first), deque([{}] * DELAY)
+        self._free_s = time.monotonic()
+
+    def expose(self, asked: dict[str, float], fd: int, stream) -> dict[str, object] | None:
+        """Fill a buffer with the next frame and say how it was taken; None: it never comes."""
+        if "stall" in self.faults:
+            return None
+        self._coming.append({} if "stale" in self.faults else asked)
+        self._now |= self._coming.popleft()
+        exposure_us = int(int(self._now["ExposureTime"] / ROW_US) * ROW_US)
+        begin_s = max(self._free_s, time.monotonic())
+        end_s = begin_s + exposure_us * 1e-6
+        self._free_s = max(end_s, begin_s + self.shortest_frame_us * 1e-6)
+        time.sleep(max(0.0, self._free_s - time.monotonic()))
+        self.frames += 1
+        counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.seed, self.frames), None)
+        self._write(counts, fd, stream)
+        return {
+            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": 1.0, "DigitalGain": 1.0,
+            "FrameDuration": int((self._free_s - begin_s) * 1e6),
+            "SensorBlackLevels": (int(self.world.spec.camera.black_dn) << (SHARE_16 - self.bits),) * 4,
+        }  # fmt: skip
+
+    def _electrons(self, begin_s: float, end_s: float) -> np.ndarray:
+        world = self.world
+        total = np.array(world.electrons(end_s - begin_s))
+        for glow, lit_s in self.lamp(begin_s, end_s):
+            if glow is not None:
+                total += world.electrons_per_s(glow.colour) * np.float32(glow.level * lit_s)
+        return total
+
+    def _write(self, counts: np.ndarray, fd: int, stream) -> None:
+        rows, cols = counts.shape
+        if (str(stream.pixel_format) == "R16") != ("justified" in self.faults):
+            counts = counts << (SHARE_16 - self.bits)
+        with mmap.mmap(fd, stream.frame_size) as memory:
+            words = np.frombuffer(memory, np.uint16).reshape(rows, stream.stride // 2)
+            words[:, :cols] = counts
+            words[:, cols:] = 0xA5A5  # what is left of the last user: nobody may read it
+            del words
