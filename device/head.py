@@ -6,16 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from device.clock import Clock
+from device.drivers.button import GpioButton
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
+from device.drivers.gpio import InputLine, OutputLine
 from device.drivers.guardian import Guardian
+from device.drivers.heartbeat import Heartbeat
 from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
-from device.ports import Battery, Camera, HeadMemory, Light, Thermometer
+from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
-from device.sim.chips import SimBattery, SimHeadMemory, SimThermometer
+from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermometer
 from device.sim.light import Mirrored, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
 from device.sim.world import World
@@ -32,6 +35,7 @@ class Chips:
     thermometer: Thermometer | None = None
     battery: Battery | None = None
     memory: HeadMemory | None = None
+    button: Button | None = None
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Head:
 
 def is_simulated(spec: InstrumentSpec) -> bool:
     """Whether any part of it, or what is known about it, is made up: then all of it counts as simulated."""
-    backends = {spec.camera.backend, spec.light.backend, spec.bus.backend if spec.bus else "none"}
+    backends = {spec.camera.backend, spec.light.backend, *(part.backend for part in (spec.bus, spec.gpio) if part)}
     return "sim" in backends or spec.sim is not None
 
 
@@ -114,7 +118,8 @@ def _opened(spec: InstrumentSpec, clock: Clock, allocator: Any, undo: ExitStack)
     light = GuardedLight(lamp, clock, spec.light.max_on_s)
     camera = _camera(spec, world, light, clock, allocator)
     undo.callback(camera.close)
-    return Head(spec, camera, light, simulated_calibration(world), _chips(spec, world, clock, undo))
+    chips = replace(_chips(spec, world, clock, undo), button=_button(spec, world, clock, undo))
+    return Head(spec, camera, light, simulated_calibration(world), chips)
 
 
 def _lamp(spec: InstrumentSpec, world: World, undo: ExitStack) -> Light:
@@ -124,9 +129,29 @@ def _lamp(spec: InstrumentSpec, world: World, undo: ExitStack) -> Light:
     assert chain is not None
     guardian = Guardian(chain.device, chain.rows * chain.cols)
     undo.callback(guardian.close)
-    ring = Apa102Ring(chain, guardian, spec.light.max_on_s + LEASE_MARGIN_S)
+    ring = Apa102Ring(chain, guardian, spec.light.max_on_s + LEASE_MARGIN_S, _pulse(spec, undo))
     undo.callback(ring.close)
     return Mirrored(ring, world) if spec.camera.backend == "sim" else ring
+
+
+def _pulse(spec: InstrumentSpec, undo: ExitStack) -> Heartbeat | None:
+    said = spec.gpio
+    if said is None or said.heartbeat is None or said.backend == "sim":
+        return None
+    pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
+    undo.callback(pulse.close)
+    return pulse
+
+
+def _button(spec: InstrumentSpec, world: World, clock: Clock, undo: ExitStack) -> Button | None:
+    said = spec.gpio
+    if said is None or said.button is None:
+        return None
+    if said.backend == "sim":
+        return SimButton(world)
+    button = GpioButton(InputLine(said.chip, said.button), clock)
+    undo.callback(button.close)
+    return button
 
 
 def _camera(spec: InstrumentSpec, world: World, light: Light, clock: Clock, allocator: Any) -> Camera:

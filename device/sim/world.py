@@ -48,6 +48,7 @@ class World:
         self.frames = 0
         self.celsius, self.charge = 25.0, Charge(0.775, 3.88)
         self.identity: Identity | None = None
+        self.pressed_since_s: float | None = None
         self._choose = choose
         self._setups: dict[Colour, Setup] = {}
         self._rates: dict[Colour, Image] = {}

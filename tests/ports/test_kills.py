@@ -135,3 +135,26 @@ def test_an_owner_that_dies_before_it_hears_the_answer_leaves_no_light(sound_wir
     assert guard.wait(timeout=5) == 0
     guard.stdin.close()
     assert not wires().lit
+
+
+def test_the_gate_is_open_before_the_light_and_what_leds_show_at_power_up_is_overwritten(sound_wires):
+    told = []
+
+    class Pulse:
+        def start(self, lease_s):
+            told.append(("start", lease_s, len(wires().messages)))
+            light_up(chain)  # what a chain may show when it gets power
+
+        def stop(self):
+            told.append(("stop", dict(wires().lit)))
+
+    chain = ChainSpec()
+    with Guardian(chain.device, chain.rows * chain.cols) as guardian:
+        ring = Apa102Ring(chain, guardian, LEASE_S, Pulse())
+        told.clear()
+        with ring.on(Glow("green")):
+            shown = [set(one["lit"]) for one in wires().messages[told[0][2] :]]
+        ring.close()
+    assert told[0][:2] == ("start", LEASE_S)
+    assert shown == [{"0", "9"}, set(), {str(led) for led in (19, 20, 26, 29, 34, 37, 43, 44)}]
+    assert told[1] == ("stop", {}), "dark first, then no power"
