@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test browser buses lint bench bench-kills bench-retinas bench-peers lock clean
+.PHONY: help run test test-other browser buses lint bench bench-kills bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -32,6 +32,18 @@ test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
+
+# The contract suites once more, in an environment of another Python: what a Raspberry Pi's next system will bring.
+OTHER_PYTHON ?= python3.13
+
+.other-venv/ready: requirements.lock $(PI_LOCK)
+	@$(OTHER_PYTHON) -m venv .other-venv
+	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
+	@touch $@
+
+test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.
+	@umockdev-wrapper .other-venv/bin/python -m pytest -m "not rig" tests/ports
 
 buses: ## Install umockdev (Debian packages) where it is missing.
 	@tests/ports/emulators/install
@@ -65,5 +77,5 @@ lock: .venv/ready ## Write requirements.lock anew.
 		--extra test --group lock pyproject.toml -o requirements.lock
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .bench-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .bench-venv .other-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

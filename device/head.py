@@ -2,7 +2,9 @@
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from device.clock import Clock
@@ -22,7 +24,7 @@ from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermomete
 from device.sim.light import Mirrored, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
 from device.sim.world import World
-from device.spec import InstrumentSpec, ReplaySpec, load_head
+from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.values import Calibration
 
 LEASE_MARGIN_S = 0.05  # the guard's own timer comes first; the other process is for when it does not come
@@ -35,7 +37,6 @@ class Chips:
     thermometer: Thermometer | None = None
     battery: Battery | None = None
     memory: HeadMemory | None = None
-    button: Button | None = None
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Head:
     light: Light
     calibration: Calibration
     chips: Chips = Chips()
+    button: Button | None = None
     held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
 
     @property
@@ -88,99 +90,119 @@ def open_head(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Head
     """
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
-    with ExitStack() as undo:
-        head = (
-            _replayed(spec, clock, undo) if spec.camera.backend == "replay" else _opened(spec, clock, allocator, undo)
-        )
+    with Opening(spec, clock, allocator) as opening:
+        head = _replayed(opening) if spec.camera.backend == "replay" else _opened(opening)
         _refuse_another_head(head)
-        return replace(head, held=undo.pop_all())
+        return replace(head, held=opening.undo.pop_all())
 
 
-def _replayed(spec: InstrumentSpec, clock: Clock, undo: ExitStack) -> Head:
+class Opening:
+    """A head that is being opened part by part; inside its context, and what was opened is closed at the end of it."""
+
+    def __init__(self, spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> None:
+        self.spec, self.clock, self.undo = spec, clock, ExitStack()
+        self._allocator = allocator
+
+    def __enter__(self) -> "Opening":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.undo.close()
+
+    @cached_property
+    def world(self) -> World:
+        """What simulated parts share, and what a calibration that is not measured yet is taken from."""
+        if self.spec.sim is None:
+            raise SpecError(
+                f"{self.spec.name} has no calibration: without its PSF no picture can be made",
+                "Calibrate the head first, or add the table [sim] to try its parts with a simulated calibration.",
+            )
+        return World(self.spec, self.clock)
+
+    def lamp(self, chain: ChainSpec | None = None) -> Light:
+        """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
+        if self.spec.light.backend == "sim":
+            return SimLight(self.world)
+        chain = chain or self.spec.light.chain
+        assert chain is not None
+        guardian = Guardian(chain.device, chain.rows * chain.cols)
+        self.undo.callback(guardian.close)
+        ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S, self._pulse())
+        self.undo.callback(ring.close)
+        return Mirrored(ring, self.world) if self.spec.camera.backend == "sim" else ring
+
+    def _pulse(self) -> Heartbeat | None:
+        said = self.spec.gpio
+        if said is None or said.heartbeat is None or said.backend == "sim":
+            return None
+        pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
+        self.undo.callback(pulse.close)
+        return pulse
+
+    def button(self) -> Button | None:
+        """The shutter's button, if the head file names one."""
+        said = self.spec.gpio
+        if said is None or said.button is None:
+            return None
+        if said.backend == "sim":
+            return SimButton(self.world)
+        button = GpioButton(InputLine(said.chip, said.button), self.clock)
+        self.undo.callback(button.close)
+        return button
+
+    def camera(self, light: Light) -> Camera:
+        """The camera; its frames say what `light` shows."""
+        camera: Camera
+        match self.spec.camera.backend:
+            case "sim":
+                camera = SimCamera(self.world)
+            case "picamera2":
+                made_up = is_simulated(self.spec)
+                camera = PiCamera(self.spec.camera, light, self.clock, allocator=self._allocator, simulated=made_up)
+            case other:
+                raise SpecError(f"there is no driver for {other} yet")
+        self.undo.callback(camera.close)
+        return camera
+
+    def chips(self) -> Chips:
+        """The chips that the head file names."""
+        said = self.spec.bus
+        if said is None:
+            return Chips()
+        if said.backend == "sim":
+            return Chips(
+                SimThermometer(self.world) if said.thermometer is not None else None,
+                SimBattery(self.world) if said.battery is not None else None,
+                SimHeadMemory(self.world) if said.memory is not None else None,
+            )
+        bus = I2cBus(said.device)
+        self.undo.callback(bus.close)
+        return Chips(
+            Tmp117(bus, said.thermometer) if said.thermometer is not None else None,
+            Max17048(bus, said.battery) if said.battery is not None else None,
+            Eeprom24(bus, said.memory, self.clock) if said.memory is not None else None,
+        )
+
+
+def _replayed(opening: Opening) -> Head:
+    spec, clock = opening.spec, opening.clock
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
-    undo.callback(camera.close)
+    opening.undo.callback(camera.close)
     return Head(spec, camera, GuardedLight(lamp, clock, spec.light.max_on_s), recorded_calibration(camera, spec))
 
 
-def _opened(spec: InstrumentSpec, clock: Clock, allocator: Any, undo: ExitStack) -> Head:
-    if spec.sim is None:
-        raise SpecError(
-            f"{spec.name} has no calibration: without its PSF no picture can be made",
-            "Calibrate the head first, or add the table [sim] to try its parts with a simulated calibration.",
-        )
-    world = World(spec, clock)
+def _opened(opening: Opening) -> Head:
+    spec, world = opening.spec, opening.world
     if spec.camera.backend == "sim":
         for colour in {spec.light.colour, spec.light.preview_colour}:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
-    lamp = _lamp(spec, world, undo)
-    light = GuardedLight(lamp, clock, spec.light.max_on_s)
-    camera = _camera(spec, world, light, clock, allocator)
-    undo.callback(camera.close)
-    chips = replace(_chips(spec, world, clock, undo), button=_button(spec, world, clock, undo))
-    return Head(spec, camera, light, simulated_calibration(world), chips)
-
-
-def _lamp(spec: InstrumentSpec, world: World, undo: ExitStack) -> Light:
-    if spec.light.backend == "sim":
-        return SimLight(world)
-    chain = spec.light.chain
-    assert chain is not None
-    guardian = Guardian(chain.device, chain.rows * chain.cols)
-    undo.callback(guardian.close)
-    ring = Apa102Ring(chain, guardian, spec.light.max_on_s + LEASE_MARGIN_S, _pulse(spec, undo))
-    undo.callback(ring.close)
-    return Mirrored(ring, world) if spec.camera.backend == "sim" else ring
-
-
-def _pulse(spec: InstrumentSpec, undo: ExitStack) -> Heartbeat | None:
-    said = spec.gpio
-    if said is None or said.heartbeat is None or said.backend == "sim":
-        return None
-    pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
-    undo.callback(pulse.close)
-    return pulse
-
-
-def _button(spec: InstrumentSpec, world: World, clock: Clock, undo: ExitStack) -> Button | None:
-    said = spec.gpio
-    if said is None or said.button is None:
-        return None
-    if said.backend == "sim":
-        return SimButton(world)
-    button = GpioButton(InputLine(said.chip, said.button), clock)
-    undo.callback(button.close)
-    return button
-
-
-def _camera(spec: InstrumentSpec, world: World, light: Light, clock: Clock, allocator: Any) -> Camera:
-    match spec.camera.backend:
-        case "sim":
-            return SimCamera(world)
-        case "picamera2":
-            return PiCamera(spec.camera, light, clock, allocator=allocator, simulated=is_simulated(spec))
-        case other:
-            raise SpecError(f"there is no driver for {other} yet")
-
-
-def _chips(spec: InstrumentSpec, world: World, clock: Clock, undo: ExitStack) -> Chips:
-    said = spec.bus
-    if said is None:
-        return Chips()
-    if said.backend == "sim":
-        return Chips(
-            SimThermometer(world) if said.thermometer is not None else None,
-            SimBattery(world) if said.battery is not None else None,
-            SimHeadMemory(world) if said.memory is not None else None,
-        )
-    bus = I2cBus(said.device)
-    undo.callback(bus.close)
-    return Chips(
-        Tmp117(bus, said.thermometer) if said.thermometer is not None else None,
-        Max17048(bus, said.battery) if said.battery is not None else None,
-        Eeprom24(bus, said.memory, clock) if said.memory is not None else None,
-    )
+    light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s)
+    camera = opening.camera(light)
+    return Head(spec, camera, light, simulated_calibration(world), opening.chips(), opening.button())
 
 
 def _refuse_another_head(head: Head) -> None:

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 from device.drivers.blank import SPEED_HZ, dark_frame
 from device.drivers.guardian import Guardian
-from device.drivers.pattern import ring
 from device.errors import LightFault
+from device.optics.matrix import ring
 from device.spec import ChainSpec
 from device.values import Colour, Glow
 

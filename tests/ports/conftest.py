@@ -1,9 +1,11 @@
 """The parts under contract. A new camera or lamp joins by one line in IMPLEMENTATIONS."""
 
+import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,6 +28,12 @@ from tests.ports.emulators.timeline import Timeline
 sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
+
+
+def pytest_report_header() -> str:
+    """Which real packages the drivers are exercised through."""
+    found = ", ".join(f"{name} {version(name)}" for name in ("picamera2", "spidev", "smbus2"))
+    return f"drivers through: {found}; Python {platform.python_version()}"
 
 
 @dataclass
