@@ -8,16 +8,19 @@ from types import TracebackType
 from typing import Any
 
 from device.clock import Clock
+from device.drivers.button import GpioButton
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
+from device.drivers.gpio import InputLine, OutputLine
 from device.drivers.guardian import Guardian
+from device.drivers.heartbeat import Heartbeat
 from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
-from device.ports import Battery, Camera, HeadMemory, Light, Thermometer
+from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
-from device.sim.chips import SimBattery, SimHeadMemory, SimThermometer
+from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermometer
 from device.sim.light import Mirrored, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
 from device.sim.world import World
@@ -45,6 +48,7 @@ class Head:
     light: Light
     calibration: Calibration
     chips: Chips = Chips()
+    button: Button | None = None
     held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
 
     @property
@@ -74,7 +78,7 @@ class Head:
 
 def is_simulated(spec: InstrumentSpec) -> bool:
     """Whether any part of it, or what is known about it, is made up: then all of it counts as simulated."""
-    backends = {spec.camera.backend, spec.light.backend, spec.bus.backend if spec.bus else "none"}
+    backends = {spec.camera.backend, spec.light.backend, *(part.backend for part in (spec.bus, spec.gpio) if part)}
     return "sim" in backends or spec.sim is not None
 
 
@@ -125,9 +129,28 @@ class Opening:
         assert chain is not None
         guardian = Guardian(chain.device, chain.rows * chain.cols)
         self.undo.callback(guardian.close)
-        ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S)
+        ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S, self._pulse())
         self.undo.callback(ring.close)
         return Mirrored(ring, self.world) if self.spec.camera.backend == "sim" else ring
+
+    def _pulse(self) -> Heartbeat | None:
+        said = self.spec.gpio
+        if said is None or said.heartbeat is None or said.backend == "sim":
+            return None
+        pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
+        self.undo.callback(pulse.close)
+        return pulse
+
+    def button(self) -> Button | None:
+        """The shutter's button, if the head file names one."""
+        said = self.spec.gpio
+        if said is None or said.button is None:
+            return None
+        if said.backend == "sim":
+            return SimButton(self.world)
+        button = GpioButton(InputLine(said.chip, said.button), self.clock)
+        self.undo.callback(button.close)
+        return button
 
     def camera(self, light: Light) -> Camera:
         """The camera; its frames say what `light` shows."""
@@ -179,7 +202,7 @@ def _opened(opening: Opening) -> Head:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s)
     camera = opening.camera(light)
-    return Head(spec, camera, light, simulated_calibration(world), opening.chips())
+    return Head(spec, camera, light, simulated_calibration(world), opening.chips(), opening.button())
 
 
 def _refuse_another_head(head: Head) -> None:

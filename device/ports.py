@@ -80,3 +80,10 @@ class HeadMemory(Protocol):
 
     def write(self, identity: Identity) -> None:
         """Keep this from now on, also without power; it has been read back when this returns. BusFault otherwise."""
+
+
+class Button(Protocol):
+    """The shutter's button on the handle."""
+
+    def pressed_since_s(self) -> float | None:
+        """The clock's moment since which it is pressed; None while it is not. BusFault if it cannot be read."""

@@ -109,6 +109,15 @@ class BusSpec(Table):
     emptiest: float = Field(default=0.05, ge=0, lt=1)
 
 
+class GpioSpec(Table):
+    """Lines of the header: the heartbeat of the lamp's gate (hardware/dead-man.md), and the shutter's button."""
+
+    backend: Literal["sim", "gpiod"]
+    chip: str = Field(default="/dev/gpiochip0", pattern=r"^/dev/gpiochip\d+$")
+    heartbeat: int | None = Field(default=None, ge=0, le=63)
+    button: int | None = Field(default=None, ge=0, le=63)
+
+
 class OpticsSpec(Table):
     """The light path from the eye to the sensor, by default the paper's: "Optical design" and "Hardware design"."""
 
@@ -144,6 +153,7 @@ class InstrumentSpec(Table):
     light: LightSpec
     optics: OpticsSpec | None = None
     bus: BusSpec | None = None
+    gpio: GpioSpec | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Sequence
 from threading import Lock
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 from device.drivers.blank import SPEED_HZ, dark_frame
 from device.drivers.guardian import Guardian
@@ -34,16 +34,26 @@ def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Glow) -> bytes:
     return bytes(frame)
 
 
+class Pulse(Protocol):
+    """What holds the hardware gate open while a lease is live (device/drivers/heartbeat.py)."""
+
+    def start(self, lease_s: float) -> None:
+        """Beat from now, at most for `lease_s` seconds; the LEDs have power when this returns."""
+
+    def stop(self) -> None:
+        """Be still."""
+
+
 class Apa102Ring:
     """The lamp that `chain` describes. Raises LightFault when the chain cannot be reached, or not be kept safe."""
 
-    def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float) -> None:
+    def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
         try:
             import spidev
         except ImportError as error:
             raise LightFault(f"spidev cannot be used: {error}", "Install python3-spidev.") from error
         self._chain, self._guardian, self._lease_s = chain, guardian, lease_s
-        self._leds = ring(chain)
+        self._leds, self._pulse = ring(chain), pulse
         self._dark = dark_frame(chain.rows * chain.cols)
         self._glow: Glow | None = None
         self._lock = Lock()  # the guard's timer may darken while the owner of the head lights up
@@ -72,14 +82,21 @@ class Apa102Ring:
             if self._wire is None:
                 return
             self._glow = None
-            self._send(self._dark)
-            self._send(self._dark)
+            try:
+                self._send(self._dark)
+                self._send(self._dark)
+            finally:
+                if self._pulse is not None:
+                    self._pulse.stop()
             self._guardian.dark()
 
     def shine(self, glow: Glow) -> None:
         """Shine now, once the guardian knows; for the context only."""
         with self._lock:
             self._guardian.lit(self._lease_s)
+            if self._pulse is not None:
+                self._pulse.start(self._lease_s)
+                self._send(self._dark)  # LEDs that had no power show anything
             self._glow = glow
             self._send(lit_frame(self._chain, self._leds, glow))
 

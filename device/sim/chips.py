@@ -49,3 +49,15 @@ class SimHeadMemory:
 def _refuse_silence(world: World) -> None:
     if world.broken("bus.silent"):
         raise BusFault("no chip of the simulated head answers")
+
+
+class SimButton:
+    """A Button in a World."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def pressed_since_s(self) -> float | None:
+        """Since when somebody in the world presses it."""
+        _refuse_silence(self._world)
+        return self._world.pressed_since_s

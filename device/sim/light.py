@@ -28,12 +28,21 @@ class SimLight:
         return SimLit(self, glow)
 
     def off(self) -> None:
-        """Be dark; always allowed, harmless when it is dark already."""
+        """Be dark; always allowed, harmless when it is dark already.
+
+        LightFault while the world's fault "light.silent" lasts: LEDs keep their last colour when nobody reaches them.
+        """
+        self._hear()
         self._world.glow = None
+
+    def _hear(self) -> None:
+        if self._world.broken("light.silent"):
+            raise LightFault("the simulated lamp does not hear what it is told")
 
     def shine(self, glow: Glow) -> None:
         """Shine now; for the context only."""
         self.check()
+        self._hear()
         self._world.glow = glow
 
     def check(self) -> None:

@@ -3,12 +3,14 @@
 import os
 import random
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
 
-from device.drivers.guardian import Guardian
-from device.drivers.ring import Apa102Ring
+from device.drivers.guardian import BLANK, Guardian
+from device.drivers.ring import Apa102Ring, lit_frame
 from device.errors import LightFault
 from device.spec import ChainSpec
 from device.values import Glow
@@ -93,3 +95,66 @@ def test_a_ring_lights_its_own_leds_at_their_own_speed_and_full_global_brightnes
         assert wires().lit == {str(led): [0, 128, 0] for led in (19, 20, 26, 29, 34, 37, 43, 44)}
         assert wires().messages[-1]["hz"] == 4_000_000
         assert wires().messages[-1]["bytes"] == 268
+
+
+def light_up(chain):
+    """As a process does that nobody watches any more."""
+    wire = os.open(chain.device, os.O_RDWR)
+    os.write(wire, lit_frame(chain, (0, 9), Glow("red")))
+    os.close(wire)
+
+
+def test_a_dead_owner_s_child_that_holds_its_pipe_does_not_keep_the_light_on(sound_wires):
+    """The end of the pipe is not the end of the process: a fork without exec holds a copy of it."""
+    death = Victim(wires(), 5.0, "heir").end("heir")
+    assert death.was_lit
+    assert death.dark_after_s <= DARK_S
+
+
+def test_a_light_that_comes_after_its_lease_is_darkened_again(sound_wires):
+    """An owner may be stopped between its promise and its light, and go on much later."""
+    chain = ChainSpec()
+    with Guardian(chain.device, chain.rows * chain.cols) as guardian:
+        guardian.lit(0.05)
+        time.sleep(0.15)
+        light_up(chain)
+        time.sleep(0.05 + LATE_S)
+        assert not wires().lit
+
+
+def test_an_owner_that_dies_before_it_hears_the_answer_leaves_no_light(sound_wires):
+    chain = ChainSpec()
+    light_up(chain)
+    assert wires().lit
+    command = [sys.executable, "-I", "-S", str(BLANK), "--device", chain.device, "--guard"]
+    guard = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+    assert guard.stdin is not None
+    assert guard.stdout is not None
+    guard.stdout.close()
+    guard.stdin.write(b"dark\n")
+    assert guard.wait(timeout=5) == 0
+    guard.stdin.close()
+    assert not wires().lit
+
+
+def test_the_gate_is_open_before_the_light_and_what_leds_show_at_power_up_is_overwritten(sound_wires):
+    told = []
+
+    class Pulse:
+        def start(self, lease_s):
+            told.append(("start", lease_s, len(wires().messages)))
+            light_up(chain)  # what a chain may show when it gets power
+
+        def stop(self):
+            told.append(("stop", dict(wires().lit)))
+
+    chain = ChainSpec()
+    with Guardian(chain.device, chain.rows * chain.cols) as guardian:
+        ring = Apa102Ring(chain, guardian, LEASE_S, Pulse())
+        told.clear()
+        with ring.on(Glow("green")):
+            shown = [set(one["lit"]) for one in wires().messages[told[0][2] :]]
+        ring.close()
+    assert told[0][:2] == ("start", LEASE_S)
+    assert shown == [{"0", "9"}, set(), {str(led) for led in (19, 20, 26, 29, 34, 37, 43, 44)}]
+    assert told[1] == ("stop", {}), "dark first, then no power"

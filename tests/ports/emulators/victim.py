@@ -1,11 +1,13 @@
 """A process that takes pictures with the real ring until it dies: `python -m tests.ports.emulators.victim LEASE_S END`.
 
 Its phases are an exam's: aiming in red, a pause, the lit exposure, the dark one, the making. END is how it ends by
-itself inside a lit phase, if at all: "hang", "raise", "exit", or "never".
+itself inside a lit phase, if at all: "hang", "raise", "exit", "heir" (killed, while a child holds all its files), or
+"never".
 """
 
 import itertools
 import os
+import signal
 import sys
 import time
 
@@ -40,6 +42,11 @@ def finish(end: str) -> None:
         raise MemoryError("no room for another picture")
     if end == "exit":
         os._exit(1)
+    if end == "heir":
+        if os.fork() == 0:
+            time.sleep(1)
+            os._exit(0)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 if __name__ == "__main__":
