@@ -18,12 +18,13 @@ from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
-from device.errors import Busy, DiffuscopeError, LightLimit
+from device.errors import Busy, DiffuscopeError
 from device.head import Head
 from device.recon.focus import sharpest
 from device.recon.model import field_box
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
+from device.sequence import lit
 from device.values import Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
@@ -279,7 +280,7 @@ class Exam:
         camera, light = self.head.camera, self.head.light
         try:
             with light.on(Glow(self.head.spec.light.colour)):
-                frame = _lit(camera.expose(Shot(exposure_s)))
+                frame = lit(camera.expose(Shot(exposure_s)))
             return frame, camera.expose(Shot(exposure_s))
         finally:
             light.off()
@@ -345,7 +346,7 @@ class Exam:
         try:
             with self.head.light.on(Glow(spec.light.preview_colour)):
                 exposed_s = self.clock.now_s()
-                frame = _lit(self.head.camera.expose(Shot(spec.camera.preview_exposure_s)))
+                frame = lit(self.head.camera.expose(Shot(spec.camera.preview_exposure_s)))
         finally:
             self.head.light.off()
             dark_s = self.clock.now_s()
@@ -367,9 +368,3 @@ class Exam:
 
     def _tell_stage(self, id: str, stage: str, fraction: float, url: str | None = None) -> None:
         self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url)
-
-
-def _lit(frame: Frame) -> Frame:
-    if frame.glow is None:
-        raise LightLimit("the light went out during the exposure: it had been on for too long")
-    return frame
