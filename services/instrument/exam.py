@@ -11,14 +11,14 @@ import secrets
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
-from device.errors import Busy, DiffuscopeError, LightLimit
+from device.errors import Busy, DiffuscopeError, LightFault, LightLimit
 from device.head import Head
 from device.recon.focus import sharpest
 from device.recon.model import field_box
@@ -168,7 +168,8 @@ class Exam:
         except DiffuscopeError as error:  # of the planning: whatever comes later answers the press that it belongs to
             self.failure = error
         finally:
-            self.head.light.off()
+            with suppress(LightFault):  # then its guardian, and whoever ends this process, must darken it
+                self.head.light.off()
             self._end()
             if not self._closing:
                 self.problem = self.failure or DiffuscopeError("the instrument stopped unexpectedly")
