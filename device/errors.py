@@ -16,6 +16,9 @@ DiffuscopeError
 │   ├── HeadMismatch             the head's memory names another head
 │   ├── TooHot                   the head is too warm to go on
 │   └── PowerLow                 the battery is nearly empty
+├── CalibrationError             what the factory measured cannot be used
+│   ├── CalibrationMissing       there is none
+│   └── CalibrationDamaged       its files are not what was kept
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -142,6 +145,27 @@ class PowerLow(HardwareError):
 
     code = "power.low"
     default_remedy = "The battery is nearly empty. Charge the device before the next picture."
+
+
+class CalibrationError(DiffuscopeError):
+    """What the factory measured about a head cannot be used."""
+
+    code = "calibration"
+    default_remedy = "Calibrate the head again, or go back to an earlier calibration."
+
+
+class CalibrationMissing(CalibrationError):
+    """There is no calibration, or none of that name."""
+
+    code = "calibration.missing"
+    default_remedy = "Calibrate the head, or import its calibration from the service centre."
+
+
+class CalibrationDamaged(CalibrationError):
+    """The files of a calibration are missing or are not what was kept."""
+
+    code = "calibration.damaged"
+    default_remedy = "This calibration is damaged. Go back to an earlier one, or import it again."
 
 
 class Busy(DiffuscopeError):
