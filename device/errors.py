@@ -9,7 +9,8 @@ DiffuscopeError
 ├── HardwareError (OSError)      something that we hold is wrong
 │   ├── CameraMissing            the camera does not answer
 │   ├── CameraStalled            the camera answered, and then stopped
-│   ├── CameraMismatch           another sensor than the head file says, or not its raw counts
+│   ├── CameraWrong              another sensor, mode or count than the head's file says
+│   ├── CameraPacked             the camera gives no plain counts
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
 │   ├── BusFault                 a chip on the I2C bus does not answer
@@ -96,11 +97,18 @@ class CameraStalled(HardwareError):
     default_remedy = "The live picture has stopped. Wait a moment; if it stays, turn the device off and on."
 
 
-class CameraMismatch(HardwareError):
-    """The camera is another one than the head file says, or does not give the counts of its sensor."""
+class CameraWrong(HardwareError):
+    """The camera is not the one that the head's file describes."""
 
-    code = "camera.mismatch"
-    default_remedy = "This camera does not belong to this head. Call the technician."
+    code = "camera.wrong"
+    default_remedy = "This camera does not belong to this head. Start with the head file of the sensor that is fitted."
+
+
+class CameraPacked(HardwareError):
+    """The camera gives packed or compressed counts only, which lose what a measurement needs."""
+
+    code = "camera.packed"
+    default_remedy = "The camera's driver gives no plain counts. Update the operating system, then start again."
 
 
 class LightFault(HardwareError):

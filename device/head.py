@@ -15,6 +15,7 @@ from device.drivers.guardian import Guardian
 from device.drivers.heartbeat import Heartbeat
 from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
+from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
 from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
@@ -160,9 +161,11 @@ class Opening:
                 camera = SimCamera(self.world)
             case "picamera2":
                 made_up = is_simulated(self.spec)
-                camera = PiCamera(self.spec.camera, light, self.clock, allocator=self._allocator, simulated=made_up)
-            case other:
-                raise SpecError(f"there is no driver for {other} yet")
+                camera = PiCamera(self.spec.camera, light, allocator=self._allocator, simulated=made_up)
+            case "v4l2":
+                camera = V4l2Camera(self.spec.camera, light, self.clock, simulated=is_simulated(self.spec))
+            case "replay":
+                raise SpecError("a recording is opened with the folder that it is in")
         self.undo.callback(camera.close)
         return camera
 

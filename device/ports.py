@@ -25,6 +25,9 @@ class Camera(Protocol):
         Raises CameraMissing or CameraStalled; never returns an old frame.
         """
 
+    def prepare(self, shot: Shot) -> None:
+        """Let the exposure time of the next shot reach the sensor, in the dark: a light need not wait for it."""
+
     def close(self) -> None:
         """Release the sensor; closing twice is harmless."""
 

@@ -21,6 +21,7 @@ class SensorProfile(NamedTuple):
     bayer: bool
     global_shutter: bool
     sure: bool
+    row_us: float = 30.0  # time of a row: exposures are whole rows, within which they are compared
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -33,7 +34,9 @@ SENSORS: dict[str, SensorProfile] = {
     "quantalux": SensorProfile(
         "Thorlabs Quantalux sCMOS (paper)", 1080, 1920, 5.04, 23000, 1.03, 12, 64, False, False, True
     ),
-    "imx296": SensorProfile("Sony IMX296, Pi Global Shutter", 1088, 1456, 3.45, 10000, 2.2, 12, 60, False, True, False),
+    "imx296": SensorProfile(
+        "Sony IMX296, Pi Global Shutter", 1088, 1456, 3.45, 10000, 2.2, 12, 60, False, True, False, 14.8
+    ),
     "imx477": SensorProfile("Sony IMX477, Pi HQ", 3040, 4056, 1.55, 8180, 3.0, 12, 256, True, False, True),
     "imx500": SensorProfile("Sony IMX500, Pi AI", 3040, 4056, 1.55, 8180, 3.0, 10, 64, True, False, False),
     "imx283": SensorProfile("Sony IMX283, 1 inch", 3694, 5496, 2.4, 15000, 3.0, 12, 50, True, False, False),

@@ -32,6 +32,8 @@ class CameraSpec(Table):
     read_noise_e: float = Field(ge=0)
     exposure_s: float = Field(default=0.1, gt=0, le=10)
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
+    device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
+    row_us: float = Field(default=30.0, gt=0, le=1000)
 
     @model_validator(mode="before")
     @classmethod

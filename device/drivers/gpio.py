@@ -51,7 +51,9 @@ def _requested(chip: str, line: int, *, output: bool) -> tuple[Any, Any, Any]:
         import gpiod
         from gpiod.line import Bias, Direction, Value
     except ImportError as error:
-        raise BusFault(f"gpiod cannot be used: {error}", "Install python3-libgpiod or the package gpiod.") from error
+        raise BusFault(
+            f"{chip} needs gpiod, which cannot be used: {error}", "Install gpiod (pip, 2.2 or newer)."
+        ) from error
     if output:
         settings = gpiod.LineSettings(direction=Direction.OUTPUT, output_value=Value.INACTIVE)
     else:

@@ -9,6 +9,7 @@ from types import TracebackType
 from device.errors import LightFault
 
 ANSWER_S = 0.5  # a guardian that does not answer in that time will not be in time either
+DARKEN_S = 2.0
 BLANK = Path(__file__).with_name("blank.py")
 
 
@@ -39,12 +40,18 @@ class Guardian:
         self._tell("dark\n")
 
     def close(self) -> None:
-        """Let it go: it darkens once more and ends; closing twice is harmless."""
+        """Let it go: it darkens once more and ends; closing twice is harmless.
+
+        LightFault if the bus does not let it: then it goes on trying, without us.
+        """
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         self._child.stdin.close()
-        self._child.wait(timeout=5)
         self._child.stdout.close()
+        try:
+            self._child.wait(timeout=DARKEN_S)
+        except subprocess.TimeoutExpired as error:
+            raise LightFault("the lamp cannot be darkened; its guardian goes on trying") from error
 
     def __enter__(self) -> "Guardian":
         return self

@@ -1,169 +1,211 @@
-"""A sensor on a Raspberry Pi, through picamera2: one long-lived raw mode, and frames that match their light."""
+"""The camera of a Raspberry Pi, over picamera2: plain raw counts, exposed after the call, or a named error.
+
+One configuration lives as long as the camera; only exposure times change. Nothing waits without an end.
+"""
 
 import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from threading import Thread
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from device.clock import Clock
-from device.drivers.raw_counts import RawLayout
-from device.errors import CameraMismatch, CameraMissing, CameraStalled, FrameError
-from device.ports import Light
+from device.drivers.exposing import STUCK, Exposing, Shining
+from device.drivers.raw_counts import RawLayout, black_dn, pi_layout
+from device.errors import CameraMissing, CameraStalled, CameraWrong, HardwareError
 from device.spec import CameraSpec
-from device.values import Counts, Frame, Shot
+from device.values import Counts, Shot
 
 log = logging.getLogger(__name__)
 
-BUFFERS = 4
-MATCHED_US = 30  # exposures are whole rows, rounded down; a Pi reports up to two rows less than was asked
-LATE_FRAMES = BUFFERS + 6  # a control takes effect after the queued buffers and some frames; never more than this
-PATIENCE_S = 2.0  # by default, beyond what the exposures take, before a camera counts as stalled
-MAIN_PX = (320, 240)  # picamera2 has no raw-only mode: the picture nobody looks at is small
+BUFFERS = 3
+SETTLING = 16  # frames that may pass until a new exposure time arrives: those queued, and four of delay, twice over
+PATIENCE_S = 2.0
+OPENING_S = 10.0
+SPARE_US = 1500  # between two exposures, for the read-out's blanking; the sensor lengthens it to what it needs
+MAIN = (320, 240)  # the processed picture that picamera2 insists on; nobody looks at it
+MOSAICS = {0: "SRGGB", 1: "SGRBG", 2: "SGBRG", 3: "SBGGR", 5: "R"}  # libcamera's ColorFilterArrangement
+WANTED = {"AeEnable": False, "AwbEnable": False, "AnalogueGain": 1.0, "NoiseReductionMode": 0, "Sharpness": 0.0}
+NO_CAMERA = "Check the camera's ribbon cable and the line dtoverlay of config.txt, then turn the device off and on."
 
 
-class PiCamera:
-    """The camera that `spec` names; every frame says what `light` showed while it was exposed.
+class PiCamera(Exposing):
+    """A sensor of libcamera: one long-lived raw configuration, opened anew once if it falls silent.
 
-    `allocator` is picamera2's seam for buffers: None takes them from the kernel's heap. `simulated` marks frames of a
-    sensor that is none. Raises CameraMissing or CameraMismatch.
+    `simulated` marks its frames, where the driver runs over an emulated sensor; `patience_s` is how long past its
+    exposure a frame is waited for. Raises CameraMissing, CameraWrong, CameraPacked or CameraStalled.
     """
 
     def __init__(
-        self, spec: CameraSpec, light: Light, clock: Clock, *,
-        allocator: Any = None, patience_s: float = PATIENCE_S, simulated: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        spec: CameraSpec,
+        light: Shining,
+        *,
+        simulated: bool = False,
+        patience_s: float = PATIENCE_S,
+        allocator: Any = None,
+    ) -> None:
         try:
             from picamera2 import MappedArray, Picamera2
         except ImportError as error:
-            raise CameraMissing(f"picamera2 cannot be used: {error}", "Install python3-picamera2.") from error
-        self._make, self._mapped = Picamera2, MappedArray
-        self.spec, self._light, self._clock = spec, light, clock
-        self._allocator, self._patience_s, self._simulated = allocator, patience_s, simulated
-        self._number = 0
-        self._camera: Any = None
-        self._open()
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(rows, cols) of every frame."""
-        return self.spec.rows, self.spec.cols
+            raise CameraMissing(
+                f"picamera2 cannot be imported: {error}",
+                "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them.",
+            ) from error
+        self._library, self._mapped = Picamera2, MappedArray
+        super().__init__(spec, light, simulated)
+        self._patience_s, self._allocator = patience_s, allocator
+        self._device: Any = None
+        self._layout: RawLayout
+        self.open(Shot(spec.exposure_s))
 
     @property
     def facts(self) -> dict[str, str]:
-        """What answered, for a technician."""
-        if self._camera is None:
-            return {}
-        raw = self._camera.camera_configuration()["raw"]
-        model = self._camera.camera_properties["Model"]
-        return {"sensor": str(model), "format": str(raw["format"]), "stride": f"{raw['stride']} bytes"}
+        """What answered, for a technician: the sensor, and the raw format that libcamera granted."""
+        return {"sensor": str(self._spec.sensor), "format": self._layout.name}
 
-    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
-        """Take one frame whose exposure began after this call; `into` (rows, cols) is filled if it is given.
+    # Opening
 
-        A camera that stalls is opened anew once. Raises CameraMissing, CameraStalled, or FrameError for a wrong buffer.
-        """
-        if self._camera is None:
-            raise CameraMissing("the camera has been closed")
-        if into is not None and (into.shape != self.shape or into.dtype != np.uint16):
-            raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
-        out: Counts = np.empty(self.shape, np.uint16) if into is None else into
+    def _open(self, shot: Shot) -> None:
+        """Open the sensor that the head names, in its mode."""
         try:
-            return self._exposed(shot, out)
-        except TimeoutError:
-            log.warning("the camera stalled: it is opened anew")
-            self._shut()
-            self._open()
-        try:
-            return self._exposed(shot, out)
-        except TimeoutError as error:
-            raise CameraStalled("the camera gives no frame, nor after it was opened anew") from error
-
-    def close(self) -> None:
-        """Release the sensor; closing twice is harmless."""
-        if self._camera is not None:
-            self._shut()
-
-    def _open(self) -> None:
-        if not self._make.global_camera_info():
-            raise CameraMissing("no camera answers")
-        try:
-            camera = self._make(allocator=self._allocator)
-        except (RuntimeError, IndexError) as error:
-            raise CameraMissing(f"no camera answers: {error}") from error
-        self._camera = camera
-        try:
-            self._configure()
-            self._check_the_first_frame()
-        except TimeoutError as error:
-            self._shut()
-            raise CameraStalled("the camera answers, but gives no frame") from error
-        except BaseException:
-            self._shut()
+            within(OPENING_S, lambda: self._start(shot.exposure_s))
+        except (HardwareError, TimeoutError):
             raise
+        except (RuntimeError, ValueError, OSError) as error:  # what picamera2 and libcamera raise
+            raise CameraMissing(f"the {self._name} cannot be opened: {error}", NO_CAMERA) from error
 
-    def _configure(self) -> None:
-        camera, spec = self._camera, self.spec
-        model = str(camera.camera_properties.get("Model", "unknown"))
-        if spec.sensor is not None and not model.startswith(spec.sensor):
-            raise CameraMismatch(f"the sensor is {model}, the head file says {spec.sensor}")
-        size = spec.cols, spec.rows
-        exposure_us = round(spec.exposure_s * 1e6)
-        wished = {"AeEnable": False, "NoiseReductionMode": 0, "AnalogueGain": 1.0} | _timing(exposure_us)
-        camera.configure(
-            camera.create_still_configuration(
-                main={"size": MAIN_PX, "format": "XBGR8888"},
-                raw={"size": size, "format": f"R{spec.bit_depth}"},
-                sensor={"output_size": size, "bit_depth": spec.bit_depth},
-                buffer_count=BUFFERS,
-                controls={name: value for name, value in wished.items() if name in camera.camera_controls},
+    def _start(self, exposure_s: float) -> None:
+        device = self._device = self._library(self._which(), allocator=self._allocator)
+        spec, size = self._spec, (self._spec.cols, self._spec.rows)
+        mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        asked = device.create_video_configuration(
+            main={"size": (min(MAIN[0], size[0] & ~1), min(MAIN[1], size[1] & ~1))},
+            raw={"format": f"{mosaic}{spec.bit_depth}", "size": size},
+            sensor={"output_size": size, "bit_depth": spec.bit_depth},
+            controls=self._controls(device, exposure_s),
+            buffer_count=BUFFERS, queue=False, display=None, encode=None,
+        )  # fmt: skip
+        device.configure(asked)
+        self._layout = self._granted(device.camera_configuration())
+        device.start()
+        log.info("%s: raw %s", spec.sensor, device.camera_configuration()["raw"])
+
+    def _which(self) -> int:
+        """The number of the first camera of the sensor that the head names."""
+        found = [str(one["Model"]) for one in self._library.global_camera_info()]
+        if not found:
+            raise CameraMissing(f"libcamera finds no camera; this head needs the {self._spec.sensor}", NO_CAMERA)
+        for number, model in enumerate(found):
+            if model.lower().split("_")[0] == self._spec.sensor:
+                return number
+        raise CameraWrong(f"the camera is the {', '.join(found)}; this head needs the {self._spec.sensor}")
+
+    def _controls(self, device: Any, exposure_s: float) -> dict[str, Any]:
+        """What to ask of the sensor, as far as it knows of it; CameraWrong if exposures cannot be chosen at all."""
+        known = device.camera_controls
+        if missing := {"ExposureTime", "AnalogueGain", "FrameDurationLimits"} - known.keys():
+            raise CameraWrong(f"the {self._spec.sensor} does not let {', '.join(sorted(missing))} be chosen")
+        return {name: value for name, value in (WANTED | timing(exposure_s)).items() if name in known}
+
+    def _granted(self, configuration: dict[str, Any]) -> RawLayout:
+        """Read back what libcamera made of the request: it may adjust every word of it."""
+        raw, sensor, spec = configuration["raw"], configuration.get("sensor") or {}, self._spec
+        layout = pi_layout(raw["format"], spec.rows, spec.cols, spec.bit_depth)
+        if tuple(raw["size"]) != (spec.cols, spec.rows):
+            raise CameraWrong(
+                f"the {spec.sensor} has no mode of {spec.rows} x {spec.cols}: it grants {raw['size'][::-1]}"
             )
-        )
-        raw = camera.camera_configuration()["raw"]
-        if tuple(raw["size"]) != size:
-            raise CameraMismatch(f"the camera gives {raw['size']} pixels, the head file says {size}")
-        self._layout = RawLayout.of(str(raw["format"]), self.shape, int(raw["stride"]), spec.bit_depth)
-        self._asked_us = exposure_us
-        camera.start(show_preview=False)
+        if sensor.get("bit_depth", spec.bit_depth) != spec.bit_depth:
+            raise CameraWrong(f"the {spec.sensor} grants {sensor['bit_depth']} bits; this head needs {spec.bit_depth}")
+        return layout
 
-    def _check_the_first_frame(self) -> None:
-        request = self._camera.capture_request(wait=self._asked_us * 1e-6 * BUFFERS + self._patience_s)
-        try:
-            with self._mapped(request, "raw", write=False) as mapped:
-                used = self._layout.used_bits(mapped.array)
-        finally:
-            request.release()
-        self._layout.check(used)
+    # Frames
 
-    def _exposed(self, shot: Shot, out: Counts) -> Frame:
-        """The first frame that was exposed as asked and began after now."""
-        glow, now_s = self._light.glow, self._clock.now_s()
-        asked_us = round(shot.exposure_s * 1e6)
-        if asked_us != self._asked_us:
-            self._camera.set_controls(_timing(asked_us))
-            self._asked_us = asked_us
-        for _ in range(LATE_FRAMES):
-            request = self._camera.capture_request(wait=2 * shot.exposure_s + self._patience_s, flush=int(now_s * 1e9))
+    def _take(self, shot: Shot, counts: Counts | None) -> None:
+        """The next frame whose metadata say what was asked, into `counts`; None looks at it only: the first one.
+
+        Raises TimeoutError when no frame comes, CameraStalled when frames come, and never the right one.
+        """
+        self._device.set_controls(timing(shot.exposure_s))
+        flush: bool | None = True  # a frame that began before this call shows another light
+        wait_s = shot.exposure_s + self._patience_s
+        for _ in range(SETTLING):
+            request = self._device.capture_request(wait=wait_s, flush=flush)
             try:
-                told = request.get_metadata()
-                if abs(told["ExposureTime"] - asked_us) > MATCHED_US:
-                    continue
-                with self._mapped(request, "raw", write=False) as mapped:
-                    self._layout.unpack(mapped.array, out)
+                said = request.get_metadata()
+                right = self._is_as_asked(said, shot)
+                if right:
+                    with self._mapped(request, "raw", write=False) as raw:
+                        first = self._read(raw.array, counts)
             finally:
                 request.release()
-            self._number += 1
-            shown = glow if self._light.glow == glow else None
-            return Frame(out, shot.exposure_s, self._number, shown, simulated=self._simulated)
-        raise CameraStalled(f"the camera does not take an exposure of {asked_us} us; it says {told['ExposureTime']}")
+            if right:
+                if first is not None:
+                    self._check(first, said)
+                return
+            flush = None  # those that follow are later still
+        raise CameraStalled(
+            f"{SETTLING} frames passed, and none was exposed for {shot.exposure_s * 1e6:.0f} us at gain 1 "
+            f"(the last: {said.get('ExposureTime')} us, gain {said.get('AnalogueGain')})"
+        )
 
-    def _shut(self) -> None:
-        camera, self._camera = self._camera, None
-        camera.cancel_all_and_flush()
-        camera.stop()
-        camera.close()
+    def _is_as_asked(self, said: dict[str, Any], shot: Shot) -> bool:
+        """Whether a frame's own metadata fit: exposures are whole rows, rounded down."""
+        off_us = abs(float(said["ExposureTime"]) - shot.exposure_s * 1e6)
+        return off_us <= 1.5 * self._spec.row_us and abs(float(said.get("AnalogueGain", 1.0)) - 1) < 0.1
+
+    def _read(self, raw: NDArray[np.uint8], counts: Counts | None) -> NDArray[np.uint8] | None:
+        """Take the counts out of a buffer that is lent; or, with nowhere to put them, a copy of it."""
+        if counts is None:
+            return raw.copy()
+        self._layout.counts(raw, counts)
+        return None
+
+    def _check(self, raw: NDArray[np.uint8], said: dict[str, Any]) -> None:
+        """Refuse a first frame that is not as the head's file and the granted format say."""
+        self._layout.check(raw)
+        levels = said.get("SensorBlackLevels")
+        if not levels:
+            return
+        nominal_dn, ours_dn = black_dn(levels[0], self._spec.bit_depth), self._spec.black_dn
+        if abs(nominal_dn - ours_dn) > max(nominal_dn, ours_dn) / 2:
+            raise CameraWrong(
+                f"the {self._spec.sensor} says its black level is {nominal_dn:g} DN at {self._spec.bit_depth} bits; "
+                f"the head's file says {ours_dn:g}",
+                "Correct bit_depth or black_dn in the head's file.",
+            )
+
+    def _let_go(self) -> None:
+        """Stop and close, as far as that can be done in time: a driver may hang, and so may libcamera."""
+        device, self._device = self._device, None
+        if device is None:
+            return
+        device.cancel_all_and_flush()
+        try:
+            within(OPENING_S, device.close)
+        except TimeoutError as error:
+            raise CameraStalled(f"the {self._spec.sensor} cannot be closed: its driver hangs", STUCK) from error
 
 
-def _timing(exposure_us: int) -> dict[str, Any]:
-    """An exposure, and frames that are just long enough for it."""
-    return {"ExposureTime": exposure_us, "FrameDurationLimits": (exposure_us, max(exposure_us, 2 * exposure_us))}
+def timing(exposure_s: float) -> dict[str, Any]:
+    """The controls of an exposure time: the frames follow each other as fast as it lets them."""
+    exposure_us = round(exposure_s * 1e6)
+    return {"ExposureTime": exposure_us, "FrameDurationLimits": (exposure_us + SPARE_US, exposure_us + SPARE_US)}
+
+
+def within(limit_s: float, act: Callable[[], None]) -> None:
+    """Do something that may hang, in a thread of its own; TimeoutError after `limit_s`, the thread is left behind."""
+    done: Future[None] = Future()
+
+    def run() -> None:
+        try:
+            act()
+            done.set_result(None)
+        except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+            done.set_exception(error)
+
+    Thread(target=run, name="camera", daemon=True).start()
+    done.result(limit_s)

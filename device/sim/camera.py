@@ -41,6 +41,9 @@ class SimCamera:
         counts = world.sensor.read(world.electrons(shot.exposure_s), seed, into)
         return Frame(counts, shot.exposure_s, world.frames, world.glow, simulated=True)
 
+    def prepare(self, shot: Shot) -> None:
+        """Nothing to do: every exposure has its own time."""
+
     def close(self) -> None:
         """Release the sensor; closing twice is harmless."""
         self._open = False

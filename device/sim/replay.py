@@ -134,6 +134,9 @@ class ReplayCamera:
             counts = into
         return Frame(counts, shot.exposure_s, self._number, glow, self._simulated)
 
+    def prepare(self, shot: Shot) -> None:
+        """Nothing to do: every exposure has its own time."""
+
     def close(self) -> None:
         """Stop playing."""
         self._open = False

@@ -20,17 +20,25 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import web
 from device.errors import (
+    BusFault,
     Busy,
+    CalibrationDamaged,
+    CalibrationMissing,
     CameraMissing,
+    CameraPacked,
     CameraStalled,
+    CameraWrong,
     DiffuscopeError,
+    HeadMismatch,
     InputError,
     LightFault,
     LightLimit,
     NotKept,
+    PowerLow,
     StoreDamaged,
     StoreError,
     StoreFull,
+    TooHot,
 )  # fmt: skip
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
@@ -44,6 +52,14 @@ STATUS: dict[type[DiffuscopeError], int] = {
     LightFault: 423,
     CameraMissing: 503,
     CameraStalled: 503,
+    CameraWrong: 503,
+    CameraPacked: 503,
+    BusFault: 503,
+    HeadMismatch: 423,
+    TooHot: 423,
+    PowerLow: 423,
+    CalibrationMissing: 423,
+    CalibrationDamaged: 423,
     StoreFull: 507,
     StoreDamaged: 500,
     DiffuscopeError: 500,

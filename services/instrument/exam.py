@@ -11,14 +11,14 @@ import secrets
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
-from device.errors import Busy, DiffuscopeError
+from device.errors import Busy, DiffuscopeError, LightFault
 from device.head import Head
 from device.recon.focus import sharpest
 from device.recon.model import field_box
@@ -169,7 +169,8 @@ class Exam:
         except DiffuscopeError as error:  # of the planning: whatever comes later answers the press that it belongs to
             self.failure = error
         finally:
-            self.head.light.off()
+            with suppress(LightFault):  # then its guardian, and whoever ends this process, must darken it
+                self.head.light.off()
             self._end()
             if not self._closing:
                 self.problem = self.failure or DiffuscopeError("the instrument stopped unexpectedly")
@@ -278,6 +279,7 @@ class Exam:
         """A lit frame and a dark one, if the head is well."""
         self.head.check()
         camera, light = self.head.camera, self.head.light
+        camera.prepare(Shot(exposure_s))
         try:
             with light.on(Glow(self.head.spec.light.colour)):
                 frame = lit(camera.expose(Shot(exposure_s)))
@@ -343,6 +345,7 @@ class Exam:
     def _live_picture(self) -> tuple[bytes, float, float]:
         """A JPEG, and the moments at which its light went on and off: aiming must not use up the picture's light."""
         spec = self.head.spec
+        self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
             with self.head.light.on(Glow(spec.light.preview_colour)):
                 exposed_s = self.clock.now_s()

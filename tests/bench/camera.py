@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 
-from device.drivers.raw_counts import RawLayout
+from device.drivers.raw_counts import pi_layout
 from device.recon.geometry import Grid
 from device.recon.prepare import Preparer
 from device.values import Calibration, Psf, Sensor
@@ -25,12 +25,12 @@ def camera() -> None:
     counts, dark = np.empty(SHAPE, np.uint16), rng.integers(58, 63, SHAPE, dtype=np.uint16)
     timing.head("a raw buffer to linear float32, 1456 x 1088", "ms", "copies", "limit")
     for name in ("R10", "R16"):
-        layout = RawLayout.of(name, SHAPE, STRIDE, BITS)
+        layout = pi_layout(name, *SHAPE, BITS)
         raw = rng.integers(60, 1000, (SHAPE[0], STRIDE // 2), dtype=np.uint16) << layout.shift
         buffer, there = raw.view(np.uint8), np.empty(raw.nbytes, np.uint8)
 
         def act(layout=layout, buffer=buffer) -> None:
-            prepare(layout.unpack(buffer, counts), dark)
+            prepare(layout.counts(buffer, counts), dark)
 
         copy_ms, ms = timing.side_by_side_ms(lambda b=buffer, t=there: np.copyto(t, b.reshape(-1)), act)
         timing.row(f"{name}, with dark frame and flat field", ms, ms / copy_ms, limit=LIMIT_MS, value=ms)

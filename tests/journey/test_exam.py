@@ -220,6 +220,19 @@ def test_a_broken_part_fails_the_press_dark_and_a_mended_one_works(rig: Any, fau
     assert rig.store.captures() == [kept]
 
 
+def test_a_lamp_that_cannot_be_darkened_ends_the_process(make_rig: Any) -> None:
+    """What nobody can switch off is for the guardian and for systemd: both act when this process is gone."""
+    rig = make_rig()
+    rig.world.faults.add("light.silent")
+    with pytest.raises(LightFault):
+        rig.exam.press("OD").result(30)
+    assert rig.died.wait(30)
+    assert isinstance(rig.exam.problem, LightFault)
+    with pytest.raises(Busy):
+        rig.exam.press("OD")
+    rig.world.faults.clear()
+
+
 def assert_dark_and_empty(rig: Any) -> None:
     assert rig.world.glow is None
     assert rig.exam.state == "aim"

@@ -16,6 +16,7 @@ from device.clock import Clock, SystemClock, VirtualClock
 from device.drivers.guardian import Guardian
 from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
+from device.drivers.v4l2_camera import V4l2Camera
 from device.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
@@ -24,6 +25,7 @@ from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
 from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from tests.ports.emulators.timeline import Timeline
+from tests.ports.emulators.video import EmulatedVideo
 
 sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
 
@@ -108,7 +110,18 @@ def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCa
     clock = SystemClock()
     libcamera.plugged.append(Sensor(World(small_head(), clock), lamp, wide=wide))
     spec = small_head().camera.model_copy(update={"backend": "picamera2", "sensor": "imx296", "exposure_s": 0.02})
-    return PiCamera(spec, light, clock, allocator=MemoryAllocator(), simulated=True)
+    return PiCamera(spec, light, allocator=MemoryAllocator(), simulated=True)
+
+
+def v4l2_rig(grants: str, bits: int) -> Rig:
+    """The V4L2 driver over an emulated device of one format, in real time."""
+    head = small_head()
+    black_dn = 60.0 * 2 ** (bits - 10)
+    camera = head.camera.model_copy(update={"backend": "v4l2", "bit_depth": bits, "black_dn": black_dn})
+    world = World(head.model_copy(update={"camera": camera}), SystemClock())
+    light = SimLight(world)
+    driver = V4l2Camera(camera, light, world.clock, simulated=True, transport=EmulatedVideo(world, grants))
+    return Rig(driver, light, world.clock)
 
 
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
@@ -118,6 +131,10 @@ IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "picamera2 as on a Pi 4": pi_rig,
     "picamera2 as on a Pi 5": partial(pi_rig, wide=True),
     "picamera2, spidev": ring_rig,
+    "v4l2, GREY": partial(v4l2_rig, "GREY", 8),
+    "v4l2, Y10": partial(v4l2_rig, "Y10 ", 10),
+    "v4l2, Y12": partial(v4l2_rig, "Y12 ", 12),
+    "v4l2, Y16": partial(v4l2_rig, "Y16 ", 12),
 }
 
 

