@@ -104,7 +104,7 @@ def installed(opt: Path) -> list[str]:
     for name in files():
         if name.startswith(("device/", "services/", "web/", "hardware/", "systemd/")):
             (opt / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(ROOT / name, opt / name)
+            shutil.copy2(ROOT / name, opt / name)  # with its time, by which numba knows what it has compiled
     blanker = opt / "device" / "drivers" / "blank.py"
     if blanker.exists():
         blanker.rename(blanker.with_name("blank_itself.py"))
@@ -121,7 +121,10 @@ def installed(opt: Path) -> list[str]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() or path.parent.name == "bin" else 0o644)
     here = Path(sys.prefix) / "lib" / python / "site-packages"
+    compiled = CACHE / "compiled"
+    compiled.mkdir(exist_ok=True)
     return [
+        f"--bind={compiled}:/var/cache/private/diffuscope",
         f"--bind-ro={opt}:/opt/diffuscope", f"--bind-ro={sys.base_prefix}:/opt/python",
         f"--bind-ro={here}:/opt/diffuscope/{packages.relative_to(opt)}",
     ]  # fmt: skip
