@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-systemd browser lint bench bench-retinas bench-peers lock clean
+.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -25,8 +25,9 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
-test: .venv/ready browser ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser
+test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports
+	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser
 
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
@@ -37,6 +38,21 @@ test-systemd: .venv/ready ## Boot a real systemd in a container and try the unit
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
 
+# The contract suites once more, in an environment of another Python: what a Raspberry Pi's next system will bring.
+OTHER_PYTHON ?= python3.13
+
+.other-venv/ready: requirements.lock $(PI_LOCK)
+	@$(OTHER_PYTHON) -m venv .other-venv
+	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
+	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
+	@touch $@
+
+test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.
+	@umockdev-wrapper .other-venv/bin/python -m pytest -m "not rig" tests/ports
+
+buses: ## Install umockdev (Debian packages) where it is missing.
+	@tests/ports/emulators/install
+
 lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --diff --quiet .
@@ -45,6 +61,9 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 
 bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
+
+bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
+	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
@@ -63,5 +82,5 @@ lock: .venv/ready ## Write requirements.lock anew.
 		--extra test --group lock pyproject.toml -o requirements.lock
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .bench-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .bench-venv .other-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -13,7 +13,12 @@ DiffuscopeError
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
 │   ├── BusFault                 a chip on the I2C bus does not answer
-│   └── HeadMismatch             the head's memory names another head
+│   ├── HeadMismatch             the head's memory names another head
+│   ├── TooHot                   the head is too warm to go on
+│   └── PowerLow                 the battery is nearly empty
+├── CalibrationError             what the factory measured cannot be used
+│   ├── CalibrationMissing       there is none
+│   └── CalibrationDamaged       its files are not what was kept
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -126,6 +131,41 @@ class HeadMismatch(HardwareError):
 
     code = "head.mismatch"
     default_remedy = "This head was calibrated as another one. Do not take pictures; call the technician."
+
+
+class TooHot(HardwareError):
+    """The head is too warm to go on."""
+
+    code = "head.hot"
+    default_remedy = "The device is too warm. Turn it off, and let it cool in the shade."
+
+
+class PowerLow(HardwareError):
+    """The battery is nearly empty."""
+
+    code = "power.low"
+    default_remedy = "The battery is nearly empty. Charge the device before the next picture."
+
+
+class CalibrationError(DiffuscopeError):
+    """What the factory measured about a head cannot be used."""
+
+    code = "calibration"
+    default_remedy = "Calibrate the head again, or go back to an earlier calibration."
+
+
+class CalibrationMissing(CalibrationError):
+    """There is no calibration, or none of that name."""
+
+    code = "calibration.missing"
+    default_remedy = "Calibrate the head, or import its calibration from the service centre."
+
+
+class CalibrationDamaged(CalibrationError):
+    """The files of a calibration are missing or are not what was kept."""
+
+    code = "calibration.damaged"
+    default_remedy = "This calibration is damaged. Go back to an earlier one, or import it again."
 
 
 class Busy(DiffuscopeError):

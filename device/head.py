@@ -1,56 +1,217 @@
 """The one place that chooses: a head file becomes a camera, a guarded light and a calibration. Never a fallback."""
 
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from types import TracebackType
+from typing import Any
 
 from device.clock import Clock
-from device.errors import SpecError
+from device.drivers.button import GpioButton
+from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
+from device.drivers.gpio import InputLine, OutputLine
+from device.drivers.guardian import Guardian
+from device.drivers.heartbeat import Heartbeat
+from device.drivers.pi_camera import PiCamera
+from device.drivers.ring import Apa102Ring
+from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
-from device.ports import Camera, Light
+from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
-from device.sim.light import SimLight
+from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermometer
+from device.sim.light import Mirrored, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
 from device.sim.world import World
-from device.spec import InstrumentSpec, ReplaySpec, load_head
+from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.values import Calibration
+
+LEASE_MARGIN_S = 0.05  # the guard's own timer comes first; the other process is for when it does not come
+
+
+@dataclass(frozen=True)
+class Chips:
+    """The chips of a head, as far as it has them."""
+
+    thermometer: Thermometer | None = None
+    battery: Battery | None = None
+    memory: HeadMemory | None = None
 
 
 @dataclass(frozen=True)
 class Head:
-    """An opened head: what it is, its camera, its guarded light, and what the factory measured about it."""
+    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it."""
 
     spec: InstrumentSpec
     camera: Camera
     light: Light
     calibration: Calibration
+    chips: Chips = Chips()
+    button: Button | None = None
+    held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
 
     @property
     def kind(self) -> str:
         """`simulated`, `recording` or `real`: what the page must say about every picture."""
-        return {"sim": "simulated", "replay": "recording"}.get(self.spec.camera.backend, "real")
+        if self.spec.camera.backend == "replay":
+            return "recording"
+        return "simulated" if is_simulated(self.spec) else "real"
+
+    def check(self) -> None:
+        """Before every picture: TooHot or PowerLow if the head had better rest, BusFault if it cannot say."""
+        said = self.spec.bus
+        if said is None:
+            return
+        if self.chips.thermometer is not None and (warm_c := self.chips.thermometer.read_c()) > said.warmest_c:
+            raise TooHot(f"the head is {warm_c:.0f} C warm, more than {said.warmest_c:.0f}")
+        if self.chips.battery is not None and (charge := self.chips.battery.read()).fraction < said.emptiest:
+            raise PowerLow(f"the battery is at {charge.fraction:.0%}, {charge.volts:.2f} V")
 
     def close(self) -> None:
-        """Be dark, then let the camera go."""
-        self.light.off()
-        self.camera.close()
+        """Be dark, then let every part go."""
+        try:
+            self.light.off()
+        finally:
+            self.held.close()
 
 
-def open_head(spec: InstrumentSpec, clock: Clock) -> Head:
-    """Open the parts that the head file names; a part that is missing is an error, never replaced by another."""
-    if spec.camera.backend != spec.light.backend:
+def is_simulated(spec: InstrumentSpec) -> bool:
+    """Whether any part of it, or what is known about it, is made up: then all of it counts as simulated."""
+    backends = {spec.camera.backend, spec.light.backend, *(part.backend for part in (spec.bus, spec.gpio) if part)}
+    return "sim" in backends or spec.sim is not None
+
+
+def open_head(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Head:
+    """Open the parts that the head file names; a part that is missing is an error, never replaced by another.
+
+    `allocator` is where a camera driver takes its buffers from; None: where its library does. Whatever was opened
+    before an error is dark and closed after it.
+    """
+    if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
-    if spec.camera.backend == "sim":
-        world = World(spec, clock)
-        for colour in {spec.light.colour, spec.light.preview_colour}:
-            world.electrons_per_s(colour)  # now, not while a lamp is lit
-        light = GuardedLight(SimLight(world), clock, spec.light.max_on_s)
-        return Head(spec, SimCamera(world), light, simulated_calibration(world))
+    with Opening(spec, clock, allocator) as opening:
+        head = _replayed(opening) if spec.camera.backend == "replay" else _opened(opening)
+        _refuse_another_head(head)
+        return replace(head, held=opening.undo.pop_all())
+
+
+class Opening:
+    """A head that is being opened part by part; inside its context, and what was opened is closed at the end of it."""
+
+    def __init__(self, spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> None:
+        self.spec, self.clock, self.undo = spec, clock, ExitStack()
+        self._allocator = allocator
+
+    def __enter__(self) -> "Opening":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.undo.close()
+
+    @cached_property
+    def world(self) -> World:
+        """What simulated parts share, and what a calibration that is not measured yet is taken from."""
+        if self.spec.sim is None:
+            raise SpecError(
+                f"{self.spec.name} has no calibration: without its PSF no picture can be made",
+                "Calibrate the head first, or add the table [sim] to try its parts with a simulated calibration.",
+            )
+        return World(self.spec, self.clock)
+
+    def lamp(self, chain: ChainSpec | None = None) -> Light:
+        """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
+        if self.spec.light.backend == "sim":
+            return SimLight(self.world)
+        chain = chain or self.spec.light.chain
+        assert chain is not None
+        guardian = Guardian(chain.device, chain.rows * chain.cols)
+        self.undo.callback(guardian.close)
+        ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S, self._pulse())
+        self.undo.callback(ring.close)
+        return Mirrored(ring, self.world) if self.spec.camera.backend == "sim" else ring
+
+    def _pulse(self) -> Heartbeat | None:
+        said = self.spec.gpio
+        if said is None or said.heartbeat is None or said.backend == "sim":
+            return None
+        pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
+        self.undo.callback(pulse.close)
+        return pulse
+
+    def button(self) -> Button | None:
+        """The shutter's button, if the head file names one."""
+        said = self.spec.gpio
+        if said is None or said.button is None:
+            return None
+        if said.backend == "sim":
+            return SimButton(self.world)
+        button = GpioButton(InputLine(said.chip, said.button), self.clock)
+        self.undo.callback(button.close)
+        return button
+
+    def camera(self, light: Light) -> Camera:
+        """The camera; its frames say what `light` shows."""
+        camera: Camera
+        match self.spec.camera.backend:
+            case "sim":
+                camera = SimCamera(self.world)
+            case "picamera2":
+                made_up = is_simulated(self.spec)
+                camera = PiCamera(self.spec.camera, light, self.clock, allocator=self._allocator, simulated=made_up)
+            case other:
+                raise SpecError(f"there is no driver for {other} yet")
+        self.undo.callback(camera.close)
+        return camera
+
+    def chips(self) -> Chips:
+        """The chips that the head file names."""
+        said = self.spec.bus
+        if said is None:
+            return Chips()
+        if said.backend == "sim":
+            return Chips(
+                SimThermometer(self.world) if said.thermometer is not None else None,
+                SimBattery(self.world) if said.battery is not None else None,
+                SimHeadMemory(self.world) if said.memory is not None else None,
+            )
+        bus = I2cBus(said.device)
+        self.undo.callback(bus.close)
+        return Chips(
+            Tmp117(bus, said.thermometer) if said.thermometer is not None else None,
+            Max17048(bus, said.battery) if said.battery is not None else None,
+            Eeprom24(bus, said.memory, self.clock) if said.memory is not None else None,
+        )
+
+
+def _replayed(opening: Opening) -> Head:
+    spec, clock = opening.spec, opening.clock
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
-    guarded = GuardedLight(lamp, clock, spec.light.max_on_s)
-    return Head(spec, camera, guarded, recorded_calibration(camera, spec))
+    opening.undo.callback(camera.close)
+    return Head(spec, camera, GuardedLight(lamp, clock, spec.light.max_on_s), recorded_calibration(camera, spec))
+
+
+def _opened(opening: Opening) -> Head:
+    spec, world = opening.spec, opening.world
+    if spec.camera.backend == "sim":
+        for colour in {spec.light.colour, spec.light.preview_colour}:
+            world.electrons_per_s(colour)  # now, not while a lamp is lit
+    light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s)
+    camera = opening.camera(light)
+    return Head(spec, camera, light, simulated_calibration(world), opening.chips(), opening.button())
+
+
+def _refuse_another_head(head: Head) -> None:
+    """A head that knows whose it is must be the one that the calibration was measured on."""
+    known = head.chips.memory.read() if head.chips.memory is not None else None
+    if known is not None and known.calibration_id != head.calibration.id:
+        raise HeadMismatch(
+            f"head {known.serial} was calibrated as {known.calibration_id[:16]}, loaded is {head.calibration.id}"
+        )
 
 
 def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:

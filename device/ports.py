@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from device.values import Frame, Glow, Shot
+from device.values import Charge, Frame, Glow, Identity, Shot
 
 
 class Camera(Protocol):
@@ -56,3 +56,34 @@ class Light(Protocol):
 
     def off(self) -> None:
         """Be dark; always allowed, harmless when it is dark already."""
+
+
+class Thermometer(Protocol):
+    """How warm the head is inside."""
+
+    def read_c(self) -> float:
+        """Degrees Celsius now; BusFault if it does not answer, or answers nonsense."""
+
+
+class Battery(Protocol):
+    """What the device runs on."""
+
+    def read(self) -> Charge:
+        """How full it is; BusFault if it does not answer, or answers nonsense."""
+
+
+class HeadMemory(Protocol):
+    """A few bytes that travel with the optical head: who it is, and which calibration is its own."""
+
+    def read(self) -> Identity | None:
+        """What it holds; None if nothing was ever written. BusFault if it does not answer, or is damaged."""
+
+    def write(self, identity: Identity) -> None:
+        """Keep this from now on, also without power; it has been read back when this returns. BusFault otherwise."""
+
+
+class Button(Protocol):
+    """The shutter's button on the handle."""
+
+    def pressed_since_s(self) -> float | None:
+        """The clock's moment since which it is pressed; None while it is not. BusFault if it cannot be read."""

@@ -55,13 +55,67 @@ class CameraSpec(Table):
         return self.full_well_e / (self.white_dn - self.black_dn)
 
 
+class ChainSpec(Table):
+    """A matrix of APA102 LEDs on SPI, and which of them are the ring; by default SparkFun's LuMini 8 x 8.
+
+    `axis` is where the light path goes through it, (row, column) from the bottom left, LEDs facing you; by default its
+    middle. `leds` names the ring's LEDs where geometry does not; `trims` dims each of them to the weakest.
+    """
+
+    device: str = Field(default="/dev/spidev0.0", pattern=r"^/dev/spidev\d+\.\d+$")
+    rows: int = Field(default=8, ge=1, le=16)
+    cols: int = Field(default=8, ge=1, le=16)
+    pitch_mm: float = Field(default=3.175, gt=0, le=20)
+    axis: tuple[float, float] | None = None
+    ring_mm: float = Field(default=10.04, gt=0, le=100)
+    tolerance_mm: float = Field(default=0.2, gt=0, le=10)
+    leds: tuple[int, ...] | None = Field(default=None, min_length=1)
+    trims: tuple[float, ...] | None = None
+    most_lit: int = Field(default=16, ge=1)  # at 20 mA each: what the head's supply was built for
+
+    @model_validator(mode="after")
+    def _the_ring_is_on_the_matrix(self) -> "ChainSpec":
+        if self.leds is not None:
+            if max(self.leds) >= self.rows * self.cols or min(self.leds) < 0 or len(set(self.leds)) < len(self.leds):
+                raise ValueError(f"leds are different numbers from 0 to {self.rows * self.cols - 1}")
+            if len(self.leds) > self.most_lit:
+                raise ValueError(f"{len(self.leds)} leds are more than most_lit = {self.most_lit}")
+        if self.trims is not None and (self.leds is None or len(self.trims) != len(self.leds)):
+            raise ValueError("trims are as many as leds")
+        if self.trims is not None and not all(0 < trim <= 1 for trim in self.trims):
+            raise ValueError("trims are above 0 and at most 1")
+        return self
+
+
 class LightSpec(Table):
     """The LED ring: colours for the picture and for aiming, and how long the guard lets it shine at once."""
 
-    backend: Literal["sim", "replay"]
+    backend: Literal["sim", "replay", "apa102"]
+    chain: ChainSpec | None = None
     colour: Literal["red", "green", "blue"] = "green"
     preview_colour: Literal["red", "green"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
+
+
+class BusSpec(Table):
+    """The chips on I2C, by address; what is not named is not there. Beyond the limits no picture is taken."""
+
+    backend: Literal["sim", "smbus"]
+    device: str = Field(default="/dev/i2c-1", pattern=r"^/dev/i2c-\d+$")
+    thermometer: int | None = Field(default=None, ge=0x08, le=0x77)  # TMP117
+    battery: int | None = Field(default=None, ge=0x08, le=0x77)  # MAX17048
+    memory: int | None = Field(default=None, ge=0x08, le=0x77)  # 24LC32
+    warmest_c: float = Field(default=55.0, gt=0, le=100)
+    emptiest: float = Field(default=0.05, ge=0, lt=1)
+
+
+class GpioSpec(Table):
+    """Lines of the header: the heartbeat of the lamp's gate (hardware/dead-man.md), and the shutter's button."""
+
+    backend: Literal["sim", "gpiod"]
+    chip: str = Field(default="/dev/gpiochip0", pattern=r"^/dev/gpiochip\d+$")
+    heartbeat: int | None = Field(default=None, ge=0, le=63)
+    button: int | None = Field(default=None, ge=0, le=63)
 
 
 class OpticsSpec(Table):
@@ -98,6 +152,8 @@ class InstrumentSpec(Table):
     camera: CameraSpec
     light: LightSpec
     optics: OpticsSpec | None = None
+    bus: BusSpec | None = None
+    gpio: GpioSpec | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 
@@ -105,8 +161,12 @@ class InstrumentSpec(Table):
 def load_head(path: Path) -> InstrumentSpec:
     """Read a head TOML (`hardware/heads/*.toml`); a missing table that its backends need is refused."""
     spec = load_toml(path, InstrumentSpec)
+    if spec.light.backend == "apa102" and spec.camera.backend != "replay" and spec.optics is None:
+        raise SpecError(f"{path}: a head needs the table [optics]")
     if "sim" in (spec.camera.backend, spec.light.backend) and (spec.sim is None or spec.optics is None):
         raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
+    if spec.light.backend == "apa102" and spec.light.chain is None:
+        raise SpecError(f"{path}: a ring of APA102 LEDs needs the table [light.chain]")
     if spec.camera.backend == "replay" and spec.replay is None:
         raise SpecError(f"{path}: a replayed head needs the table [replay]")
     for key in ("exposure_s", "preview_exposure_s"):

@@ -42,6 +42,22 @@ class Glow:
 
 
 @dataclass(frozen=True)
+class Charge:
+    """A battery's state: how full it is, 0 to 1, and its voltage."""
+
+    fraction: float
+    volts: float
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who an optical head is: its serial number, and the content hash of its calibration."""
+
+    serial: str
+    calibration_id: str
+
+
+@dataclass(frozen=True)
 class Shot:
     """One exposure asked of the camera."""
 

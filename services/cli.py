@@ -99,6 +99,23 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
 
 
+@app.command("probe")
+def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")]) -> None:
+    """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips. Lights the lamp shortly.
+
+    The exit status is 1 if a part is not well.
+    """
+    from device.probe import probe  # the drivers, which the other commands do not need
+
+    well = True
+    for found in probe(load_head(head), SystemClock()):
+        well &= found.ok
+        typer.echo(f"{'ok  ' if found.ok else 'FAIL'}  {found.part:<14} {found.said}")
+        if found.remedy:
+            typer.echo(f"{'':<22}{found.remedy}")
+    raise typer.Exit(0 if well else 1)
+
+
 @app.command()
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],

@@ -14,9 +14,9 @@ from device.sim.render import electrons_per_s, fitted, psf
 from device.sim.sensor import SensorModel
 from device.sim.setup import Scene, Setup
 from device.spec import InstrumentSpec, OpticsSpec
-from device.values import Colour, Eye, Geometry, Glow, Image
+from device.values import Charge, Colour, Eye, Geometry, Glow, Identity, Image
 
-FAULTS = frozenset({"camera.missing", "camera.stalled", "light.fault"})
+FAULTS = frozenset({"camera.missing", "camera.stalled", "light.fault", "light.silent", "bus.silent"})
 
 Choice = Callable[[Scene], tuple[Decision, ...]]
 
@@ -26,7 +26,8 @@ class World:
 
     `eye` is that of the procedural retina; `choose` decides which effects each colour of light calls for;
     `ambient_e_per_s` is light that comes without the lamp, beside what the scene says.
-    `faults` holds what is broken now: "camera.missing", "camera.stalled", "light.fault".
+    `faults` holds what is broken now: "camera.missing", "camera.stalled", "light.fault", "light.silent"
+    (nothing reaches the LEDs, which keep what they show), "bus.silent".
     """
 
     def __init__(
@@ -46,6 +47,9 @@ class World:
         self.glow: Glow | None = None
         self.faults: set[str] = set()
         self.frames = 0
+        self.celsius, self.charge = 25.0, Charge(0.775, 3.88)
+        self.identity: Identity | None = None
+        self.pressed_since_s: float | None = None
         self._choose = choose
         self._setups: dict[Colour, Setup] = {}
         self._rates: dict[Colour, Image] = {}

@@ -280,7 +280,8 @@ class Exam:
         return kept
 
     def _expose(self, exposure_s: float) -> tuple[Frame, Frame]:
-        """A lit frame and a dark one."""
+        """A lit frame and a dark one, if the head is well."""
+        self.head.check()
         camera, light = self.head.camera, self.head.light
         try:
             with light.on(Glow(self.head.spec.light.colour)):

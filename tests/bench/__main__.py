@@ -1,7 +1,7 @@
 """`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
 
 Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `deadline`, `peers`, `simulator` or `scaling`.
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator` or `scaling`.
 """
 
 import os
@@ -13,11 +13,11 @@ from pathlib import Path
 from device.recon.plan import Planner, processor
 from device.sim.staged import staged
 from device.spec import load_head
-from tests.bench import deadline, peers, scaling, simulator, speed
+from tests.bench import camera, deadline, peers, scaling, simulator, speed
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "deadline", "peers", "simulator", "scaling")
+PARTS = ("speed", "camera", "deadline", "peers", "simulator", "scaling")
 
 
 def main(parts: list[str]) -> None:
@@ -38,6 +38,8 @@ def main(parts: list[str]) -> None:
             deadline.deadlines(scene, planner)
         if "peers" in wanted:
             peers.peers(scene, planner)
+    if "camera" in wanted:
+        camera.camera()
     if "simulator" in wanted:
         simulator.simulator()
     if "scaling" in wanted:

@@ -1,9 +1,11 @@
 """The parts under contract. A new camera or lamp joins by one line in IMPLEMENTATIONS."""
 
+import platform
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,19 +13,27 @@ import numpy as np
 import pytest
 
 from device.clock import Clock, SystemClock, VirtualClock
+from device.drivers.guardian import Guardian
 from device.drivers.pi_camera import PiCamera
+from device.drivers.ring import Apa102Ring
 from device.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
-from device.spec import InstrumentSpec, ReplaySpec, load_head
+from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from tests.ports.emulators.timeline import Timeline
 
 sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
+
+
+def pytest_report_header() -> str:
+    """Which real packages the drivers are exercised through."""
+    found = ", ".join(f"{name} {version(name)}" for name in ("picamera2", "spidev", "smbus2"))
+    return f"drivers through: {found}; Python {platform.python_version()}"
 
 
 @dataclass
@@ -34,6 +44,13 @@ class Rig:
     light: Light
     clock: Clock
     recorded: bool = False  # what it shows was exposed long ago: colour and duration change nothing
+
+    def close(self) -> None:
+        """Dark, and gone."""
+        self.light.off()
+        self.camera.close()
+        if isinstance(self.light, Apa102Ring):
+            self.light.close()
 
 
 def small_head() -> InstrumentSpec:
@@ -66,17 +83,32 @@ def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
 
 def pi_rig(*, wide: bool = False) -> Rig:
     """The real picamera2 over an emulated libcamera, whose sensor looks at a simulated world in real time."""
+    timeline = Timeline()
+    light = SimLight(timeline)
+    return Rig(emulated_camera(timeline, light, wide=wide), light, SystemClock())
+
+
+def ring_rig() -> Rig:
+    """That camera, lit by the real spidev's bytes: the LEDs that shine are decoded from the emulated wire."""
+    from tests.ports.emulators.wires import wires
+
+    chain = ChainSpec()
+    wires().break_()
+    light = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s=30)
+    return Rig(emulated_camera(wires(), light), light, SystemClock())
+
+
+def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCamera:
+    """picamera2's camera on a sensor of its own, which sees what `lamp` says."""
     import libcamera
 
     from tests.ports.emulators.memory import MemoryAllocator
     from tests.ports.emulators.sensor import Sensor
 
-    timeline, clock = Timeline(), SystemClock()
+    clock = SystemClock()
+    libcamera.plugged.append(Sensor(World(small_head(), clock), lamp, wide=wide))
     spec = small_head().camera.model_copy(update={"backend": "picamera2", "sensor": "imx296", "exposure_s": 0.02})
-    libcamera.plugged.append(Sensor(World(small_head(), clock), timeline, wide=wide))
-    light = SimLight(timeline)
-    camera = PiCamera(spec, light, clock, allocator=MemoryAllocator(), simulated=True)
-    return Rig(camera, light, clock)
+    return PiCamera(spec, light, clock, allocator=MemoryAllocator(), simulated=True)
 
 
 IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
@@ -85,6 +117,7 @@ IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "replay": replay_rig,
     "picamera2 as on a Pi 4": pi_rig,
     "picamera2 as on a Pi 5": partial(pi_rig, wide=True),
+    "picamera2, spidev": ring_rig,
 }
 
 
@@ -92,7 +125,7 @@ IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
 def rig_of_module(request):
     rig = IMPLEMENTATIONS[request.param]()
     yield rig
-    rig.camera.close()
+    rig.close()
 
 
 @pytest.fixture
@@ -116,5 +149,4 @@ def fresh_rig(request):
     """A rig of one's own, to be broken or closed."""
     rig = IMPLEMENTATIONS[request.param]()
     yield rig
-    rig.light.off()
-    rig.camera.close()
+    rig.close()

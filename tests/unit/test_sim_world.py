@@ -209,6 +209,22 @@ def test_a_lamp_that_breaks_before_the_context_begins_stays_dark():
     assert light.glow is None
 
 
+def test_leds_keep_their_colour_until_they_are_told_otherwise():
+    """The latch of the real chain: a lamp whose owner falls silent shines on, which is why there is a guardian."""
+    world = World(small_head(), VirtualClock())
+    camera, light = SimCamera(world), SimLight(world)
+    light.on(Glow("green")).__enter__()
+    world.clock.sleep(3600)
+    assert camera.expose(Shot(0.01)).glow == Glow("green")
+    world.faults.add("light.silent")
+    with pytest.raises(LightFault, match="hear"):
+        light.off()
+    assert camera.expose(Shot(0.01)).glow == Glow("green")
+    world.faults.clear()
+    light.off()
+    assert camera.expose(Shot(0.01)).glow is None
+
+
 def test_a_fault_that_does_not_exist_is_refused():
     world = World(small_head(), VirtualClock())
     world.faults.add("camera.stolen")

@@ -1,0 +1,39 @@
+"""Which LEDs of a matrix make a ring: geometry alone, never indices by heart."""
+
+from math import hypot
+
+from device.errors import SpecError
+from device.spec import ChainSpec
+
+
+def places_mm(chain: ChainSpec) -> list[tuple[float, float]]:
+    """(right, up) of every LED from the light path's axis, LED side facing you; index 0 is at the bottom left."""
+    row, col = chain.axis if chain.axis is not None else ((chain.rows - 1) / 2, (chain.cols - 1) / 2)
+    pitch = chain.pitch_mm
+    return [((i % chain.cols - col) * pitch, (i // chain.cols - row) * pitch) for i in range(chain.rows * chain.cols)]
+
+
+def ring(chain: ChainSpec) -> tuple[int, ...]:
+    """The LEDs whose distance from the axis is that of the ring, within its tolerance, or those that the head names.
+
+    Raises SpecError where none is. The LuMini's only clean ring near 9.5 mm is that of 10.04 mm, with eight LEDs.
+    """
+    if chain.leds is not None:
+        return chain.leds
+    radius, slack = chain.ring_mm / 2, chain.tolerance_mm / 2
+    found = tuple(i for i, place in enumerate(places_mm(chain)) if abs(hypot(*place) - radius) <= slack)
+    if not found:
+        near = min(places_mm(chain), key=lambda place: abs(hypot(*place) - radius))
+        raise SpecError(
+            f"light.chain.ring_mm = {chain.ring_mm:g}: no LED lies on that ring; the nearest one is "
+            f"{2 * hypot(*near):.2f} mm wide"
+        )
+    if len(found) > chain.most_lit:
+        raise SpecError(f"light.chain: {len(found)} LEDs lie on that ring, more than most_lit = {chain.most_lit}")
+    return found
+
+
+def ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
+    """How wide the ring is where the relay images it into the eye's pupil (optics.md 1.4)."""
+    reached = [hypot(*places_mm(chain)[i]) for i in ring(chain)]
+    return 2 * max(reached) * magnification

@@ -1,0 +1,175 @@
+"""The buses of a Raspberry Pi behind umockdev, in a process of its own: `/usr/bin/python3 serve.py FOLDER`.
+
+Prints the root that UMOCKDEV_DIR must name. Every message on SPI is written to FOLDER/spi.jsonl with its moment
+(CLOCK_MONOTONIC, seconds) and the LEDs that shine after it. FOLDER/faults holds what is broken, one word to a line:
+"spi.short" (half a message arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is
+dead), "power" (brown-out: the chain loses its latch), "memory.blank" (the head's memory is as from the shop).
+"""
+
+import json
+import struct
+import sys
+import time
+from pathlib import Path
+
+import gi
+
+gi.require_version("UMockdev", "1.0")
+from chain import Chain  # noqa: E402
+from chips import Eeprom, Words  # noqa: E402
+from gi.repository import GLib, UMockdev  # noqa: E402
+
+FOLDER = Path(sys.argv[1])
+EIO, ENXIO, EINVAL, ENOTTY = 5, 6, 22, 25
+DEVICES = """P: /devices/platform/soc/spi0.0/spidev/spidev0.0
+N: spidev0.0
+E: DEVNAME=/dev/spidev0.0
+E: SUBSYSTEM=spidev
+
+P: /devices/platform/soc/i2c-1/i2c-dev/i2c-1
+N: i2c-1
+E: DEVNAME=/dev/i2c-1
+E: SUBSYSTEM=i2c-dev
+"""
+
+
+def faults():
+    path = FOLDER / "faults"
+    return set(path.read_text(encoding="ascii").split()) if path.exists() else set()
+
+
+class Bus(UMockdev.IoctlBase):
+    """Answers always: a request without an answer would hang whoever asked."""
+
+    def do_handle_ioctl(self, client):
+        try:
+            result, errno = self.answer(client.get_request() & 0xFFFFFFFF, client.get_arg())
+        except (ValueError, struct.error, OverflowError):
+            result, errno = -1, EINVAL
+        client.complete(result, errno)
+        return True
+
+
+class Spi(Bus):
+    """The controller's settings, and the chain that listens."""
+
+    def __init__(self):
+        super().__init__()
+        self.settings = {1: 0, 2: 0, 3: 8, 4: 125_000_000, 5: 0}  # mode, order, bits, hertz as a Pi's tree says, mode32
+        self.chain = Chain()
+        self.log = (FOLDER / "spi.jsonl").open("a", encoding="ascii")
+
+    def answer(self, request, arg):
+        size, number = (request >> 16) & 0x3FFF, request & 0xFF
+        if (request >> 8) & 0xFF != ord("k"):
+            return -1, ENOTTY
+        if number == 0:
+            return self.transfer(arg, size)
+        data = arg.resolve(0, size)
+        if request >> 30 == 2:
+            data.update(0, list(self.settings[number].to_bytes(4, "little")[:size]))
+        else:
+            self.settings[number] = int.from_bytes(bytes(data.retrieve()), "little")
+        return 0, 0
+
+    def transfer(self, arg, size):
+        messages = arg.resolve(0, size)
+        raw, total = bytes(messages.retrieve()), 0
+        for at in range(0, size, 32):
+            tx, rx, length = struct.unpack_from("<QQI", raw, at)
+            sent = bytes(messages.resolve(at, length).retrieve()) if tx else bytes(length)
+            if self.take(sent) < 0:
+                return -1, EIO
+            if rx:
+                messages.resolve(at + 8, length).update(0, list(bytes(length)))
+            total += length
+        return total, 0
+
+    def do_handle_write(self, client):
+        arg = client.get_arg()
+        taken = self.take(bytes(arg.retrieve()) if arg else b"")
+        client.complete(taken, EIO if taken < 0 else 0)
+        return True
+
+    def take(self, wire):
+        broken = faults()
+        if "spi.cut" in broken:
+            return -1
+        if "power" in broken:
+            self.chain = Chain()
+            return len(wire)
+        self.chain.dead = {int(name[4:]) for name in broken if name.startswith("led.")}
+        arrived = wire[: len(wire) // 2] if "spi.short" in broken else wire
+        self.chain.take(arrived)
+        seen = {"at_s": time.monotonic(), "hz": self.settings[4], "bytes": len(arrived), "lit": self.chain.lit}
+        self.log.write(json.dumps(seen) + "\n")
+        self.log.flush()
+        return len(arrived)
+
+
+class I2c(Bus):
+    """Plain messages and the word reads of SMBus."""
+
+    def __init__(self, chips):
+        super().__init__()
+        self.chips, self.address = chips, 0
+
+    def answer(self, request, arg):
+        if request == 0x0705:  # I2C_FUNCS
+            arg.resolve(0, 8).update(0, list(struct.pack("<Q", 0x0EFF0009)))
+            return 0, 0
+        if request == 0x0703:  # I2C_SLAVE
+            self.address = int.from_bytes(bytes(arg.retrieve())[:8], "little")
+            return 0, 0
+        if request == 0x0707:
+            return self.messages(arg)
+        if request == 0x0720:
+            return self.smbus(arg)
+        return -1, ENOTTY
+
+    def chip(self, address):
+        broken = faults()
+        if "memory.blank" in broken:
+            self.chips[0x50] = Eeprom()
+        return None if "i2c.silent" in broken else self.chips.get(address)
+
+    def messages(self, arg):
+        head = arg.resolve(0, 16)
+        _, count = struct.unpack("<QI", bytes(head.retrieve())[:12])
+        table = head.resolve(0, count * 16)
+        raw = bytes(table.retrieve())
+        for at in range(0, 16 * count, 16):
+            address, flags, length = struct.unpack_from("<HHH", raw, at)
+            chip = self.chip(address)
+            if chip is None:
+                return -1, ENXIO
+            buffer = table.resolve(at + 8, length)
+            if flags & 1:
+                buffer.update(0, list(chip.read(length)))
+            else:
+                chip.write(bytes(buffer.retrieve()))
+        return count, 0
+
+    def smbus(self, arg):
+        data = arg.resolve(0, 16)
+        reads, command, size, _ = struct.unpack("<BBxxIQ", bytes(data.retrieve()))
+        chip = self.chip(self.address)
+        if chip is None:
+            return -1, ENXIO
+        if size == 3:  # a word, the low byte first
+            block = data.resolve(8, 34)
+            chip.write(bytes([command]) + (b"" if reads else bytes(block.retrieve())[:2]))
+            if reads:
+                block.update(0, list(chip.read(2)))
+            return 0, 0
+        return (0, 0) if size == 0 else (-1, EINVAL)
+
+
+testbed = UMockdev.Testbed.new()
+testbed.add_from_string(DEVICES)
+testbed.attach_ioctl("/dev/spidev0.0", Spi())
+# 25.0 C; 77.5 % and 3.88 V; 4096 bytes that were never written
+chips = {0x48: Words({0: 0x0C80, 15: 0x0117}), 0x36: Words({2: 0xC200, 4: 0x4D80}), 0x50: Eeprom()}
+testbed.attach_ioctl("/dev/i2c-1", I2c(chips))
+print(testbed.get_root_dir(), flush=True)
+GLib.MainLoop().run()

@@ -1,0 +1,53 @@
+"""A process that takes pictures with the real ring until it dies: `python -m tests.ports.emulators.victim LEASE_S END`.
+
+Its phases are an exam's: aiming in red, a pause, the lit exposure, the dark one, the making. END is how it ends by
+itself inside a lit phase, if at all: "hang", "raise", "exit", "heir" (killed, while a child holds all its files), or
+"never".
+"""
+
+import itertools
+import os
+import signal
+import sys
+import time
+
+from device.drivers.guardian import Guardian
+from device.drivers.ring import Apa102Ring
+from device.spec import ChainSpec
+from device.values import Glow
+
+AIM_S, PAUSE_S, PICTURE_S, MAKE_S = 0.05, 0.02, 0.1, 0.03
+ENDS_AT_ROUND = 3
+
+
+def main(lease_s: float, end: str) -> None:
+    chain = ChainSpec()
+    ring = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s)
+    os.write(1, b"ready\n")
+    for turn in itertools.count():
+        for glow, lit_s, dark_s in ((Glow("red", 0.4), AIM_S, PAUSE_S), (Glow("green"), PICTURE_S, PICTURE_S + MAKE_S)):
+            with ring.on(glow):
+                time.sleep(lit_s)
+                if turn == ENDS_AT_ROUND and glow.colour == "green":
+                    finish(end)
+            time.sleep(dark_s)
+
+
+def finish(end: str) -> None:
+    """End as told, with the lamp on."""
+    os.write(1, b"ending\n")
+    if end == "hang":
+        time.sleep(3600)
+    if end == "raise":
+        raise MemoryError("no room for another picture")
+    if end == "exit":
+        os._exit(1)
+    if end == "heir":
+        if os.fork() == 0:
+            time.sleep(1)
+            os._exit(0)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]), sys.argv[2])

@@ -1,0 +1,105 @@
+"""The whole instrument, with the real ring on an emulated wire, killed in the middle of aiming and of a press."""
+
+import os
+import random
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from tests.ports.conftest import HEAD
+from tests.ports.emulators.wires import Wires, wires
+
+ROOT = HEAD.parents[2]
+DARK_S, READY_S = 0.1, 60.0
+MIXED = '[light]\nbackend = "apa102"'
+
+
+class Instrument:
+    """`diffuscope run` with a simulated camera that is lit by the real ring, and somebody who looks and presses."""
+
+    def __init__(self, folder: Path) -> None:
+        self.head = folder / "mixed.toml"
+        text = HEAD.read_text(encoding="utf-8").replace('[light]\nbackend = "sim"', MIXED)
+        text = text.replace("rows = 1080", "rows = 270").replace("cols = 1920", "cols = 480").replace("5.04", "20.16")
+        self.head.write_text(text + "\n[light.chain]\n", encoding="utf-8")
+        self.data = folder / "data"
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+
+    @contextmanager
+    def running(self) -> Iterator[subprocess.Popen[bytes]]:
+        words = ["run", "--head", str(self.head), "--port", str(self.port), "--data", str(self.data)]
+        command = [sys.executable, "-c", "from services.cli import main; main()", *words]
+        process = subprocess.Popen(command, cwd=ROOT, env=os.environ.copy(), stdout=subprocess.DEVNULL)
+        try:
+            self.wait_until(lambda: self.ask("/api/preview?after=0") is not None)
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+    def wait_until(self, ready) -> None:
+        end_s = time.monotonic() + READY_S
+        while time.monotonic() < end_s:
+            with suppress(OSError):
+                if ready():
+                    return
+            time.sleep(0.1)
+        raise AssertionError("the instrument did not get ready")
+
+    def ask(self, path: str, body: bytes | None = None) -> bytes | None:
+        head = {"Content-Type": "application/json"} if body else {}
+        request = urllib.request.Request(f"http://127.0.0.1:{self.port}{path}", data=body, headers=head)
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.read() if answer.status != 204 else None
+
+    def use(self) -> None:
+        """Look, and press, until nobody answers any more."""
+        with suppress(OSError):
+            for number in range(1000):
+                self.ask(f"/api/preview?after={number}")
+                if number % 2:
+                    self.ask("/api/captures", b'{"eye": "OD"}')
+
+
+@pytest.fixture
+def sound_wires() -> Wires:
+    wires().break_()
+    return wires()
+
+
+def dark_after_s(chain: Wires, moment_s: float) -> float:
+    """How long after a moment the last LED went out; it must stay dark for a while."""
+    time.sleep(0.5)
+    assert not chain.lit
+    later = [one["at_s"] for one in chain.messages if one["at_s"] > moment_s]
+    lit = [one["at_s"] for one in chain.messages if one["lit"]]
+    before = [one for one in chain.messages if one["at_s"] <= moment_s]
+    if not before[-1]["lit"] and (not lit or lit[-1] <= moment_s):
+        return 0.0
+    return min(at_s for at_s in later if at_s > max(lit)) - moment_s
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_an_instrument_that_is_killed_while_it_is_used_leaves_no_light(tmp_path, sound_wires, seed):
+    instrument = Instrument(tmp_path)
+    with instrument.running() as process:
+        seen = len(sound_wires.messages)
+        user = Thread(target=instrument.use)
+        user.start()
+        time.sleep(random.Random(seed).uniform(0.2, 1.2))
+        process.kill()
+        died_s = time.monotonic()
+        process.wait()
+        user.join()
+    assert any(one["lit"] for one in sound_wires.messages[seen:])
+    assert dark_after_s(sound_wires, died_s) <= DARK_S

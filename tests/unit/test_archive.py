@@ -1,0 +1,141 @@
+"""Calibrations are kept whole or not at all, and one wrong byte is noticed."""
+
+import random
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device.calibration.archive import Archive, Provenance
+from device.errors import CalibrationDamaged, CalibrationError, CalibrationMissing
+from device.values import Calibration, Geometry, Psf, Sensor
+from tests.scenes import speckle
+
+ROOT = Path(__file__).parents[2]
+WHEN = datetime(2026, 11, 21, 9, 30, tzinfo=UTC)
+WHO = Provenance("DS-0042", WHEN, "Ana \u201cthe technician\u201d\nÅ", "0.1.0", 24.5, (("prnu", 0.004), ("hot", 3.0)))
+
+
+def calibration(black_dn: float = 64.25) -> Calibration:
+    shape = (24, 32)
+    flat = np.random.default_rng(0).uniform(0.9, 1.1, shape).astype(np.float32)
+    return Calibration(
+        (Psf(speckle((17, 19)), "0 dpt"), Psf(speckle((17, 19), 3), "2 dpt")), Sensor(black_dn, 5.7, 1.03, 4095.0),
+        Geometry(5.04, 6000, 0.75), 33.4, np.full(shape, 64.5, np.float32), flat, flat > 1.09, True,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    kept = Archive(tmp_path / "calibrations")
+    kept.keep(calibration(), WHO)
+    return kept
+
+
+def test_what_is_kept_is_what_comes_back(archive):
+    found, expected = archive.load(), calibration()
+    assert found.calibration.id == expected.id
+    assert found.provenance == WHO
+    assert [psf.name for psf in found.calibration.psfs] == ["0 dpt", "2 dpt"]
+    assert found.calibration.simulated
+    assert np.array_equal(found.calibration.bad, expected.bad)
+    assert not found.calibration.flat.flags.writeable
+
+
+def test_a_plain_psf_with_nothing_known_is_kept_as_just_that(tmp_path):
+    plain = Calibration((Psf(speckle((9, 9))),), Sensor())
+    kept = Archive(tmp_path)
+    kept.keep(plain, replace(WHO, temperature_c=None, figures=()))
+    found = kept.load()
+    assert found.calibration.geometry is None
+    assert found.calibration.field_deg is None
+    assert found.calibration.flat is None
+    assert found.provenance.temperature_c is None
+
+
+def test_an_earlier_one_can_be_put_in_force_again(archive):
+    first = archive.current()
+    second = archive.keep(calibration(65.0), WHO)
+    assert archive.current() == second != first
+    archive.use(first)
+    assert archive.load().calibration.sensor.black_dn == 64.25
+    assert archive.ids() == (first, second)
+
+
+def test_an_empty_archive_says_that_there_is_none(tmp_path):
+    with pytest.raises(CalibrationMissing) as told:
+        Archive(tmp_path / "nothing").load()
+    assert "Calibrate" in told.value.remedy
+
+
+def test_every_wrong_byte_is_noticed_and_none_crashes(archive):
+    """A thousand single bytes, spread over all files."""
+    files = [path for path in sorted(archive.root.rglob("*")) if path.is_file()]
+    draw = random.Random(1)
+    for _ in range(1000):
+        path = draw.choice(files)
+        whole = path.read_bytes()
+        at = draw.randrange(len(whole))
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ draw.randrange(1, 256)]) + whole[at + 1 :])
+        with pytest.raises(CalibrationError):
+            archive.load()
+        path.write_bytes(whole)
+    assert archive.load().calibration.id == calibration().id
+
+
+@pytest.mark.parametrize("name", ["manifest.toml", "psf1.npy", "flat.npy"])
+def test_a_lost_or_cut_file_is_damage(archive, name):
+    path = archive.root / archive.current() / name
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CalibrationDamaged):
+        archive.load()
+    path.unlink()
+    with pytest.raises(CalibrationError):
+        archive.load()
+
+
+KEEPS_TWO_IN_TURN = """
+import itertools, shutil, sys
+from pathlib import Path
+from device.calibration.archive import Archive
+from tests.unit.test_archive import WHO, calibration
+both = [calibration(64.25), calibration(65.0)]
+archive = Archive(Path(sys.argv[1]))
+archive.keep(both[0], WHO)
+print("ready", flush=True)
+for turn in itertools.count(1):
+    new = both[turn % 2]
+    shutil.rmtree(archive.root / new.id, ignore_errors=True)
+    archive.keep(new, WHO)
+"""
+
+
+def test_a_kill_at_any_moment_leaves_the_old_or_the_new_one_whole(tmp_path):
+    """A hundred kills; the victim removes what it is about to keep, so that every turn writes anew."""
+    good, draw = {calibration(64.25).id, calibration(65.0).id}, random.Random(2)
+    place = tmp_path / "calibrations"
+    for _ in range(20):
+        process = subprocess.Popen(
+            [sys.executable, "-c", KEEPS_TWO_IN_TURN, str(place)], cwd=ROOT, stdout=subprocess.PIPE
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        for _ in range(5):  # stopped is as good as killed for what is on the disk
+            time.sleep(draw.uniform(0, 0.02))
+            process.send_signal(19)
+            snapshot = tmp_path / "snapshot"
+            shutil.copytree(place, snapshot, symlinks=True)
+            assert Archive(snapshot).load().calibration.id in good
+            shutil.rmtree(snapshot)
+            process.send_signal(18)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        assert Archive(place).load().calibration.id in good
