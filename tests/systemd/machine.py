@@ -106,9 +106,7 @@ def installed(opt: Path) -> list[str]:
             (opt / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, opt / name)  # with its time, by which numba knows what it has compiled
     blanker = opt / "device" / "drivers" / "blank.py"
-    if blanker.exists():
-        blanker.rename(blanker.with_name("blank_itself.py"))
-    shutil.copy(Path(__file__).with_name("recorder.py"), blanker)
+    blanker.write_text(Path(__file__).with_name("recorder.py").read_text() + blanker.read_text())
     python = f"python{sys.version_info.major}.{sys.version_info.minor}"
     venv = opt / ".venv"
     packages = venv / "lib" / python / "site-packages"
