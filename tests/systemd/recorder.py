@@ -1,4 +1,4 @@
-"""Put before the text of device/drivers/blank.py: when it is run as root, writes down when, with which words and why."""
+"""Put before the text of device/drivers/blank.py: run as root, it writes down when, with which words and why."""
 
 import os
 import sys

