@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-other browser buses lint bench bench-kills bench-retinas bench-peers lock clean
+.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -26,9 +26,14 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 	@$(BIN)/diffuscope run --port $(PORT)
 
 test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig" --ignore tests/browser --ignore tests/ports
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser
+
+test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
+	@tests/systemd/install
+	@$(BIN)/python -m pytest tests/systemd -rP
+	@$(BIN)/python -m pytest tests/test_house_files.py -k "systemd_has_nothing_to_say or exposed_as_little"
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install

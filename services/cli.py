@@ -41,11 +41,17 @@ def run(
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
 ) -> None:
     """Serve the page: one button, one true picture."""
-    from services.instrument.serve import serve  # opens the web stack, which the other commands do not need
+    from services.instrument.serve import bound, handed_over, serve  # opens the web stack; others do not need it
+    from services.instrument.watchdog import Watchdog
 
     spec = _chosen(head, replay, tuple(raw or ()), tuple(psf or ()))
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
-    serve(spec, host, port, data or _default_data(), lambda: typer.echo(f"Open http://{host}:{port} in a browser"))
+    address = handed_over(os.environ) or bound(host, port)
+    served, at = address.getsockname()[:2]
+    serve(
+        spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
+        Watchdog(os.environ.get("NOTIFY_SOCKET")),
+    )  # fmt: skip
 
 
 def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs: tuple[Path, ...]) -> InstrumentSpec:

@@ -19,6 +19,8 @@ import typer
 from device import errors
 from device.spec import load_head
 from services.cli import app
+from services.instrument.exam import BUDGET_S
+from services.instrument.watchdog import BEAT_S
 from tests.house import BIN, ROOMS, ROOT, Offence, files, judge, nodes, python, text
 
 
@@ -196,22 +198,60 @@ HARDENING = re.findall(
 )
 
 
-@pytest.mark.parametrize("name", [name for name in files() if name.endswith(".service")])
-def test_a_unit_starts_what_exists_restarts_it_and_locks_it_in(name: str, tmp_path: Path) -> None:
-    """Checked by systemd where it is installed; where it is not, at least sections, keys and the command line are."""
-    unit = configparser.ConfigParser(interpolation=None, delimiters="=", comment_prefixes="#")
+UNITS = [name for name in files() if re.fullmatch(r"systemd/[^/]+\.(service|socket)", name)]
+BLANKER = "/usr/bin/python3 -I -S /opt/diffuscope/device/drivers/blank.py --device /dev/spidev0.0"
+
+
+def unit_of(name: str) -> configparser.ConfigParser:
+    """The last of several lines of one key counts here; for the tests that look at keys that is enough."""
+    unit = configparser.ConfigParser(interpolation=None, delimiters="=", comment_prefixes="#", strict=False)
     unit.optionxform = str  # type: ignore[assignment, method-assign]  # keys of systemd are case-sensitive
     unit.read_string(text(name))
-    assert unit.sections() == ["Unit", "Service", "Install"]
-    service = unit["Service"]
-    program, *words = shlex.split(service["ExecStart"])
+    return unit
+
+
+def test_the_instrument_is_started_with_words_that_exist_restarted_and_locked_in() -> None:
+    """Sections, keys and the command line, also where there is no systemd."""
+    service = unit_of("systemd/diffuscope.service")["Service"]
+    _, *words = shlex.split(service["ExecStart"])
     assert not unknown_words(shlex.join(["diffuscope", *words]))
     assert service["Restart"] == "always"
     assert not [key for key in HARDENING if service.get(key) != "yes"]
     assert service["ProtectSystem"] == "strict"
     assert "MemoryDenyWriteExecute" not in service, "numba compiles at run time, so memory must become executable"
-    if analyze := shutil.which("systemd-analyze"):
-        here = tmp_path / Path(name).name  # the same unit, with the program that this machine has
-        here.write_text(text(name).replace(program, str(BIN / "diffuscope")), encoding="utf-8")
-        done = subprocess.run([analyze, "verify", "--man=no", here], capture_output=True, text=True)
-        assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def test_the_watchdog_waits_for_several_beats_and_for_the_longest_round() -> None:
+    """One beat that comes late is not a hang; BUDGET_S is what a whole picture may take, and it beats in between."""
+    service = unit_of("systemd/diffuscope.service")["Service"]
+    assert service["Type"] == "notify"
+    assert float(service["WatchdogSec"]) >= max(3 * BEAT_S, 2 * BUDGET_S)
+    assert service["WatchdogSignal"] == "SIGKILL"
+    assert float(service["TimeoutStartSec"]) >= 180
+
+
+def test_every_end_every_boot_and_giving_up_call_the_same_blanker() -> None:
+    """Its words are a contract with device/drivers/blank.py; a lamp that cannot be reached must not fail the unit."""
+    assert unit_of("systemd/diffuscope.service")["Service"]["ExecStopPost"] == f"-+{BLANKER}"
+    assert unit_of("systemd/diffuscope.service")["Unit"]["OnFailure"] == "diffuscope-dark.service"
+    for name in ("diffuscope-blank", "diffuscope-dark"):
+        assert unit_of(f"systemd/{name}.service")["Service"]["ExecStart"] == f"-{BLANKER}"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
+    """Any output is a failure: for unknown keys systemd-analyze only prints, and says that all is well."""
+    for name in UNITS:  # the same units, with the program that this machine has
+        here = re.sub(r"/opt/diffuscope/\S+/diffuscope", str(BIN / "diffuscope"), text(name))
+        (tmp_path / Path(name).name).write_text(here, encoding="utf-8")
+    words = ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", *sorted(tmp_path.iterdir())]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
+def test_the_instrument_is_exposed_as_little_as_it_can_be() -> None:
+    """0 is locked up, 10 is open; with camera, lamp and buses in reach it is 2 at most."""
+    words = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "systemd/diffuscope.service"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-200:]

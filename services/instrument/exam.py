@@ -28,6 +28,7 @@ from device.sequence import lit
 from device.values import Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
+from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.store import Store
 
@@ -79,13 +80,14 @@ class Exam:
     """
 
     def __init__(
-        self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, plans: Path, died: Callable[[], None]
-    ) -> None:
+        self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, plans: Path, died: Callable[[], None],
+        watchdog: Watchdog,
+    ) -> None:  # fmt: skip
         self.head, self.store, self.bulletin, self.clock = head, store, bulletin, clock
         self.problem: DiffuscopeError | None = None
         self.failure: DiffuscopeError | None = None
         self.ready = Event()
-        self._died, self._plans = died, plans
+        self._died, self._plans, self._watchdog = died, plans, watchdog
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
         self._press: _Press | None = None
@@ -150,6 +152,7 @@ class Exam:
 
     def close(self) -> None:
         """Finish what is under way, then let the head go, dark."""
+        self._watchdog.stopping()
         with self._turn:
             self._closing = True
             self._turn.notify_all()
@@ -161,8 +164,10 @@ class Exam:
     def _own_the_head(self) -> None:
         """Until it is closed; what nobody foresaw ends the process, dark: a restart is safer than a half-alive head."""
         try:
+            self._watchdog.status("making plans")
             self._plan()
             self.ready.set()
+            self._watchdog.ready()
             self._tell_state()
             while (act := self._next()) is not None:
                 act()
@@ -203,13 +208,14 @@ class Exam:
     def _next(self) -> Callable[[], None] | None:
         with self._turn:
             while not self._closing or self._exposed:
+                self._watchdog.beat()
                 if self._press is not None and not self._closing:
                     return self._answer
                 if self._exposed:
                     return self._develop
                 if self.clock.now_s() < self._wanted_until_s:
                     return self._look
-                self._turn.wait()
+                self._turn.wait(BEAT_S)
         return None
 
     def _answer(self) -> None:
@@ -299,6 +305,7 @@ class Exam:
 
     def _let_in(self) -> None:
         """Between two rounds: who pressed meanwhile is exposed and sees a quick look; then the refinement goes on."""
+        self._watchdog.beat()
         if self._press is None or self._closing:
             return
         self._answer()
@@ -368,6 +375,8 @@ class Exam:
         if self.state != self._told:
             self._told = self.state
             self.bulletin.tell("state", state=self._told)
+            self._watchdog.status(self._told)
 
     def _tell_stage(self, id: str, stage: str, fraction: float, url: str | None = None) -> None:
+        self._watchdog.beat()
         self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url)

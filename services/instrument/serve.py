@@ -4,7 +4,7 @@ import errno
 import os
 import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,9 +17,11 @@ from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.watchdog import Watchdog
 from services.records.store import Store
 
 BACKLOG = 128
+HANDED_OVER = 3  # the file descriptor of sd_listen_fds(3)
 
 
 def bound(host: str, port: int) -> socket.socket:
@@ -42,6 +44,13 @@ def bound(host: str, port: int) -> socket.socket:
     return listener
 
 
+def handed_over(environment: Mapping[str, str]) -> socket.socket | None:
+    """The listening address that systemd opened for this very process; None if it did not."""
+    if environment.get("LISTEN_PID") != str(os.getpid()) or environment.get("LISTEN_FDS") != "1":
+        return None
+    return socket.socket(fileno=HANDED_OVER)
+
+
 def _remedy(error: OSError, port: int) -> str:
     other = port + 1 if port < 65535 else 8000
     if error.errno == errno.EADDRINUSE:
@@ -51,19 +60,21 @@ def _remedy(error: OSError, port: int) -> str:
     return "Give an address of this computer with --host: 127.0.0.1 for itself, 0.0.0.0 for the whole network."
 
 
-def serve(spec: InstrumentSpec, host: str, port: int, data: Path, ready: Callable[[], None]) -> None:
-    """Open the head and the shelf, say `ready`, and serve the page until it is told to stop.
+def serve(
+    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog
+) -> None:
+    """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
     The page is there while the exam still makes its plans; raises what keeps it from making them.
     """
     clock = SystemClock()
-    with bound(host, port) as listener, Store(data) as store:
+    with address, Store(data) as store:
         head = open_head(spec, clock)
-        exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process)
+        exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process, watchdog)
         config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()
-            _Server(config, exam).run(sockets=[listener])
+            _Server(config, exam).run(sockets=[address])
         finally:
             exam.close()
         if exam.failure is not None:

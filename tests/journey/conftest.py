@@ -32,6 +32,7 @@ from device.values import Calibration
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.watchdog import Watchdog
 from services.records.store import Store
 
 ROOT = Path(__file__).parents[2]
@@ -161,6 +162,7 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         bulletin: Bulletin | None = None,
         wait: bool = True,
         psfs: int = 1,
+        watchdog: str | None = None,
     ) -> Rig:
         clock, died = GateClock(), Event()
         scene = copy(dark_world)
@@ -170,7 +172,7 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
         shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
         bulletin = bulletin or Bulletin()
-        exam = Exam(head, shelf, bulletin, clock, plans, died.set)
+        exam = Exam(head, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)

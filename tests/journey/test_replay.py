@@ -19,6 +19,7 @@ from device.images import as_raw, read_image
 from device.values import Capture, Glow, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.watchdog import Watchdog
 from services.records.picture import raw_tiff, read_raw_tiff
 from services.records.store import Store
 from tests import scenes
@@ -68,7 +69,7 @@ def play(tmp_path: Path, plans: Path) -> Iterator[Played]:
             head = open_head(recording(*where), clock)
             assert head.kind == "recording"
             store = undo.enter_context(Store(tmp_path / f"shelf{len(list(tmp_path.iterdir()))}", reserve_bytes=0))
-            exam = Exam(head, store, Bulletin(), clock, plans, lambda: None)
+            exam = Exam(head, store, Bulletin(), clock, plans, lambda: None, Watchdog(None))
             undo.callback(exam.close)
             return exam.press("OD").result(60), exam
 

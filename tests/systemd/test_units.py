@@ -1,0 +1,131 @@
+"""The units in a real systemd: ready, fed, hung, killed, given up, stopped, and the blanker after each of these ends.
+
+Inside runs `diffuscope run` with the simulated head, under the units that are shipped. There is no SPI in a container,
+so what is seen of the blanker is when it is called, and how.
+"""
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from signal import SIGKILL, SIGSTOP
+
+import pytest
+
+from tests.systemd.machine import UNIT, Blanked, Machine, booted
+
+pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
+
+LAMP = ["--device", "/dev/spidev0.0"]
+ASK = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:8000{}', timeout=60).read().decode())"
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    with booted(tmp_path_factory.mktemp("machine")) as machine:
+        yield machine
+
+
+@pytest.fixture
+def running(machine: Machine) -> Machine:
+    """The machine with its instrument ready and no past."""
+    machine.run("systemctl", "reset-failed")
+    machine.run("systemctl", "start", UNIT)
+    return machine
+
+
+def blanked_after(machine: Machine, end_s: float, why: str) -> Blanked:
+    """The run of the blanker that answers the end at `end_s`; says how long it took."""
+
+    def answers() -> list[Blanked]:
+        return [one for one in machine.blanked() if one.at_s > end_s and one.why == why]
+
+    machine.until(lambda: bool(answers()))
+    first = answers()[0]
+    assert first.words == LAMP
+    print(f"{why}: dark {1000 * (first.at_s - end_s):.0f} ms later")  # noqa: T201  # the figure that README quotes
+    return first
+
+
+def test_the_address_answers_while_the_instrument_starts(machine: Machine) -> None:
+    """Also on the first start, which takes half a minute: who asks waits, and is not refused."""
+    machine.run("systemctl", "start", "diffuscope.socket")
+    begin_s = time.monotonic()
+    status = json.loads(machine.run("python3", "-c", ASK.format("/api/status")))
+    assert status["state"] == "starting"
+    assert machine.show(UNIT, "ActiveState", "StatusText") == ["activating", "making plans"]
+    machine.until(lambda: machine.show(UNIT, "ActiveState") == ["active"], 240)
+    print(f"start: ready after {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+    assert json.loads(machine.run("python3", "-c", ASK.format("/api/status")))["state"] == "aim"
+    assert machine.show(UNIT, "StatusText", "NRestarts") == ["aim", "0"]
+
+
+def test_the_blanker_ran_before_the_instrument_did(running: Machine) -> None:
+    first = running.blanked()[0]
+    started_us = int(running.show(UNIT, "ExecMainStartTimestampMonotonic")[0])
+    assert first.at_s < started_us / 1e6
+    assert first.words == LAMP
+
+
+def test_it_runs_as_nobody_in_particular_and_without_a_network(running: Machine) -> None:
+    process = Path("/proc") / str(running.main_pid())
+    status = running.run("cat", str(process / "status"))
+    assert int(re.findall(r"^Uid:\s+(\d+)", status, re.M)[0]) > 60000
+    assert re.findall(r"^(?:CapEff|NoNewPrivs|Seccomp):\s+(\S+)", status, re.M) == ["0000000000000000", "1", "2"]
+    links = running.run("cat", str(process / "net/dev")).splitlines()[2:]
+    assert [link.split(":")[0].strip() for link in links] == ["lo"]
+
+
+def test_an_idle_instrument_outlives_its_watchdog(running: Machine) -> None:
+    pid = running.main_pid()
+    time.sleep(12)  # longer than WatchdogSec
+    assert running.main_pid() == pid
+    assert running.show(UNIT, "NRestarts") == ["0"]
+
+
+def test_a_hung_instrument_is_killed_darkened_and_started_anew(running: Machine) -> None:
+    pid = running.main_pid()
+    hung_s = running.signal(SIGSTOP)
+    blanked = blanked_after(running, hung_s, "watchdog")
+    assert 7 < blanked.at_s - hung_s < 11  # WatchdogSec less one beat, and up to a second of a busy machine
+    running.until(lambda: running.show(UNIT, "ActiveState") == ["active"], 60)
+    assert running.main_pid() not in (0, pid)
+    assert "watchdog" in running.journal()
+
+
+def test_a_killed_instrument_is_darkened_at_once_and_started_anew(running: Machine) -> None:
+    pid = running.main_pid()
+    killed_s = running.signal(SIGKILL)
+    assert blanked_after(running, killed_s, "signal").at_s - killed_s < 1
+    running.until(lambda: running.show(UNIT, "ActiveState") == ["active"], 60)
+    assert running.main_pid() != pid
+
+
+def test_told_to_stop_it_ends_well_and_dark(running: Machine) -> None:
+    stopped_s = time.monotonic()
+    running.run("systemctl", "stop", "diffuscope.socket", UNIT)
+    assert running.show(UNIT, "ActiveState", "Result") == ["inactive", "success"]
+    assert blanked_after(running, stopped_s, "success").at_s - stopped_s < 10
+
+
+def test_after_five_ends_it_is_given_up_and_darkened_once_more(machine: Machine) -> None:
+    machine.run("systemctl", "stop", "diffuscope.socket", UNIT)
+    machine.run("systemctl", "reset-failed")
+    machine.run("systemctl", "start", "--no-block", UNIT)
+    begin_s = time.monotonic()
+    while machine.show(UNIT, "ActiveState") != ["failed"]:
+        assert time.monotonic() < begin_s + 60, machine.journal()
+        if machine.main_pid():
+            machine.signal(SIGKILL)
+        time.sleep(0.1)
+    ends = [one for one in machine.blanked() if one.at_s > begin_s and one.why == "signal"]
+    assert len(ends) == 5
+    machine.until(lambda: machine.show("diffuscope-dark.service", "ExecMainExitTimestampMonotonic") != ["0"])
+    assert machine.show("diffuscope-dark.service", "Result") == ["success"]  # though there is no SPI to be darkened
+    given_up = [one for one in machine.blanked() if one.at_s > ends[-1].at_s and one.why == "-"]
+    assert given_up
+    time.sleep(2)
+    assert machine.show(UNIT, "ActiveState", "MainPID") == ["failed", "0"]
+    machine.run("python3", "-c", ASK.format("/"), check=False)
+    machine.until(lambda: machine.show("diffuscope.socket", "ActiveState") == ["failed"])
