@@ -4,9 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from device.clock import Clock
+from device.dose import FIELD_DEG, Hazard, light_limits, radiometry
 from device.errors import SpecError
 from device.guard import GuardedLight
-from device.ports import Camera, Light
+from device.ledger import Ledger
+from device.ports import Camera
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
@@ -22,7 +24,7 @@ class Head:
 
     spec: InstrumentSpec
     camera: Camera
-    light: Light
+    light: GuardedLight
     calibration: Calibration
 
     @property
@@ -36,21 +38,31 @@ class Head:
         self.camera.close()
 
 
-def open_head(spec: InstrumentSpec, clock: Clock) -> Head:
-    """Open the parts that the head file names; a part that is missing is an error, never replaced by another."""
+def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger) -> Head:
+    """Open the parts that the head file names; a part that is missing is an error, never replaced by another.
+
+    `ledger` keeps the book of light; only what shows light to no eye may use a MemoryLedger.
+    """
+    hazard = hazard_of(spec)
     if spec.camera.backend != spec.light.backend:
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     if spec.camera.backend == "sim":
         world = World(spec, clock)
         for colour in {spec.light.colour, spec.light.preview_colour}:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
-        light = GuardedLight(SimLight(world), clock, spec.light.max_on_s)
+        light = GuardedLight(SimLight(world), clock, spec.light.max_on_s, hazard, ledger)
         return Head(spec, SimCamera(world), light, simulated_calibration(world))
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
-    guarded = GuardedLight(lamp, clock, spec.light.max_on_s)
+    guarded = GuardedLight(lamp, clock, spec.light.max_on_s, hazard, ledger)
     return Head(spec, camera, guarded, recorded_calibration(camera, spec))
+
+
+def hazard_of(spec: InstrumentSpec) -> Hazard:
+    """What the light of a head does to an eye, by its own measurements or at its worst, and the limits for it."""
+    field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
+    return Hazard(radiometry(spec.light.radiometry, field_deg), light_limits())
 
 
 def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:
