@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from math import exp, log, pi
+from math import exp, floor, log, pi
 from pathlib import Path
 from typing import Literal
 
@@ -125,6 +125,7 @@ class Beam:
 
 
 Radiometry = Mapping[Colour, Beam]
+NO_LIGHT: Radiometry = {colour: Beam(led.wavelength_um, 0.0, 0.0) for colour, led in LED.items()}  # of a recording
 
 
 def radiometry(measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS) -> Radiometry:
@@ -182,13 +183,13 @@ class Hazard:
     def refuse(self, glow: Glow) -> None:
         """LightLimit, with the level that is allowed, if a glow is brighter than any of the three limits."""
         limits = self.limits
-        most = min(
-            limits.photochemical_w_per_cm2 / self.photochemical_w_per_cm2(glow),
-            limits.thermal_w_per_cm2 / self.thermal_w_per_cm2(glow),
-            limits.waist_w_per_cm2 / self.waist_w_per_cm2(glow),
+        times = max(
+            self.photochemical_w_per_cm2(glow) / limits.photochemical_w_per_cm2,
+            self.thermal_w_per_cm2(glow) / limits.thermal_w_per_cm2,
+            self.waist_w_per_cm2(glow) / limits.waist_w_per_cm2,
         )
-        if most < 1:
+        if times > 1:
             raise LightLimit(
-                f"{glow.colour} light at {100 * glow.level:.3g} % is {1 / most:.3g} times brighter than an eye may see",
-                f"Dim it to {100 * glow.level * most:.2g} % or less, or have the head's light measured.",
+                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
+                f"Dim it to {floor(1000 * glow.level / times) / 10:g} % or less, or have the head's light measured.",
             )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from device.clock import Clock
-from device.dose import FIELD_DEG, Hazard, light_limits, radiometry
+from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.errors import SpecError
 from device.guard import GuardedLight
 from device.ledger import Ledger
@@ -61,6 +61,8 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger) -> Head:
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:
     """What the light of a head does to an eye, by its own measurements or at its worst, and the limits for it."""
+    if spec.light.backend == "replay":
+        return Hazard(NO_LIGHT, light_limits())
     field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
     return Hazard(radiometry(spec.light.radiometry, field_deg), light_limits())
 

@@ -39,6 +39,7 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert report == kept.report | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
+    assert 0 < report["dose_j_per_cm2"] <= report["dose_24h_j_per_cm2"]["OS"] < report["dose_stop_j_per_cm2"]
     assert report["seconds"]["expose"] == pytest.approx(0.2)
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         picture.load()

@@ -69,7 +69,7 @@ def test_the_weights_between_their_entries(hazard: Hazard) -> None:
 def test_blue_at_full_drive_is_refused_and_told_how_far_to_dim(hazard: Hazard) -> None:
     with pytest.raises(LightLimit, match=r"1\.92 times") as told:
         hazard.refuse(Glow("blue"))
-    assert "52 %" in told.value.remedy
+    assert "51.9 %" in told.value.remedy
     hazard.refuse(Glow("blue", 0.51))
     for colour in ("red", "green"):
         hazard.refuse(Glow(colour))

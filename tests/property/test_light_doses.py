@@ -204,25 +204,25 @@ class Eyes(RuleBasedStateMachine):
             self.pass_time(rest_s)
 
     @precondition(lambda self: self.holding is None)
-    @rule(duration_s=st.one_of(st.floats(0, 120), st.floats(0, 1.2 * DAY_S)))
+    @rule(duration_s=st.one_of(st.floats(0, 120), st.floats(0, 1.2 * DAY_S), st.floats(DAY_S - 1800, DAY_S)))
     def pass_time(self, duration_s: float) -> None:
         self.shine_for(duration_s)
 
     @rule(
         off_s=st.one_of(st.just(0.0), st.floats(0, 2 * DAY_S)),
         afterglow_s=st.floats(0, AFTERGLOW_S),
-        reboot=st.booleans(),
+        reboot_s=st.one_of(st.none(), st.floats(0, 10 * DAY_S)),
     )
-    def crash(self, off_s: float, afterglow_s: float, reboot: bool) -> None:
-        """The process dies; the lamp shines until its gate closes; the computer may start anew."""
+    def crash(self, off_s: float, afterglow_s: float, reboot_s: float | None) -> None:
+        """The process dies; the lamp shines until its gate closes; the computer may start anew, its clock anywhere."""
         self.shine_for(afterglow_s)
         self.lamp.off()
         if self.guarded._timer is not None:
             self.guarded._timer.cancel()  # it died with its process
         self.times.sleep(off_s)
-        if reboot:
+        if reboot_s is not None:
             self.boots += 1
-            self.times.booted_s = self.times.true_s - 3.0
+            self.times.booted_s = self.times.true_s - reboot_s
         self.holding = None
         self.start()
 
