@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any
 
 from device.clock import Clock
+from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.drivers.button import GpioButton
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
 from device.drivers.gpio import InputLine, OutputLine
@@ -18,6 +19,8 @@ from device.drivers.ring import Apa102Ring
 from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
+from device.ledger import Ledger
+from device.optics.matrix import ring
 from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
@@ -46,7 +49,7 @@ class Head:
 
     spec: InstrumentSpec
     camera: Camera
-    light: Light
+    light: GuardedLight
     calibration: Calibration
     chips: Chips = Chips()
     button: Button | None = None
@@ -83,16 +86,17 @@ def is_simulated(spec: InstrumentSpec) -> bool:
     return "sim" in backends or spec.sim is not None
 
 
-def open_head(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Head:
+def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any = None) -> Head:
     """Open the parts that the head file names; a part that is missing is an error, never replaced by another.
 
-    `allocator` is where a camera driver takes its buffers from; None: where its library does. Whatever was opened
-    before an error is dark and closed after it.
+    `ledger` keeps the book of light; only what shows light to no eye may use a MemoryLedger. `allocator` is where a
+    camera driver takes its buffers from; None: where its library does. Whatever was opened before an error is dark and
+    closed after it.
     """
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with Opening(spec, clock, allocator) as opening:
-        head = _replayed(opening) if spec.camera.backend == "replay" else _opened(opening)
+        head = _replayed(opening, ledger) if spec.camera.backend == "replay" else _opened(opening, ledger)
         _refuse_another_head(head)
         return replace(head, held=opening.undo.pop_all())
 
@@ -189,21 +193,22 @@ class Opening:
         )
 
 
-def _replayed(opening: Opening) -> Head:
+def _replayed(opening: Opening, ledger: Ledger) -> Head:
     spec, clock = opening.spec, opening.clock
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
     opening.undo.callback(camera.close)
-    return Head(spec, camera, GuardedLight(lamp, clock, spec.light.max_on_s), recorded_calibration(camera, spec))
+    light = GuardedLight(lamp, clock, spec.light.max_on_s, hazard_of(spec), ledger)
+    return Head(spec, camera, light, recorded_calibration(camera, spec))
 
 
-def _opened(opening: Opening) -> Head:
+def _opened(opening: Opening, ledger: Ledger) -> Head:
     spec, world = opening.spec, opening.world
     if spec.camera.backend == "sim":
         for colour in {spec.light.colour, spec.light.preview_colour}:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
-    light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s)
+    light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
     return Head(spec, camera, light, simulated_calibration(world), opening.chips(), opening.button())
 
@@ -215,6 +220,17 @@ def _refuse_another_head(head: Head) -> None:
         raise HeadMismatch(
             f"head {known.serial} was calibrated as {known.calibration_id[:16]}, loaded is {head.calibration.id}"
         )
+
+
+def hazard_of(spec: InstrumentSpec) -> Hazard:
+    """What the light of a head does to an eye, by its own measurements or at its worst, and the limits for it."""
+    if spec.light.backend == "replay":
+        return Hazard(NO_LIGHT, light_limits())
+    field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
+    if spec.light.chain is None:
+        return Hazard(radiometry(spec.light.radiometry, field_deg), light_limits())
+    leds = len(ring(spec.light.chain))
+    return Hazard(radiometry(spec.light.radiometry, field_deg, leds=leds), light_limits())
 
 
 def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from device.errors import SpecError
+from device.radiometry import RadiometrySpec
 from device.scene import SimSpec
 from device.sensors import SENSORS
 from device.tables import Table, load_toml
@@ -97,6 +98,7 @@ class LightSpec(Table):
     colour: Literal["red", "green", "blue"] = "green"
     preview_colour: Literal["red", "green"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
+    radiometry: RadiometrySpec | None = None
 
 
 class BusSpec(Table):

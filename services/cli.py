@@ -101,9 +101,10 @@ def _cache() -> Path:
 
 @app.command("probe")
 def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")]) -> None:
-    """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips. Lights the lamp shortly.
+    """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips.
 
-    The exit status is 1 if a part is not well.
+    The lamp shines, and its light is not counted for an eye: point the head at white paper. The exit status is 1 if a
+    part is not well.
     """
     from device.probe import probe  # the drivers, which the other commands do not need
 

@@ -25,7 +25,7 @@ from device.recon.model import field_box
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.sequence import lit
-from device.values import Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
+from device.values import EYES, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.instrument.watchdog import BEAT_S, Watchdog
@@ -70,6 +70,7 @@ class _Exposed:
     frame: Frame
     dark: Frame
     expose_s: float
+    light: dict[str, object]
 
 
 class Exam:
@@ -192,7 +193,7 @@ class Exam:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
         if len(self.head.calibration.psfs) == 1:
             return 0
-        frame, _ = self._expose(self.head.spec.camera.exposure_s)
+        frame, _ = self._expose(EYES)
         return sharpest(self.head.calibration, frame.counts, planner)[0]
 
     def _end(self) -> None:
@@ -229,8 +230,9 @@ class Exam:
             id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
             self._tell_stage(id, "expose", 0.1)
             begin_s = self.clock.now_s()
-            frame, dark = self._expose(self.head.spec.camera.exposure_s)
-            self._exposed.append(_Exposed(press, id, taken_at, frame, dark, self.clock.now_s() - begin_s))
+            frame, dark = self._expose((press.eye,))
+            exposed = press, id, taken_at, frame, dark, self.clock.now_s() - begin_s
+            self._exposed.append(_Exposed(*exposed, light=self.head.light.account()))
         self._exposing = False
         self._tell_state()
 
@@ -271,7 +273,7 @@ class Exam:
     def _make(self, shot: _Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
         made = self._reconstruct(shot)
-        report = asdict(made.report)
+        report = asdict(made.report) | shot.light
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
@@ -281,13 +283,13 @@ class Exam:
         self.bulletin.tell("kept", id=shot.id)
         return kept
 
-    def _expose(self, exposure_s: float) -> tuple[Frame, Frame]:
-        """A lit frame and a dark one, if the head is well."""
+    def _expose(self, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
+        """A lit frame and a dark one, if the head is well; the light counts for these eyes."""
         self.head.check()
-        camera, light = self.head.camera, self.head.light
+        camera, light, exposure_s = self.head.camera, self.head.light, self.head.spec.camera.exposure_s
         camera.prepare(Shot(exposure_s))
         try:
-            with light.on(Glow(self.head.spec.light.colour)):
+            with light.on(Glow(self.head.spec.light.colour), eyes):
                 frame = lit(camera.expose(Shot(exposure_s)))
             return frame, camera.expose(Shot(exposure_s))
         finally:

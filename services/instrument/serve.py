@@ -11,6 +11,7 @@ from pathlib import Path
 import uvicorn
 
 from device.clock import SystemClock
+from device.dose import light_limits
 from device.errors import InputError
 from device.head import open_head
 from device.spec import InstrumentSpec
@@ -18,6 +19,7 @@ from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
 from services.instrument.watchdog import Watchdog
+from services.records.light_book import LightBook
 from services.records.store import Store
 
 BACKLOG = 128
@@ -69,7 +71,7 @@ def serve(
     """
     clock = SystemClock()
     with address, Store(data) as store:
-        head = open_head(spec, clock)
+        head = open_head(spec, clock, LightBook(store.engine, clock, light_limits().window_s))
         exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process, watchdog)
         config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
         try:

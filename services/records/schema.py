@@ -12,7 +12,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import URL, CheckConstraint, Connection, Engine, ForeignKey, Index, Text, create_engine, event
+from sqlalchemy import REAL, URL, CheckConstraint, Connection, Engine, ForeignKey, Index, Text, create_engine, event
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
@@ -71,6 +71,35 @@ class FileRow(Shelf):
         CheckConstraint("bytes >= 0", name="bytes_is_a_length"),
         {"sqlite_strict": True},
     )
+
+
+class LightRow(Shelf):
+    """What an eye got in one slot of observed time (device/ledger.py), reservations that were not settled included."""
+
+    __tablename__ = "light_doses"
+
+    eye: Mapped[str] = mapped_column(Text, primary_key=True)
+    slot: Mapped[int] = mapped_column(primary_key=True)
+    dose_j_per_cm2: Mapped[float] = mapped_column(REAL)
+
+    __table_args__ = (
+        CheckConstraint("eye IN ('OD', 'OS')", name="light_fell_on_an_eye"),
+        CheckConstraint("dose_j_per_cm2 >= 0", name="light_is_not_given_back"),
+        {"sqlite_strict": True},
+    )
+
+
+class SeenRow(Shelf):
+    """One row: how much time was seen until a moment of a boot, by which light ages."""
+
+    __tablename__ = "light_time"
+
+    id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    boot: Mapped[str] = mapped_column(Text)
+    now_s: Mapped[float] = mapped_column(REAL)
+    observed_s: Mapped[float] = mapped_column(REAL)
+
+    __table_args__ = (CheckConstraint("id = 1", name="time_is_one"), {"sqlite_strict": True})
 
 
 def open_engine(path: Path) -> Engine:

@@ -49,20 +49,20 @@ class Store:
         self.folder = folder
         self._captures, self._torn, self._lock = folder / "captures", folder / "torn", folder / ".lock"
         self._reserve_bytes, self._free_bytes = reserve_bytes, free_bytes
-        with _told(), ExitStack() as undo:
+        with told(), ExitStack() as undo:
             disk.make_folder(self._captures)
             disk.make_folder(self._torn)
-            self._engine = schema.open_engine(folder / "shelf.sqlite")
-            undo.callback(self._engine.dispose)
+            self.engine = schema.open_engine(folder / "shelf.sqlite")
+            undo.callback(self.engine.dispose)
             with disk.alone(self._lock):  # a capture that another process is keeping is not a torn one
                 self._refuse_to_begin_anew()
-                schema.migrate(self._engine)
+                schema.migrate(self.engine)
                 self.swept = self._sweep()
             undo.pop_all()
 
     def close(self) -> None:
         """Let go of the database."""
-        self._engine.dispose()
+        self.engine.dispose()
 
     def __enter__(self) -> Self:
         return self
@@ -80,14 +80,14 @@ class Store:
         capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
         row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
-        with _told(), disk.alone(self._lock):
+        with told(), disk.alone(self._lock):
             self._refuse_twice(part, kept)
             self._refuse_without_room(sum(map(len, files.values())))
             with _nothing_left_when_full(part, kept):
                 disk.write_folder(part, files)
                 part.rename(kept)
                 disk.settle(self._captures)
-                with Session(schema.for_writing(self._engine)) as session, session.begin():
+                with Session(schema.for_writing(self.engine)) as session, session.begin():
                     session.add(row)
         return capture
 
@@ -137,7 +137,7 @@ class Store:
 
     @contextmanager
     def _reading(self) -> Iterator[Session]:
-        with _told(), Session(self._engine) as session:
+        with told(), Session(self.engine) as session:
             yield session
 
     def _refuse_to_begin_anew(self) -> None:
@@ -149,7 +149,7 @@ class Store:
 
     def _sweep(self) -> tuple[str, ...]:
         """Move every folder without a row aside."""
-        with Session(self._engine) as session:
+        with Session(self.engine) as session:
             kept = set(session.scalars(select(CaptureRow.id)))
         strays = sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
         swept = tuple(disk.move_aside(stray, self._torn) for stray in strays)
@@ -209,7 +209,7 @@ def _sqlite_name(error: DBAPIError) -> str:
 
 
 @contextmanager
-def _told() -> Iterator[None]:
+def told() -> Iterator[None]:
     """Tell errors of the operating system and of SQLite as errors of the shelf."""
     try:
         yield

@@ -21,7 +21,7 @@ from fastapi import FastAPI
 
 from device.clock import VirtualClock
 from device.guard import GuardedLight
-from device.head import Head
+from device.head import Head, hazard_of
 from device.ports import Camera
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
@@ -33,9 +33,11 @@ from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
 from services.instrument.watchdog import Watchdog
+from services.records.light_book import LightBook
 from services.records.store import Store
 
 ROOT = Path(__file__).parents[2]
+DAY_S = 86400.0
 COMMAND = str(Path(sys.executable).parent / "diffuscope")
 SMALL_HEAD = """\
 name = "Small simulated head"
@@ -167,10 +169,12 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         clock, died = GateClock(), Event()
         scene = copy(dark_world)
         scene.clock, scene.faults = clock, set()
-        light = GuardedLight(SimLight(scene), clock, max_on_s)
+        shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
+        light = GuardedLight(
+            SimLight(scene), clock, max_on_s, hazard_of(scene.spec), LightBook(shelf.engine, clock, DAY_S, boot="once")
+        )
         stack = replace(calibration, psfs=calibration.psfs * psfs)
         head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
-        shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
         bulletin = bulletin or Bulletin()
         exam = Exam(head, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)

@@ -39,6 +39,9 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert report == kept.report | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
+    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 0.1, rel=1e-3)  # unmeasured green, for one exposure
+    day = report["dose_24h_j_per_cm2"]  # the reservation is given back but for rounding
+    assert report["dose_j_per_cm2"] <= day["OS"] * (1 + 1e-9) < report["dose_stop_j_per_cm2"]
     assert report["seconds"]["expose"] == pytest.approx(0.2)
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         picture.load()
@@ -117,6 +120,9 @@ class Astonishing:
         self._camera, self._wrong = camera, wrong
         self._error = error or ZeroDivisionError("nobody foresaw this")
         self.shape = camera.shape
+
+    def prepare(self, shot: Shot) -> None:
+        """Nothing to prepare."""
 
     def expose(self, shot: Shot, into: Any = None) -> Frame:
         if self._wrong.is_set():

@@ -16,6 +16,7 @@ from device.clock import VirtualClock
 from device.errors import CameraMissing, PsfError, SpecError
 from device.head import Head, open_head, recording
 from device.images import as_raw, read_image
+from device.ledger import MemoryLedger
 from device.values import Capture, Glow, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
@@ -66,7 +67,7 @@ def play(tmp_path: Path, plans: Path) -> Iterator[Played]:
 
         def played(*where: Any) -> tuple[Capture, Exam]:
             clock = VirtualClock()
-            head = open_head(recording(*where), clock)
+            head = open_head(recording(*where), clock, MemoryLedger(clock))
             assert head.kind == "recording"
             store = undo.enter_context(Store(tmp_path / f"shelf{len(list(tmp_path.iterdir()))}", reserve_bytes=0))
             exam = Exam(head, store, Bulletin(), clock, plans, lambda: None, Watchdog(None))
@@ -77,7 +78,8 @@ def play(tmp_path: Path, plans: Path) -> Iterator[Played]:
 
 
 def opened(folder: Path) -> Head:
-    return open_head(recording(folder), VirtualClock())
+    clock = VirtualClock()
+    return open_head(recording(folder), clock, MemoryLedger(clock))
 
 
 def lit(head: Head) -> Any:
@@ -236,7 +238,7 @@ def test_the_dark_frame_of_a_float_recording_is_scaled_with_it(told: Path) -> No
 
 def refused(*where: Any) -> SpecError | PsfError:
     with pytest.raises((SpecError, PsfError)) as error:
-        open_head(recording(*where), VirtualClock())
+        open_head(recording(*where), VirtualClock(), MemoryLedger(VirtualClock()))
     assert error.value.remedy
     return error.value
 

@@ -18,6 +18,8 @@ from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
 from device.drivers.v4l2_camera import V4l2Camera
 from device.guard import GuardedLight
+from device.head import hazard_of
+from device.ledger import MemoryLedger
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
@@ -69,7 +71,9 @@ def sim_rig() -> Rig:
 
 def guarded_rig() -> Rig:
     rig = sim_rig()
-    return Rig(rig.camera, GuardedLight(rig.light, rig.clock, max_on_s=30), rig.clock)
+    return Rig(
+        rig.camera, GuardedLight(rig.light, rig.clock, 30, hazard_of(small_head()), MemoryLedger(rig.clock)), rig.clock
+    )
 
 
 def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:

@@ -11,6 +11,7 @@ import pytest
 from device.clock import SystemClock, VirtualClock
 from device.errors import BusFault, HeadMismatch, PowerLow, TooHot
 from device.head import Head, open_head
+from device.ledger import MemoryLedger
 from device.recon.metrics import Judge
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor
@@ -42,11 +43,15 @@ def real_parts(**bus: object) -> InstrumentSpec:
 def head() -> Iterator[Head]:
     wires().break_("memory.blank")
     plug_in()
-    opened = open_head(real_parts(), SystemClock(), MemoryAllocator())
+    opened = opened_again()
     wires().break_()
     yield opened
     wires().break_()
     opened.close()
+
+
+def opened_again() -> Head:
+    return open_head(real_parts(), SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
 
 
 def plug_in() -> None:
@@ -95,11 +100,11 @@ def test_the_memory_of_another_head_is_refused_and_everything_is_closed_again(he
     head.chips.memory.write(Identity("DS-0001", head.calibration.id))
     head.close()
     plug_in()
-    same = open_head(real_parts(), SystemClock(), MemoryAllocator())
+    same = opened_again()
     same.chips.memory.write(Identity("DS-0002", "another"))
     same.close()
     with pytest.raises(HeadMismatch, match="DS-0002"):
-        open_head(real_parts(), SystemClock(), MemoryAllocator())
+        opened_again()
     assert not libcamera.plugged[-1].held
     assert not wires().lit
 
@@ -108,4 +113,4 @@ def test_a_silent_bus_stops_the_head_from_opening(head):
     head.close()
     wires().break_("i2c.silent")
     with pytest.raises(BusFault):
-        open_head(real_parts(), SystemClock(), MemoryAllocator())
+        opened_again()

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from device.clock import VirtualClock
 from device.errors import LightLimit
-from device.guard import GuardedLight
 from device.sequence import burst, colours
 from device.values import Glow, Shot
-from tests.ports.conftest import sim_rig
+from tests.ports.conftest import guarded_rig
 
 SHOT = Shot(0.02)
 
@@ -43,8 +41,8 @@ def test_each_colour_has_its_own_frame_and_its_own_darkness(live_rig):
 
 
 def test_a_burst_that_is_longer_than_the_guard_allows_stops_in_the_dark():
-    rig = sim_rig()
-    guarded = GuardedLight(rig.light, VirtualClock(), max_on_s=30)
+    rig = guarded_rig()
+    guarded = rig.light
     frames = burst(rig.camera, guarded, Glow("green"), SHOT, 3)
     next(frames)
     guarded._cut()  # the timer, which here is not waited for

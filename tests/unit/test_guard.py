@@ -5,9 +5,11 @@ from types import TracebackType
 
 import pytest
 
-from device.clock import SystemClock, VirtualClock
+from device.clock import Clock, SystemClock, VirtualClock
+from device.dose import Hazard, light_limits, radiometry
 from device.errors import LightFault, LightLimit
 from device.guard import GuardedLight
+from device.ledger import MemoryLedger
 from device.values import Glow
 
 GREEN, RED = Glow("green"), Glow("red", 0.5)
@@ -43,6 +45,10 @@ class Lamp:
         self.off()
 
 
+def guard(lamp: Lamp, clock: Clock, max_on_s: float) -> GuardedLight:
+    return GuardedLight(lamp, clock, max_on_s, Hazard(radiometry(), light_limits()), MemoryLedger(clock))
+
+
 @pytest.fixture
 def lamp() -> Lamp:
     return Lamp()
@@ -55,7 +61,7 @@ def clock() -> VirtualClock:
 
 @pytest.fixture
 def guarded(lamp: Lamp, clock: VirtualClock) -> GuardedLight:
-    return GuardedLight(lamp, clock, max_on_s=1.0)
+    return guard(lamp, clock, 1.0)
 
 
 def wait_until_dark(lamp: Lamp, patience_s: float = 10.0) -> float:
@@ -68,7 +74,7 @@ def wait_until_dark(lamp: Lamp, patience_s: float = 10.0) -> float:
 
 def test_a_lamp_that_was_left_on_is_dark_once_it_is_guarded(lamp: Lamp, clock: VirtualClock) -> None:
     assert lamp.glow is not None
-    assert GuardedLight(lamp, clock, 1.0).glow is None
+    assert guard(lamp, clock, 1.0).glow is None
     assert lamp.glow is None
 
 
@@ -136,7 +142,7 @@ def test_as_much_darkness_as_light_goes_on_for_ever(guarded: GuardedLight, clock
 
 
 def test_the_timer_darkens_a_lamp_whose_holder_hangs(lamp: Lamp) -> None:
-    guarded = GuardedLight(lamp, SystemClock(), max_on_s=0.1)
+    guarded = guard(lamp, SystemClock(), 0.1)
     with guarded.on(GREEN):
         took_s = wait_until_dark(lamp)
         time.sleep(0.3)  # the holder still hangs
@@ -148,7 +154,7 @@ def test_the_timer_darkens_a_lamp_whose_holder_hangs(lamp: Lamp) -> None:
 
 def test_only_the_time_in_which_it_shone_counts_however_long_the_holder_hung(lamp: Lamp) -> None:
     clock = VirtualClock()
-    guarded = GuardedLight(lamp, clock, max_on_s=0.1)
+    guarded = guard(lamp, clock, 0.1)
     with guarded.on(GREEN):
         clock.sleep(0.05)
         wait_until_dark(lamp)
@@ -158,7 +164,7 @@ def test_only_the_time_in_which_it_shone_counts_however_long_the_holder_hung(lam
 
 
 def test_a_holder_in_time_is_not_disturbed_by_its_timer_later(lamp: Lamp) -> None:
-    guarded = GuardedLight(lamp, SystemClock(), max_on_s=0.2)
+    guarded = guard(lamp, SystemClock(), 0.2)
     with guarded.on(GREEN):
         pass
     dark = len(lamp.history)
@@ -168,7 +174,7 @@ def test_a_holder_in_time_is_not_disturbed_by_its_timer_later(lamp: Lamp) -> Non
 
 def test_a_lamp_slower_than_its_timer_does_not_stay_on(clock: VirtualClock) -> None:
     lamp = Lamp(slow_s=0.3)
-    guarded = GuardedLight(lamp, clock, max_on_s=0.05)
+    guarded = guard(lamp, clock, 0.05)
     with pytest.raises(LightLimit, match="longer"), guarded.on(GREEN):
         pytest.fail("it shone without a timer")
     assert lamp.glow is None

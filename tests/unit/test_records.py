@@ -273,7 +273,7 @@ def test_every_connection_is_durable_and_the_tables_are_strict(store: Store) -> 
             assert connection.exec_driver_sql("PRAGMA busy_timeout").scalar() >= 1000
         strict = {name: flag for name, flag in one.exec_driver_sql("SELECT name, strict FROM pragma_table_list")}  # noqa: C416
     engine.dispose()
-    assert strict["captures"] == strict["files"] == 1
+    assert strict["captures"] == strict["files"] == strict["light_doses"] == strict["light_time"] == 1
 
 
 def test_the_migrations_make_what_the_models_say(store: Store) -> None:
@@ -281,14 +281,18 @@ def test_the_migrations_make_what_the_models_say(store: Store) -> None:
     with engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), schema.Shelf.metadata) == []
         made = set(
-            connection.exec_driver_sql("SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files')").scalars()
+            connection.exec_driver_sql(
+                "SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files', 'light_doses', 'light_time')"
+            ).scalars()
         )
     engine.dispose()
     fresh = schema.open_engine(store.folder / "models.sqlite")
     with schema.for_writing(fresh).begin() as connection:
         schema.Shelf.metadata.create_all(connection)
         said = set(
-            connection.exec_driver_sql("SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files')").scalars()
+            connection.exec_driver_sql(
+                "SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files', 'light_doses', 'light_time')"
+            ).scalars()
         )
     fresh.dispose()
 

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from device.clock import VirtualClock
 from device.errors import SpecError
 from device.head import open_head
+from device.ledger import MemoryLedger
 from device.spec import load_head
 from device.tables import line_of
 
@@ -141,7 +142,7 @@ def test_a_camera_cannot_see_the_lamp_of_another_backend(tmp_path: Path) -> None
     path = tmp_path / "mixed.toml"
     path.write_text(mixed + '\n[replay]\nraws = ["r.npy"]\npsfs = ["p.npy"]\n')
     with pytest.raises(SpecError, match="cannot see"):
-        open_head(load_head(path), VirtualClock())
+        open_head(load_head(path), VirtualClock(), MemoryLedger(VirtualClock()))
 
 
 def test_lines_are_found_through_comments_quotes_and_dots() -> None:
