@@ -1,6 +1,5 @@
 """Where the words of an SVG drawing lie, so that a test can say that none covers another."""
 
-import re
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -39,8 +38,3 @@ def overlapping(found: list[Words]) -> list[tuple[str, str]]:
         for b in found[:k]
         if a.left < b.right and b.left < a.right and a.top < b.bottom and b.top < a.bottom
     ]
-
-
-def said(root: ElementTree.Element) -> set[str]:
-    """Every word of a drawing."""
-    return {word for element in root.iter(f"{SVG}text") for word in re.findall(r"[\w.+/-]+", element.text or "")}

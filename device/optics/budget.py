@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from math import radians
 
+from device.errors import SpecError
 from device.optics.eye import Relay, reflex_free_mm, size_mm
 from device.optics.illumination import Budget, half_period_deg, photon_budget, tried
 from device.optics.light_path import LightPath, relay_of
@@ -81,10 +82,12 @@ class OpticalBudget:
 
 
 def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
-    """A head's own numbers; what it does not say is the path's."""
-    optics, chain, camera = spec.optics or path.optics, spec.light.chain or path.ring, spec.camera
+    """A head's own numbers; a ring that it does not describe is the path's. SpecError for a head without optics."""
+    if spec.optics is None:
+        raise SpecError(f"{spec.name}: no table [optics], so nothing is known of its light path")
+    chain, camera, eye = spec.light.chain or path.ring, spec.camera, path.eye
     return Design(
-        spec.name, path, optics, chain, camera.rows, camera.cols, camera.pitch_um, path.eye.focal_mm, path.eye.pupil_mm,
+        spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, eye.focal_mm, eye.pupil_mm,
         spec.light.colour, camera.exposure_s,
     )  # fmt: skip
 
