@@ -185,6 +185,32 @@ def paper(
 
 
 @app.command()
+def optics(
+    head: Annotated[Path | None, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="A sensor of device/sensors.py, such as imx296.")] = None,
+    eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
+    pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,
+    svg: Annotated[Path | None, typer.Option(help="Where to draw the light path, to scale.")] = None,
+) -> None:
+    """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
+    from services.instrument import light_path_plot
+    from services.instrument import optics as budget
+
+    if head is not None and sensor is not None:
+        raise typer.BadParameter("choose --head or --sensor, not both")
+    if head is None and sensor is None:
+        if svg is not None or eye_mm is not None or pupil_mm is not None:
+            raise typer.BadParameter("choose --head or --sensor")
+        typer.echo(budget.comparison())
+        return
+    chosen = budget.design(head, sensor, eye_mm, pupil_mm)
+    typer.echo(budget.table(chosen))
+    if svg is not None:
+        written(svg, lambda: svg.write_text(light_path_plot.drawn(chosen), encoding="utf-8"))
+        typer.echo(f"{svg}")
+
+
+@app.command()
 def methods(
     rows: Annotated[int, typer.Option(min=1, help="Rows of the frame.")] = 1080,
     cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,

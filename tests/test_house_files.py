@@ -99,7 +99,9 @@ def test_the_wheel_holds_what_the_instrument_needs_at_run_time(tmp_path: Path) -
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         held = set(wheel.namelist())
-    needed = {name for name in files() if re.match(r"(device|services|web)/(?!pictures/)|hardware/heads/", name)}
+    needed = {
+        name for name in files() if re.match(r"(device|services|web)/(?!pictures/)|hardware/(heads/|optics.toml)", name)
+    }
     needed |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
     assert needed - held == set()
 

@@ -75,6 +75,10 @@ class Relay:
         u = max(-1.0, min(1.0, u))
         return 1 - (acos(u) - u * sqrt(1 - u * u)) / pi
 
+    def half_caught_field_deg(self, sensor_mm: float) -> float:
+        """The field at whose edge half the light still falls on a sensor of that side; optics.md 1.5."""
+        return degrees(sensor_mm / (self.angular_magnification * self.diffuser_to_sensor_mm))
+
     def scale_per_dpt(self) -> float:
         """z a^2: how much one dioptre stretches the caustic."""
         return self.diffuser_to_sensor_mm / 1000 * self.angular_magnification**2
@@ -94,6 +98,25 @@ class Relay:
     def beam_at_iris_mm(self, pupil_mm: float) -> float:
         """The diameter of the pupil's image on the iris."""
         return pupil_mm * self.pupil_magnification
+
+    def pupil_margin_mm(self, pupil_mm: float) -> float:
+        """How far the pupil's image may slide over the iris before it clips, at the diffuser: (m P - d) / 2."""
+        return (self.beam_at_iris_mm(pupil_mm) - self.iris_mm) / 2
+
+    def filled_field_deg(self, pupil_mm: float) -> float:
+        """The full field within which beam walk leaves the iris filled (optics.md 1.4); 0 for a pupil too small."""
+        margin_mm = self.pupil_margin_mm(pupil_mm)
+        if margin_mm < 0:
+            return 0.0
+        return 2 * (WALK_FROM_DEG + float((margin_mm / WALK_MM) ** (1 / WALK_POWER)))
+
+    def clear_at_first_mm(self, field_deg: float) -> float:
+        """The diameter that the first lens must have: the chief ray's height and the beam's half, twice."""
+        return 2 * self.first_mm * tan(radians(field_deg / 2)) + self.iris_at_eye_mm
+
+    def clear_before_iris_mm(self, field_deg: float, distance_mm: float) -> float:
+        """The light's diameter at a distance before the iris."""
+        return 2 * distance_mm * self.angular_magnification * tan(radians(field_deg / 2)) + self.iris_mm
 
 
 def field_deg(object_mm: float, focal_length_mm: float = 25.0) -> float:

@@ -37,8 +37,17 @@ def ring(chain: ChainSpec) -> tuple[int, ...]:
 
 def ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
     """How wide the ring is where the relay images it into the eye's pupil (optics.md 1.4)."""
-    reached = [hypot(*places_mm(chain)[i]) for i in ring(chain)]
-    return 2 * max(reached) * magnification
+    return 2 * max(_radii_mm(chain)) * magnification
+
+
+def inner_ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
+    """The same for those of its LEDs that are nearest to the axis: what the cornea's reflex is judged by."""
+    return 2 * min(_radii_mm(chain)) * magnification
+
+
+def _radii_mm(chain: ChainSpec) -> list[float]:
+    places = places_mm(chain)
+    return [hypot(*places[i]) for i in ring(chain)]
 
 
 def for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> ChainSpec:

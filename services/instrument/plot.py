@@ -131,8 +131,8 @@ def svg(plot: Plot) -> str:
             f'<desc id="plot-desc">{escape(plot.says)}</desc>',
             f"<style>{STYLE}</style>",
             f'<rect class="ground" width="{wide}" height="{tall}"/>',
-            _text(LEFT, 32, plot.title, "title"),
-            _text(LEFT, 54, plot.under, "quiet small"),
+            text(LEFT, 32, plot.title, "title"),
+            text(LEFT, 54, plot.under, "quiet small"),
             *inner,
             "</svg>\n",
         ]
@@ -147,11 +147,13 @@ def _y(plot: Plot, value: float) -> float:
     return plot.height - BOTTOM - plot.y.at(value) * (plot.height - TOP - BOTTOM)
 
 
-def _text(x: float, y: float, words: str, kind: str = "", anchor: str = "start") -> str:
+def text(x: float, y: float, words: str, kind: str = "", anchor: str = "start") -> str:
+    """Words at a place; `anchor` says which end of them stands there."""
     return f'<text x="{x:.1f}" y="{y:.1f}" class="{kind}" text-anchor="{anchor}">{escape(words)}</text>'
 
 
-def _line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
+def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
+    """A straight line from one place to another."""
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
 
 
@@ -164,17 +166,17 @@ def _frame(plot: Plot) -> list[str]:
     out = []
     for value, words in plot.x.ticks:
         at = _x(plot, value)
-        out += [_line(at, TOP, at, low, "grid"), _text(at, low + 19, words, "small", "middle")]
+        out += [line(at, TOP, at, low, "grid"), text(at, low + 19, words, "small", "middle")]
     for value, words in plot.y.ticks:
         at = _y(plot, value)
-        out += [_line(LEFT, at, high, at, "grid"), _text(LEFT - 8, at + 4, words, "small", "end")]
+        out += [line(LEFT, at, high, at, "grid"), text(LEFT - 8, at + 4, words, "small", "end")]
     for value, words in plot.right:
         at = _y(plot, value)
         if TOP <= at <= low:
-            out += [_line(high, at, high + 5, at, "frame"), _text(high + 8, at + 4, words, "small")]
+            out += [line(high, at, high + 5, at, "frame"), text(high + 8, at + 4, words, "small")]
     middle = (TOP + low) / 2
     out.append(f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{high - LEFT}" height="{low - TOP}"/>')
-    out.append(_text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
+    out.append(text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
     out.append(_upright(24, middle, plot.y.title))
     if plot.right_title:
         out.append(_upright(plot.width - 14, middle, plot.right_title))
@@ -196,8 +198,8 @@ def _limit(plot: Plot) -> list[str]:
         return []
     at = _x(plot, plot.limit[0])
     return [
-        _line(at, TOP, at, plot.height - BOTTOM, "limit"),
-        _text(at + 6, plot.height - BOTTOM - 8, plot.limit[1], "small limit-word"),
+        line(at, TOP, at, plot.height - BOTTOM, "limit"),
+        text(at + 6, plot.height - BOTTOM - 8, plot.limit[1], "small limit-word"),
     ]
 
 
@@ -242,15 +244,15 @@ def _legend(plot: Plot) -> list[str]:
     """One row above the frame: shape and name of each series, then the lines."""
     out, at = [], float(LEFT + 6)
     for k, series in enumerate(plot.series):
-        out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', _text(at + 13, TOP - 15, series.name)]
+        out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', text(at + 13, TOP - 15, series.name)]
         at += 13 + 7.4 * len(series.name) + 16
     if plot.edge:
-        out += [_line(at, TOP - 20, at + 24, TOP - 20, "edge"), _text(at + 31, TOP - 15, "Pareto edge")]
+        out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 31, TOP - 15, "Pareto edge")]
         at += 31 + 7.4 * 11 + 14
     if plot.ring is not None:
         out += [
             f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',
-            _text(at + 24, TOP - 15, plot.ring[2]),
+            text(at + 24, TOP - 15, plot.ring[2]),
         ]
     return out
 
@@ -269,7 +271,7 @@ def _labels(plot: Plot) -> list[str]:
             place = _free(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
             if place is not None:
                 taken.append(place)
-                out.append(f'<g class="s{k % 5}">{_text(place[0], place[3] - 3, mark.label, "label small")}</g>')
+                out.append(f'<g class="s{k % 5}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
     return out
 
 

@@ -1,0 +1,203 @@
+"""What a builder reads: parts, wiring and assembly agree with one another, with the head files and with the optics."""
+
+import csv
+import re
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from math import radians, tan
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from device.optics.budget import design_of_head, optical_budget
+from device.optics.light_path import load_light_path
+from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.spec import ChainSpec, load_head
+from services.instrument.light_path_plot import drawn
+from tests.drawings import boxes, overlapping
+from tests.house import ROOT, text
+from tests.test_house_files import code_in, unknown_words
+
+HARDWARE = ROOT / "hardware"
+PAPERS = ("hardware/wiring.md", "hardware/assembly.md")
+HEADS = sorted((HARDWARE / "heads").glob("*.toml"))
+HEADER: dict[int, str] = {  # of every Raspberry Pi with 40 pins
+    1: "3.3 V", 2: "5 V", 3: "GPIO2", 4: "5 V", 5: "GPIO3", 6: "ground", 7: "GPIO4", 8: "GPIO14", 9: "ground",
+    10: "GPIO15", 11: "GPIO17", 12: "GPIO18", 13: "GPIO27", 15: "GPIO22", 16: "GPIO23", 19: "GPIO10", 21: "GPIO9",
+    23: "GPIO11", 24: "GPIO8", 25: "ground",
+}  # fmt: skip
+BUSES = {
+    "MOSI": ("GPIO10", "spidev0"),
+    "SCLK": ("GPIO11", "spidev0"),
+    "SDA": ("GPIO2", "i2c-1"),
+    "SCL": ("GPIO3", "i2c-1"),
+}
+SHOWN_AS = {"edge capacitor": "100 pF", "pull-down": "10 k"}  # in the drawing
+
+
+@cache
+def parts() -> dict[str, dict[str, str]]:
+    with (HARDWARE / "parts.csv").open(encoding="utf-8", newline="") as lines:
+        return {row["part"]: row for row in csv.DictReader(lines)}
+
+
+@cache
+def wires() -> dict[int, tuple[str, str, str, str]]:
+    """By pin: line, signal, where to, what the head file says."""
+    rows = re.findall(r"^\| (\d+) \| (.*?) \| (.*?) \| (.*?) \| (.*?) ?\|$", text("hardware/wiring.md"), re.M)
+    return {int(pin): (line, signal, to, said) for pin, line, signal, to, said in rows}
+
+
+def said_of(key: str) -> set[str]:
+    """What the wiring's last column says of a key of the head file."""
+    return {
+        value.strip('"')
+        for *_, said in wires().values()
+        for value in re.findall(rf"`{re.escape(key)} = ([^`]+)`", said)
+    }
+
+
+def named(paper: str) -> set[str]:
+    """Names in bold."""
+    return set(re.findall(r"\*\*([^*]+)\*\*", text(paper)))
+
+
+def test_the_bill_of_materials_is_whole() -> None:
+    with (HARDWARE / "parts.csv").open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    assert len(rows) == len(parts()) > 20, "a part has two rows"
+    for row in rows:
+        assert None not in row, f"{row['part']}: a comma too many"
+        assert int(row["quantity"]) > 0
+        assert float(row["estimate_eur_each"]) > 0
+        assert row["status"] in {"paper", "data sheet", "never built"}
+        assert row["what_for"]
+        assert row["from"]
+
+
+def test_the_sum_is_the_one_that_the_readme_says() -> None:
+    total = sum(int(row["quantity"]) * float(row["estimate_eur_each"]) for row in parts().values())
+    claimed = re.search(r"about (\d+) EUR", text("hardware/README.md"))
+    assert claimed is not None
+    assert float(claimed[1]) == pytest.approx(total, abs=10)
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_every_part_that_is_named_can_be_bought_or_made(paper: str) -> None:
+    assert len(named(paper)) > 8
+    assert named(paper) - set(parts()) == set()
+
+
+def test_every_part_is_put_somewhere() -> None:
+    """What stands on the bill and in no instruction is not needed, or forgotten."""
+    assert set(parts()) - set.union(*map(named, PAPERS)) == set()
+
+
+def test_every_pin_of_the_wiring_is_what_the_header_has_there() -> None:
+    assert len(wires()) >= 9
+    for pin, (line, signal, *_) in wires().items():
+        assert HEADER[pin] == line, f"pin {pin}"
+        if signal in BUSES:
+            assert BUSES[signal][0] == line
+    once = Counter(line for line, *_ in wires().values() if line.startswith("GPIO"))
+    assert max(once.values()) == 1
+
+
+def test_a_signal_hangs_on_the_bus_of_its_device() -> None:
+    for line, signal, _, said in wires().values():
+        if signal in BUSES:
+            assert BUSES[signal][1] in said, f"{line} is no line of {said}"
+
+
+def test_the_gates_resistor_pulls_where_the_circuit_wants_it() -> None:
+    """GPIO 9 to 27 are pulled down from reset; a heartbeat on another line would be high before any software runs."""
+    (heartbeat,) = said_of("gpio.heartbeat")
+    assert 9 <= int(heartbeat) <= 27
+    assert "**pull-down**" in next(to for line, _, to, _ in wires().values() if line == f"GPIO{heartbeat}")
+
+
+@pytest.mark.parametrize("head", HEADS, ids=lambda path: path.stem)
+def test_a_head_is_wired_as_it_says(head: Path) -> None:
+    spec = load_head(head)
+    if spec.light.chain is not None:
+        assert said_of("light.chain.device") == {spec.light.chain.device}
+    if spec.bus is not None:
+        assert said_of("bus.device") == {spec.bus.device}
+        sda = wires()[3][2]
+        for part, address in (("thermometer", spec.bus.thermometer), ("fuel gauge", spec.bus.battery),
+                              ("head memory", spec.bus.memory)):  # fmt: skip
+            assert address is None or f"**{part}** 0x{address:02x}" in sda
+    if spec.gpio is not None:
+        assert said_of("gpio.heartbeat") == {str(spec.gpio.heartbeat)}
+        assert said_of("gpio.button") == {str(spec.gpio.button)}
+
+
+def test_what_a_builder_is_told_to_add_to_a_head_loads(tmp_path: Path) -> None:
+    lines = re.findall(r"^```\n(\[gpio\]\n.*?)^```", text("hardware/wiring.md"), re.M | re.S)
+    (head := tmp_path / "head.toml").write_text(text("hardware/heads/imx296.toml") + "\n" + lines[0])
+    gpio = load_head(head).gpio
+    assert gpio is not None
+    assert {str(gpio.heartbeat)} == said_of("gpio.heartbeat")
+    assert {str(gpio.button)} == said_of("gpio.button")
+
+
+def test_the_drawing_of_the_wiring_shows_the_table() -> None:
+    root = ElementTree.fromstring(text("hardware/pictures/wiring.svg"))
+    found = boxes(root)
+    assert overlapping(found) == []
+    lines = {re.sub(r"\s+", " ", box.words) for box in found}
+    for pin, (line, signal, to, _) in wires().items():
+        words = next((words for words in lines if re.match(rf"pin {pin} ", words)), "")
+        assert line in words, f"pin {pin}"
+        assert signal in ("supply", "ground") or signal in words
+        for part in re.findall(r"\*\*([^*]+)\*\*", to):
+            assert any(SHOWN_AS.get(part, part) in words for words in lines), part
+    assert {"0x48", "0x36", "0x50"} <= lines
+
+
+def test_the_drawing_of_the_light_path_is_todays() -> None:
+    """Made by `diffuscope optics --head hardware/heads/imx296.toml --svg hardware/pictures/light-path.svg`."""
+    design = design_of_head(load_light_path(HARDWARE / "optics.toml"), load_head(HARDWARE / "heads" / "imx296.toml"))
+    assert text("hardware/pictures/light-path.svg") == drawn(design)
+
+
+def test_every_figure_of_the_assembly_is_the_optics() -> None:
+    path = load_light_path(HARDWARE / "optics.toml")
+    design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296.toml"))
+    budget, relay = optical_budget(design), design.relay
+    small = optical_budget(replace(design, pupil_mm=3.0))
+    wide = optical_budget(replace(design, optics=path.optics.model_copy(update={"field_deg": 50.0})))
+    beside = ChainSpec(axis=(3, 3), leds=(18, 19, 20, 26, 28, 34, 35, 36))
+    figures = [
+        f"{relay.first_mm:g} mm before the first", f"{relay.first_mm + relay.second_mm:g} mm on two",
+        f"{relay.second_mm:g} mm behind the second lens", f"10 mm measure {10 * relay.pupil_magnification:.1f} mm",
+        f"the iris is {budget.iris_at_eye_mm:.2f} mm wide", f"has {budget.pupil_margin_mm:.2f} mm of margin",
+        f"one of 3 mm has {small.pupil_margin_mm:.2f} mm", f"0.1 mm are {10 / relay.diffuser_to_sensor_mm:.1f} %",
+        f"{path.relay.splitter_to_iris_mm:g} mm before the iris", f"beam is {budget.splitter_mm:.1f} mm wide there",
+        f"plate shows {path.relay.splitter_mm / 2**0.5:.1f} mm", f"ring of {budget.ring_at_pupil_mm:.2f} mm",
+        f"full cone of {budget.led_cone_deg:.2f} degrees", f"{budget.light.cornea_mw:.3f} mW of green",
+        f"about {200 * tan(radians(budget.field_deg / 2)) + budget.ring_at_pupil_mm:.1f} mm",
+        f"LEDs {', '.join(map(str, ring(path.ring)))}", f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
+        f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm", f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
+        f"its beam is {wide.splitter_mm:.1f} mm wide",
+    ]  # fmt: skip
+    said = " ".join(text("hardware/assembly.md").split())
+    assert [figure for figure in figures if figure not in said] == []
+
+
+@pytest.mark.parametrize("ring_mm", [4.49, 10.04, 13.47, 16.19])
+def test_the_rings_of_the_board_are_those_that_the_guide_names(ring_mm: float) -> None:
+    """The board's own grid, 3.175 mm; neither 8 nor 9.5 mm lies on it."""
+    count = len(ring(ChainSpec(ring_mm=ring_mm, tolerance_mm=0.02)))
+    assert re.search(rf"{ring_mm:.2f} mm \({count}", text("hardware/assembly.md"))
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_commands_and_links_of_the_papers_exist(paper: str) -> None:
+    assert not [word for line in code_in(text(paper)) for word in unknown_words(line)]
+    for link in re.findall(r"\]\(([^)]+)\)", text(paper)):
+        assert (HARDWARE / link).is_file(), link
+    for name in re.findall(r"`([\w/-]+\.(?:md|csv|toml))`", text(paper)):
+        assert (HARDWARE / name).is_file(), name

@@ -1,0 +1,78 @@
+"""The drawing of the light path: whole, to scale, and readable for every sensor and eye."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from device.optics.budget import Design, design_of_head, design_of_sensor, optical_budget
+from device.optics.eye import Relay
+from device.optics.light_path import led_ray_mm, load_light_path, planes_mm, ray_mm
+from device.sensors import SENSORS
+from device.spec import load_head
+from services.instrument.light_path_plot import drawn
+from tests.drawings import boxes, overlapping
+
+HARDWARE = Path(__file__).parents[2] / "hardware"
+PATH = load_light_path(HARDWARE / "optics.toml")
+RELAY = Relay()
+
+
+def designs() -> Iterator[tuple[str, Design]]:
+    for name, sensor in SENSORS.items():
+        yield name, design_of_sensor(PATH, sensor)
+    for head in sorted((HARDWARE / "heads").glob("*.toml")):
+        yield f"head-{head.stem}", design_of_head(PATH, load_head(head))
+
+
+@pytest.mark.parametrize("design", [pytest.param(design, id=name) for name, design in designs()])
+@pytest.mark.parametrize(("eye_mm", "pupil_mm"), [(17.0, 7.7), (25.0, 7.7), (12.0, 2.0), (35.0, 10.0), (5.0, 0.1)])
+def test_no_label_lies_on_another_or_outside(design: Design, eye_mm: float, pupil_mm: float) -> None:
+    root = ElementTree.fromstring(drawn(replace(design, eye_mm=eye_mm, pupil_mm=pupil_mm)))
+    found = boxes(root)
+    assert len(found) > 20
+    assert overlapping(found) == []
+    wide, tall = float(root.get("width", 0)), float(root.get("height", 0))
+    assert not [box for box in found if box.left < 0 or box.right > wide or box.top < 0 or box.bottom > tall]
+
+
+@given(st.floats(-25, 25), st.floats(-1.2, 1.2))
+def test_a_ray_meets_the_iris_where_the_pupil_is_imaged_and_the_sensor_at_its_field(
+    angle: float, height: float
+) -> None:
+    """The relay's formulas in `Relay`, reached by tracing lens after lens."""
+    *_, (_, iris_mm), (_, sensor_mm) = ray_mm(RELAY, 17, height, angle)
+    assert iris_mm == pytest.approx(-height * RELAY.pupil_magnification, abs=1e-9)
+    shift_mm = RELAY.half_shift_tan_mm(2 * abs(angle)) * (1 if angle < 0 else -1)
+    assert sensor_mm - iris_mm == pytest.approx(shift_mm, abs=1e-9)
+
+
+@given(st.floats(-6, 6), st.floats(-12.5, 12.5))
+def test_an_led_is_imaged_into_the_pupil_and_its_light_is_parallel_between_the_lenses(led: float, angle: float) -> None:
+    """Whatever its direction; and the plate mirrors: as long a way from the LED to the second lens as from the iris."""
+    start, plate, second, first, pupil = led_ray_mm(PATH, RELAY, led, angle)
+    assert pupil[1] == pytest.approx(-led * RELAY.angular_magnification, abs=1e-9)
+    assert (second[1] - first[1]) / (second[0] - first[0]) == pytest.approx(led / RELAY.second_mm, abs=1e-9)
+    assert plate[0] - plate[1] == pytest.approx(planes_mm(RELAY)[2] - PATH.relay.splitter_to_iris_mm, abs=1e-9)
+    assert abs(complex(*start) - complex(*plate)) == pytest.approx(
+        abs(complex(planes_mm(RELAY)[2], led) - complex(*plate)), abs=1e-9
+    )
+
+
+def test_the_drawing_is_to_scale() -> None:
+    """The bars beside the enlarged end are as long as they say: 25 px to a millimetre."""
+    design = design_of_sensor(PATH, SENSORS["imx296"])
+    budget = optical_budget(design)
+    bars = [
+        path.get("d", "").split()
+        for path in ElementTree.fromstring(drawn(design)).iter()
+        if path.get("style") is not None
+    ]
+    long_px, short_px, light_px = (float(d[4]) - float(d[2]) for d in bars)
+    assert long_px == pytest.approx(25 * budget.long.sensor_mm, abs=0.2)
+    assert short_px == pytest.approx(25 * budget.short.sensor_mm, abs=0.2)
+    assert light_px == pytest.approx(25 * budget.extent_tan_mm, abs=0.2)
