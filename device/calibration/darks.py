@@ -29,12 +29,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Darks:
-    """The dark of one sensor: `black_dn` without exposure, read noise and pixel spread, warmth, and where it is hot.
+    """The dark of one sensor: `black_dn` without exposure, noise and pixel spread, warmth, and where it is hot.
 
+    `read_noise_dn` is that of the exposure `shortest_s`, in which a little of the warmth may have arrived.
     `map_dn` (rows, cols) is the mean dark frame at `map_s`; `hot` (rows, cols) marks pixels that are far from the rest.
     """
 
     black_dn: float
+    shortest_s: float
     read_noise_dn: float
     pattern_dn: float
     dark_dn_per_s: float
@@ -68,7 +70,8 @@ def measured_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) 
     level_dn = black_dn + dark_dn_per_s * mapped.exposure_s  # the law's: whole counts lean to the nearest
     mean_dn += np.float32(level_dn - float(mean_dn[~hot].mean(dtype=np.float64)))
     pattern_dn = sqrt(max(total_dn**2 - read_dn**2, 0.0))
-    return Darks(float(black_dn), read_dn, pattern_dn, float(dark_dn_per_s), mapped.exposure_s, mean_dn, hot)
+    warmth_dn_per_s, shortest_s = float(dark_dn_per_s), shortest.exposure_s
+    return Darks(float(black_dn), shortest_s, read_dn, pattern_dn, warmth_dn_per_s, mapped.exposure_s, mean_dn, hot)
 
 
 def hot_pixels(exposures: Sequence[Moments]) -> Mask:

@@ -29,9 +29,12 @@ FLAWS = {"prnu": 0.01, "dsnu_e": 2.0, "dark_e_per_s": 50.0, "hot_pixels": 1e-3, 
 E_PER_S = 160_000.0
 
 
-def small_world(black_dn: float = 64.0, calibration: dict[str, Any] | None = None, **flaws: Any) -> World:
+def small_world(
+    black_dn: float = 64.0, calibration: dict[str, Any] | None = None, coarser: int = 4, **flaws: Any
+) -> World:
     spec = load_head(HEAD)
-    small = {"rows": 270, "cols": 480, "pitch_um": 4 * spec.camera.pitch_um, "black_dn": black_dn}
+    rows, cols, pitch_um = spec.camera.rows // coarser, spec.camera.cols // coarser, coarser * spec.camera.pitch_um
+    small = {"rows": rows, "cols": cols, "pitch_um": pitch_um, "black_dn": black_dn}
     spec = spec.model_copy(update={"camera": spec.camera.model_copy(update=small)})
     return World(having(spec, sensor=flaws, calibration=calibration or {}), VirtualClock())
 
