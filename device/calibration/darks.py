@@ -11,7 +11,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from device.calibration.moments import Moments
 from device.errors import CalibrationRefused
@@ -21,6 +21,7 @@ HOT_SIGMAS = 6.0  # of the fixed pattern and the noise: a normal pixel is beyond
 MOST_HOT = 0.02  # share of pixels; more is light, not heat
 MOST_DARK_SHARE = 0.05  # of the converter: a dark frame that rises by more than this saw light
 MOST_SHADING_DN = 0.5  # between parts of a dark frame, beside 6 sigma of its noise
+SEEN = 10.0  # times: what is rarer tells nothing
 UNDECIDED_DN = 0.05  # a noise below this never leaves its count
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(41)
 
@@ -53,7 +54,8 @@ class Darks:
 def measured_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) -> Darks:
     """From darks at two exposures or more, one of them at `map_s`, to what a sensor says without light.
 
-    Errors with 16 frames of 270 x 480 pixels: black level 0.01 DN, read noise 1 %. optics.md 3.9.
+    Errors with 16 frames of 270 x 480 pixels: black level 0.01 DN, read noise 3 %. Where all frames together show two
+    counts only, read noise is the most that it can be. optics.md 3.9.
     """
     if len(exposures) < 2:
         raise CalibrationRefused("darks at one exposure only say nothing about warmth", "Take two exposures or more.")
@@ -109,6 +111,26 @@ def fitted_law(mean_dn: float, variance_dn2: float) -> tuple[float, float]:
     return float(found.x[0]), float(found.x[1])
 
 
+def undecided(mean_dn: float, variance_dn2: float, samples: int) -> bool:
+    """Whether two neighbouring counts are all that is seen: they tell one number, and a law has two."""
+    above = mean_dn % 1
+    return (variance_dn2 - above * (1 - above)) * samples < SEEN
+
+
+def most_law(mean_dn: float, samples: int) -> tuple[float, float]:
+    """The widest normal law that shows a third count not more than ten times: its mean and sigma, DN."""
+    above = float(np.clip(mean_dn % 1, 1 / samples, 1 - 1 / samples))
+
+    def law(sigma_dn: float) -> tuple[float, float]:
+        return float(np.floor(mean_dn) + 0.5 + sigma_dn * ndtri(above)), sigma_dn
+
+    def beyond(sigma_dn: float) -> float:
+        mean, variance = whole_counts(*law(sigma_dn))
+        return variance - (mean % 1) * (1 - mean % 1) - SEEN / samples
+
+    return law(float(brentq(beyond, UNDECIDED_DN / 2, 1.0, xtol=1e-4)))
+
+
 def read_noise_dn(mean_dn: float, total_dn: float, temporal_dn2: float) -> float:
     """The noise from frame to frame, DN: `total_dn` less the pixels' fixed spread, whose share the whole counts tell.
 
@@ -137,7 +159,10 @@ def _law(one: Moments, hot: Mask) -> tuple[float, float]:
             f"every dark frame is the same, {mean_dn:.0f} DN in every pixel: no sensor is without noise",
             "The camera does not give raw counts, or its black level is cut off. Check its driver.",
         )
-    return fitted_law(mean_dn, variance_dn2)
+    samples = int(good.sum()) * one.count
+    return (
+        most_law(mean_dn, samples) if undecided(mean_dn, variance_dn2, samples) else fitted_law(mean_dn, variance_dn2)
+    )
 
 
 def _temporal(one: Moments, hot: Mask) -> float:

@@ -10,20 +10,14 @@ from device.calibration.archive import Archive
 from device.calibration.procedure import Job, Operator, Procedure, Stand
 from device.clock import VirtualClock
 from device.errors import CalibrationMissing, CalibrationRefused, CameraStalled, SpecError
-from device.recon.metrics import Judge
-from device.recon.model import field_radius_px
-from device.recon.reconstructor import Recipe
 from device.sim import stage
-from device.sim.calibrate import flat_frame
 from device.sim.camera import SimCamera
-from device.sim.effects.hot import hot_pixels
-from device.sim.light import SimLight
-from device.sim.render import fitted
 from device.sim.world import World
 from device.spec import InstrumentSpec
-from device.values import Calibration, Glow, Psf, Sensor, Shot
+from device.values import Glow
 from services.instrument.calibrating import Wish, calibrate, staging
 from tests import scenes
+from tests.bench.calibration import pictures, true_calibration
 from tests.unit.test_measure import FLAWS, small_world
 
 
@@ -103,29 +97,11 @@ def test_a_whole_calibration_is_kept_in_force_with_what_was_found(table: Table) 
     assert not list(table.work.glob("*.npz"))
 
 
-def true_calibration(world: World) -> Calibration:
-    camera = world.spec.camera
-    sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, camera.white_dn)
-    psf = Psf(fitted(world.psf(world.spec.light.colour), world.shape))
-    dark_dn = np.full(world.shape, camera.black_dn + 50 * camera.exposure_s / camera.gain_e_per_dn, np.float32)
-    return Calibration(
-        (psf,), sensor, world.geometry, world.optics.field_deg, dark_dn, flat_frame(world), hot_pixels(world.scene)
-    )
-
-
 def test_a_picture_loses_nothing_by_the_measured_calibration(table: Table) -> None:
     measured = table.archive.load(table.run()).calibration
     world = table.world
     world.stage = None
-    with SimLight(world).on(Glow("green")):
-        counts = SimCamera(world).expose(Shot(world.spec.camera.exposure_s)).counts
-    rows, cols = (np.arange(size) - size // 2 for size in world.shape)
-    inside = np.hypot(rows[:, None], cols) < 0.95 * field_radius_px(measured)
-    judge = Judge(world.truth("green"), inside, 2.0)
-    by_measured, by_truth = (
-        judge(scenes.reconstructor(known, world.shape, Recipe("gradient", 1))(counts).picture).psnr_db
-        for known in (measured, true_calibration(world))
-    )
+    by_measured, by_truth = pictures(world, measured, true_calibration(world), scenes.PLANNER)
     assert by_truth > 15
     assert by_measured > by_truth - 0.2  # what the issue asks
 

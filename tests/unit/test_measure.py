@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from device.calibration.darks import Darks, fitted_law, measured_darks, read_noise_dn, whole_counts
+from device.calibration.darks import Darks, fitted_law, measured_darks, most_law, read_noise_dn, undecided, whole_counts
 from device.calibration.flats import Flats, measured_flats
 from device.calibration.moments import Moments
 from device.calibration.point import Steady, measured_point
@@ -87,6 +87,17 @@ def test_black_level_and_read_noise_are_found_far_below_one_count(black_dn: floa
 @pytest.mark.parametrize("sigma_dn", [0.3, 1.0, 5.0])
 def test_a_law_is_found_again_from_the_mean_and_variance_of_its_whole_counts(mean_dn: float, sigma_dn: float) -> None:
     assert fitted_law(*whole_counts(mean_dn, sigma_dn)) == pytest.approx((mean_dn, sigma_dn), rel=1e-3)
+
+
+@pytest.mark.parametrize("read_noise_e", [0.3, 0.6, 1.03])
+def test_half_way_between_two_counts_the_most_is_said_that_the_noise_can_be(read_noise_e: float) -> None:
+    """Up to 1.03 electrons nothing but 64 and 65 is seen, half of the time each, whatever the noise is."""
+    assert fitted_or_most(64.5, read_noise_e / 5.706) == pytest.approx((64.5, 0.212), rel=0.01)
+
+
+def fitted_or_most(mean_dn: float, sigma_dn: float) -> tuple[float, float]:
+    seen = *whole_counts(mean_dn, sigma_dn), 2_000_000
+    return most_law(mean_dn, seen[2]) if undecided(*seen) else fitted_law(*seen[:2])
 
 
 def test_noise_is_told_from_a_fixed_pattern() -> None:
