@@ -19,7 +19,8 @@ DiffuscopeError
 │   └── PowerLow                 the battery is nearly empty
 ├── CalibrationError             what the factory measured cannot be used
 │   ├── CalibrationMissing       there is none
-│   └── CalibrationDamaged       its files are not what was kept
+│   ├── CalibrationDamaged       its files are not what was kept
+│   └── CalibrationRefused       what stands before the head is not what this step measures
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -174,6 +175,13 @@ class CalibrationDamaged(CalibrationError):
 
     code = "calibration.damaged"
     default_remedy = "This calibration is damaged. Go back to an earlier one, or import it again."
+
+
+class CalibrationRefused(CalibrationError):
+    """A step of a calibration saw what it cannot measure by; earlier steps are kept, the old calibration stays."""
+
+    code = "calibration.refused"
+    default_remedy = "Put right what stands before the head, then start `diffuscope calibrate` again: it goes on here."
 
 
 class Busy(DiffuscopeError):

@@ -193,6 +193,31 @@ class Opening:
         )
 
 
+@dataclass(frozen=True)
+class Bench:
+    """What a calibration needs of a head: its camera, its lamp dark, its chips; `world` is None before a real head."""
+
+    camera: Camera
+    chips: Chips
+    world: World | None
+    held: ExitStack
+
+    def close(self) -> None:
+        """Let every part go."""
+        self.held.close()
+
+
+def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
+    """Open a head that has no calibration yet; SpecError for a recording, which nobody can put a cap on."""
+    if spec.camera.backend == "replay":
+        raise SpecError(f"{spec.name} is a recording", "Give the file of a head with --head.")
+    with Opening(spec, clock, allocator) as opening:
+        lamp = opening.lamp()
+        lamp.off()
+        camera, chips = opening.camera(lamp), opening.chips()
+        return Bench(camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.undo.pop_all())
+
+
 def _replayed(opening: Opening, ledger: Ledger) -> Head:
     spec, clock = opening.spec, opening.clock
     assert spec.replay is not None

@@ -117,6 +117,29 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
     raise typer.Exit(0 if well else 1)
 
 
+@app.command("calibrate")
+def calibrate_head(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    archive: Annotated[Path, typer.Option(help="Where calibrations are kept.")],
+    serial: Annotated[str | None, typer.Option(help="Of the head; what its memory says if nothing is given.")] = None,
+    by: Annotated[str, typer.Option(help="Who calibrates.")] = "technician",
+    source_deg: Annotated[
+        float | None, typer.Option(min=0, max=5, help="Width of the point source; 275 um behind a 25 mm lens: 0.63.")
+    ] = None,
+) -> None:
+    """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
+    from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
+
+    def ask(said: str) -> None:
+        typer.prompt(f"{said} Then press Enter", default="", show_default=False)
+
+    kept = calibrate(load_head(head), Wish(archive, serial, by, source_deg), SystemClock(), ask, typer.echo)
+    sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
+    typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")
+    typer.echo(f"read noise {sensor.read_noise_e:.2f} e-, " + ", ".join(f"{k} {v:.3g}" for k, v in known.items()))
+    typer.echo(f"{kept.calibration.id} is in force in {archive}")
+
+
 @app.command()
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],

@@ -67,13 +67,13 @@ class Archive:
             part = Path(tempfile.mkdtemp(prefix=".part", dir=self.root))
             try:
                 for name, content in _files(calibration, provenance).items():
-                    _write(part / name, content)
-                _sync(part)
+                    write_synced(part / name, content)
+                sync_folder(part)
                 part.rename(place)
             except BaseException:
                 shutil.rmtree(part, ignore_errors=True)
                 raise
-            _sync(self.root)
+            sync_folder(self.root)
         self.use(calibration.id)
         return calibration.id
 
@@ -81,9 +81,9 @@ class Archive:
         """Put a kept calibration in force; it is read and checked first."""
         self.load(id)
         part = self.root / f".{CURRENT}"
-        _write(part, id.encode("ascii"))
+        write_synced(part, id.encode("ascii"))
         part.rename(self.root / CURRENT)
-        _sync(self.root)
+        sync_folder(self.root)
 
     def load(self, id: str | None = None) -> Kept:
         """The one in force, or the one of that name; CalibrationMissing, or CalibrationDamaged at one wrong byte."""
@@ -204,14 +204,16 @@ def _unsealed(content: bytes) -> str:
     return body.decode("utf-8")
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_synced(path: Path, content: bytes) -> None:
+    """Write a file, and return when it is on the disk."""
     with path.open("wb") as out:
         out.write(content)
         out.flush()
         os.fsync(out.fileno())
 
 
-def _sync(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
+    """Return when the names in a folder are on the disk."""
     number = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(number)

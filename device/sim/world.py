@@ -1,6 +1,7 @@
 """The one world that the simulated camera and lamp share: retina, eye, diffuser, and what the lamp does now."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -25,7 +26,8 @@ class World:
     """A retina behind an eye behind the diffuser, and the state of the lamp.
 
     `eye` is that of the procedural retina; `choose` decides which effects each colour of light calls for;
-    `ambient_e_per_s` is light that comes without the lamp, beside what the scene says.
+    `ambient_e_per_s` is light that comes without the lamp, beside what the scene says. `stage` is the light of what
+    stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "light.fault", "light.silent"
     (nothing reaches the LEDs, which keep what they show), "bus.silent".
     """
@@ -45,6 +47,7 @@ class World:
         self.seed = self.scene.seed
         self.ambient_e_per_s = ambient_e_per_s
         self.glow: Glow | None = None
+        self.stage: Image | None = None
         self.faults: set[str] = set()
         self.frames = 0
         self.celsius, self.charge = 25.0, Charge(0.775, 3.88)
@@ -79,8 +82,11 @@ class World:
 
     @property
     def sensor(self) -> SensorModel:
-        """The sensor, which is the same in every light."""
-        return self.setup(self.spec.light.colour).sensor
+        """The sensor, the same in every light; before a stage, however bright, its wells and its converter end."""
+        sensor, camera = self.setup(self.spec.light.colour).sensor, self.spec.camera
+        if self.stage is None:
+            return sensor
+        return replace(sensor, full_well_e=camera.full_well_e, white_dn=camera.white_dn)
 
     @cached_property
     def retina(self) -> Fundus:
@@ -120,6 +126,9 @@ class World:
 
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
+        if self.stage is not None:
+            dark_e_per_s = np.float32(self.setup(self.spec.light.colour).dark_e_per_s)
+            return (self.stage + dark_e_per_s) * np.float32(exposure_s)
         always_e = np.asarray((self._always_e_per_s + self.ambient_e_per_s) * exposure_s, np.float32)
         glow = self.glow  # once: a guard may darken the lamp at any moment
         if glow is None:

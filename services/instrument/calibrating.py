@@ -1,0 +1,83 @@
+"""`diffuscope calibrate`: whoever stands at the bench, a technician or the simulator, and a procedure between them."""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from importlib.metadata import version
+from math import degrees
+from pathlib import Path
+
+from device.calibration.archive import Archive, Kept
+from device.calibration.procedure import FILLED, Job, Operator, Procedure, Stand
+from device.clock import Clock
+from device.errors import SettingError
+from device.head import Bench, open_bench
+from device.sim import stage
+from device.sim.world import World
+from device.spec import InstrumentSpec
+
+ASKED: dict[Stand, str] = {
+    "cap": "Put the cap on the head and shade it.",
+    "screen": "Take the cap off and put the even screen before the head, switched on.",
+    "point": "Put the point source before the head, on its axis, and switch the screen off.",
+}
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What the command line says; None: what the head knows itself."""
+
+    archive: Path
+    serial: str | None
+    made_by: str
+    source_deg: float | None
+
+
+def calibrate(
+    spec: InstrumentSpec, wish: Wish, clock: Clock, ask: Callable[[str], None], tell: Callable[[str], None]
+) -> Kept:
+    """Measure a head and put the calibration in force; steps that were done before an error are taken up again.
+
+    `ask` says to a person what to put before the head, and returns when it is there.
+    """
+    with closing(open_bench(spec, clock)) as bench:
+        world = bench.world
+        job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+        operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
+        work = wish.archive / ".steps"
+        procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
+        archive = Archive(wish.archive)
+        return archive.load(procedure.run(archive))
+
+
+def staging(world: World) -> Callable[[Stand], None]:
+    """Puts things before a simulated head, as bright as its picture's exposure likes them."""
+    e_per_s = FILLED * world.spec.camera.full_well_e / world.spec.camera.exposure_s
+
+    def put(stand: Stand) -> None:
+        match stand:
+            case "cap":
+                world.stage = stage.cap(world)
+            case "screen":
+                world.stage = stage.screen(world, e_per_s)
+            case "point":
+                world.stage = stage.point(world, e_per_s)
+
+    return put
+
+
+def _serial(bench: Bench, wish: Wish) -> str:
+    if wish.serial is not None:
+        return wish.serial
+    known = bench.chips.memory.read() if bench.chips.memory is not None else None
+    if known is not None:
+        return known.serial
+    if bench.world is not None:
+        return "simulated"
+    raise SettingError("this head does not say who it is", "Give its serial number with --serial.")
+
+
+def _source_deg(spec: InstrumentSpec, wish: Wish) -> float:
+    if wish.source_deg is not None or spec.sim is None:
+        return wish.source_deg or 0.0
+    return degrees(spec.sim.calibration.source_um / spec.sim.eye.focal_length_um)
