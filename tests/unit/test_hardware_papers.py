@@ -143,6 +143,17 @@ def test_what_a_builder_is_told_to_add_to_a_head_loads(tmp_path: Path) -> None:
     assert {str(gpio.button)} == said_of("gpio.button")
 
 
+def test_the_gate_closes_in_time_with_the_parts_on_the_bill() -> None:
+    """0.3 to 0.5 s (hardware/dead-man.md): R C for the 74LVC1G123, TI's SLVA720A; 0.45 R C for the other one."""
+    uf = float(re.findall(r"([\d.]+) uF", parts()["timing capacitor"]["what_for"])[0])
+    ours_k, others_k = map(float, re.findall(r"(\d+) k\b", parts()["timing resistor"]["what_for"]))
+    assert parts()["one-shot"]["from"] == "74LVC1G123"
+    assert 0.3 < ours_k * uf / 1000 < 0.5
+    assert 0.3 < 0.45 * others_k * uf / 1000 < 0.5
+    assert f"{ours_k:g} k, {uf:g} uF" in text("hardware/pictures/wiring.svg")
+    assert f"C {uf:g} uF, and R {ours_k:g} k for a 74LVC1G123" in text("hardware/dead-man.md")
+
+
 def test_the_drawing_of_the_wiring_shows_the_table() -> None:
     root = ElementTree.fromstring(text("hardware/pictures/wiring.svg"))
     found = boxes(root)
