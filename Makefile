@@ -45,6 +45,7 @@ OTHER_PYTHON ?= python3.13
 	@$(OTHER_PYTHON) -m venv .other-venv
 	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
 	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
+	@.other-venv/bin/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
 test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.

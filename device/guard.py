@@ -41,7 +41,12 @@ class GuardedLight:
 
     @property
     def glow(self) -> Glow | None:
-        """What the lamp shows now."""
+        """What the lamp shows now; None once it may shine no longer, for others may have darkened it meanwhile.
+
+        A process that was stopped wakes up with a lamp that its guardian has cut, and does not know it.
+        """
+        if self._held is not None and self._clock.now_s() - self._lit_at_s >= self.max_on_s:
+            return None
         return self._light.glow
 
     def on(self, glow: Glow, eyes: Sequence[Eye] = EYES) -> Lit:

@@ -20,7 +20,7 @@ from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
 from device.ledger import Ledger
-from device.optics.matrix import ring
+from device.optics.matrix import for_pupil, ring
 from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
@@ -130,7 +130,7 @@ class Opening:
         """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
         if self.spec.light.backend == "sim":
             return SimLight(self.world)
-        chain = chain or self.spec.light.chain
+        chain = chain or chain_of(self.spec)
         assert chain is not None
         guardian = Guardian(chain.device, chain.rows * chain.cols)
         self.undo.callback(guardian.close)
@@ -222,14 +222,23 @@ def _refuse_another_head(head: Head) -> None:
         )
 
 
+def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
+    """The ring that the head file describes, or that fits the pupil which it names; None without one."""
+    chain, light = spec.light.chain, spec.light
+    if chain is None or light.pupil_mm is None or spec.optics is None:
+        return chain
+    return for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)
+
+
 def hazard_of(spec: InstrumentSpec) -> Hazard:
     """What the light of a head does to an eye, by its own measurements or at its worst, and the limits for it."""
     if spec.light.backend == "replay":
         return Hazard(NO_LIGHT, light_limits())
     field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
-    if spec.light.chain is None:
+    chain = chain_of(spec)
+    if chain is None:
         return Hazard(radiometry(spec.light.radiometry, field_deg), light_limits())
-    leds = len(ring(spec.light.chain))
+    leds = len(ring(chain))
     return Hazard(radiometry(spec.light.radiometry, field_deg, leds=leds), light_limits())
 
 

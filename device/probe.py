@@ -8,7 +8,7 @@ import numpy as np
 
 from device.clock import Clock
 from device.errors import HardwareError
-from device.head import Opening
+from device.head import Opening, chain_of
 from device.optics.matrix import ring
 from device.ports import Camera, Light
 from device.spec import ChainSpec, InstrumentSpec
@@ -56,11 +56,12 @@ def _leds(opening: Opening, camera: Camera, light: Light) -> Iterator[Finding]:
     """Each LED of the ring by itself; a lamp that cannot be taken apart is lit as a whole."""
     spec = opening.spec
     colour, shot = Glow(spec.light.preview_colour), Shot(spec.camera.preview_exposure_s)
-    if spec.light.chain is None:
+    chain = chain_of(spec)
+    if chain is None:
         yield _asked("ring", lambda: _seen(camera, light, colour, shot))
         return
-    for led in ring(spec.light.chain):
-        alone = spec.light.chain.model_copy(update={"leds": (led,), "trims": None})
+    for led in ring(chain):
+        alone = chain.model_copy(update={"leds": (led,), "trims": None})
 
         def look(alone: ChainSpec = alone) -> Finding:
             with Opening(spec, opening.clock) as another:

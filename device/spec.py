@@ -95,6 +95,7 @@ class LightSpec(Table):
 
     backend: Literal["sim", "replay", "apa102"]
     chain: ChainSpec | None = None
+    pupil_mm: float | None = Field(default=None, gt=0, le=10)  # chooses the chain's widest ring that fits into it
     colour: Literal["red", "green", "blue"] = "green"
     preview_colour: Literal["red", "green"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)

@@ -5,6 +5,8 @@ from math import hypot
 from device.errors import SpecError
 from device.spec import ChainSpec
 
+LEAST_LEDS = 4  # fewer do not light a field from all around
+
 
 def places_mm(chain: ChainSpec) -> list[tuple[float, float]]:
     """(right, up) of every LED from the light path's axis, LED side facing you; index 0 is at the bottom left."""
@@ -46,3 +48,18 @@ def inner_ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
 def _radii_mm(chain: ChainSpec) -> list[float]:
     places = places_mm(chain)
     return [hypot(*places[i]) for i in ring(chain)]
+
+
+def for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> ChainSpec:
+    """The same matrix with the widest ring of at least four LEDs whose image fits into a pupil of that diameter.
+
+    The wider the ring, the farther its reflex is from the picture (optics.md 3.6). Raises SpecError where none fits.
+    """
+    distances = sorted({round(hypot(*place), 3) for place in places_mm(chain)}, reverse=True)
+    for radius_mm in distances:
+        found = chain.model_copy(update={"ring_mm": 2 * radius_mm, "leds": None, "trims": None})
+        if radius_mm > 0 and len(ring(found)) >= LEAST_LEDS and ring_at_pupil_mm(found, magnification) <= pupil_mm:
+            return found
+    raise SpecError(
+        f"light.pupil_mm = {pupil_mm:g}: no ring of at least {LEAST_LEDS} LEDs of this matrix fits into that pupil"
+    )

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon import kernels, sweeps
@@ -37,6 +38,8 @@ SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from nei
 FRINGES = 0.2  # cycles by which the finest speckle moves from one candidate of the coarse search to the next
 LEAST_NATS = 150.0  # best candidate over the median one: another head's PSF gives 110, retinas at 10 ke- 1200 and more
 LEAST_FREQUENCIES = 500
+UPPER_BIAS_DPT = 0.2  # by which the upper half of the band differs from all of it where both are right
+DISAGREED_DPT = 3.0  # beyond, the evidence has more than one valley, and the stored PSF is the safer guess
 SD_FACTOR = 1.4  # neighbouring frequencies are not independent; with it 23 frames had z scores of rms 1.0
 
 
@@ -45,19 +48,54 @@ class Refraction:
     """What a frame says about the eye: mean sphere M in dpt (positive: myopia), its standard deviation, and the curve.
 
     `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate of
-    the coarse search, sorted; `nats` is how much likelier its best is than its median.
+    the coarse search, sorted; `nats` is how much likelier its best is than its median. `noise_sd_dpt` is what the
+    photons alone explain, `disagreement_dpt` how far the upper half of the band is from all of it.
     """
 
     sphere_dpt: float
     psf_scale: float
-    sd_dpt: float
+    noise_sd_dpt: float
     nats: float
     curve: tuple[tuple[float, float], ...]
+    disagreement_dpt: float = 0.0
+
+    @property
+    def sd_dpt(self) -> float:
+        """The standard deviation of M: one smooth but wrong valley shows where two parts of the band disagree."""
+        more_dpt = max(0.0, self.disagreement_dpt - UPPER_BIAS_DPT)
+        return float(np.hypot(self.noise_sd_dpt, more_dpt))
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the stored PSF is as good: the eye is relaxed as far as anyone can tell."""
-        return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
+        """Whether the stored PSF is as good: the eye is relaxed, as far as anyone can tell, or nobody can tell."""
+        return abs(self.sphere_dpt) < max(0.12, 2 * self.noise_sd_dpt) or self.disagreement_dpt > DISAGREED_DPT
+
+
+@dataclass(frozen=True)
+class _Band:
+    """Frequencies that decide: where in the window's spectrum, in which ring, and what samples of n pixels pass."""
+
+    where: NDArray[np.int64]
+    ring: NDArray[np.int64]
+    rows: NDArray[np.float64]
+    cols: NDArray[np.float64]
+    share: Image
+    energy: Image
+    power: Image
+
+    @classmethod
+    def of(cls, window: Pair, low: float, high: float, n: int) -> "_Band":
+        """All frequencies of a window's spectrum between two, cycles per sample, in rings."""
+        down = np.fft.fftfreq(window[0]).astype(np.float64)
+        across = np.fft.rfftfreq(window[1]).astype(np.float64)
+        frequency = np.hypot(down[:, None], across[None])
+        where = np.flatnonzero((frequency > low) & (frequency < high))
+        edges = np.linspace(low, high, RINGS + 1)
+        ring = np.clip(np.digitize(frequency.ravel()[where], edges) - 1, 0, RINGS - 1)
+        rows, cols = down[where // across.size], across[where % across.size]
+        share = (dirichlet(rows, n) * dirichlet(cols, n)).astype(np.float32)
+        scratch = (np.zeros(where.size, np.float32) for _ in range(2))
+        return cls(where, ring, rows, cols, share, *scratch)
 
 
 def can_refract(calibration: Calibration) -> bool:
@@ -99,19 +137,15 @@ class Refractor:
         frequency = np.hypot(rows, cols)
         power = np.abs(self.elastic.on(window, n, np.eye(2)).astype(np.complex128)) ** 2
         self.low, self.high = band(frequency, power, min(window))
-        self._where = np.flatnonzero((frequency > self.low) & (frequency < self.high))
-        edges = np.linspace(self.low, self.high, RINGS + 1)
-        self._ring = np.clip(np.digitize(frequency.ravel()[self._where], edges) - 1, 0, RINGS - 1)
-        self._rows = np.broadcast_to(rows, frequency.shape).ravel()[self._where]
-        self._cols = np.broadcast_to(cols, frequency.shape).ravel()[self._where]
-        self._share = (dirichlet(self._rows, n) * dirichlet(self._cols, n)).astype(np.float32)
+        self._band = _Band.of(window, self.low, self.high, n)
+        middle = float(np.median(frequency.ravel()[self._band.where])) if self._band.where.size else self.high
+        self._upper = _Band.of(window, middle, self.high, n)
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
-        self._energy, self._power = (np.zeros(self._where.size, np.float32) for _ in range(2))
 
     def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
         """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span."""
-        if self._where.size < LEAST_FREQUENCIES:
+        if self._band.where.size < LEAST_FREQUENCIES:
             return None
         frame = self.preparer(counts, dark)
         np.multiply(frame.good, self.taper, out=self._seen)
@@ -119,13 +153,13 @@ class Refractor:
             return None
         self._residual(frame, 0.0)
         noise = self._noise_power(frame)
-        coarse = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
+        coarse = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._band))
         sphere_dpt = coarse.ladder(self.step_dpt)
         if coarse.relief < LEAST_NATS:
             return None
         sphere_dpt = coarse.walk(sphere_dpt, self.step_dpt / 2)
         self._fit_smooth(frame, self.otf(self.grid, sphere_dpt))
-        fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt))
+        fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._band))
         for part in (2, 4):
             sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
         if abs(sphere_dpt) >= SPAN_DPT:
@@ -133,7 +167,15 @@ class Refractor:
         vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
         sd_dpt = min(SD_FACTOR * (self._spread / bend) ** 0.5, SPAN_DPT) if bend > 0 else SPAN_DPT
         curve = tuple(sorted(coarse.known.items()))
-        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve)
+        apart_dpt = abs(self._found_by_the_upper_half(frame, noise, sphere_dpt) - vertex_dpt)
+        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve, apart_dpt)
+
+    def _found_by_the_upper_half(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
+        """The minimum downhill from a candidate when only the upper half of the band is asked."""
+        upper = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._upper))
+        for part in (1, 2):
+            sphere_dpt = upper.walk(sphere_dpt, self.step_dpt / part)
+        return upper.parabola(sphere_dpt, self.step_dpt / 2)[0]
 
     def scale(self, m_dpt: float) -> float:
         """How an eye with mean sphere M stretches the PSF."""
@@ -163,14 +205,13 @@ class Refractor:
         kernels.residual(frame.y, smooth, self._seen, level, stray, (0, 0), self.fft.space)
         self.fft.forward()
 
-    def _unlikelihood(self, frame: Linear, noise: float, m_dpt: float) -> float:
+    def _unlikelihood(self, frame: Linear, noise: float, m_dpt: float, part: _Band) -> float:
         self._residual(frame, m_dpt)
         stretch = transform(self.geometry, m_dpt)
-        otf = self.elastic.at(self._rows, self._cols, self._share, self.grid.n, stretch)
+        otf = self.elastic.at(part.rows, part.cols, part.share, self.grid.n, stretch)
         return sweeps.unlikelihood(
-            self.fft.spectrum, otf, self._where, self._ring, noise, SMEAR, TURNS,
-            self._levels, self._energy, self._power,
-        )  # fmt: skip
+            self.fft.spectrum, otf, part.where, part.ring, noise, SMEAR, TURNS, self._levels, part.energy, part.power
+        )
 
     def _noise_power(self, frame: Linear) -> float:
         """Noise per frequency of the tapered window, from the sensor's gain or from the silent frequencies."""

@@ -197,3 +197,15 @@ def test_off_from_anywhere_ends_it_and_is_harmless_twice(guarded: GuardedLight, 
         assert lamp.glow is None
     with guarded.on(RED):
         assert lamp.glow == RED
+
+
+def test_a_holder_that_was_stopped_wakes_up_with_a_lamp_that_does_not_count_as_lit(
+    guarded: GuardedLight, lamp: Lamp, clock: VirtualClock
+) -> None:
+    """Its guardian has darkened the ring, and its own timer has not had its turn yet."""
+    with guarded.on(Glow("green")):
+        clock.sleep(0.9)
+        assert guarded.glow == Glow("green")
+        clock.sleep(0.1)
+        assert lamp.glow == Glow("green")
+        assert guarded.glow is None
