@@ -13,7 +13,7 @@ import pytest
 
 from device.optics.budget import design_of_head, optical_budget
 from device.optics.light_path import load_light_path
-from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.optics.matrix import for_pupil, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
 from device.spec import ChainSpec, load_head
 from services.instrument.light_path_plot import drawn
 from tests.drawings import boxes, overlapping
@@ -192,6 +192,7 @@ def test_every_figure_of_the_assembly_is_the_optics() -> None:
         f"about {200 * tan(radians(budget.field_deg / 2)) + budget.ring_at_pupil_mm:.1f} mm",
         f"LEDs {', '.join(map(str, ring(path.ring)))}", f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
         f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm", f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
+        f"the inner four: {ring_at_pupil_mm(for_pupil(path.ring, 7, 0.75), 0.75):.2f} mm at the pupil",
         f"its beam is {wide.splitter_mm:.1f} mm wide",
     ]  # fmt: skip
     said = " ".join(text("hardware/assembly.md").split())
