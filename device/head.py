@@ -20,7 +20,7 @@ from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
 from device.guard import GuardedLight
 from device.ledger import Ledger
-from device.optics.matrix import for_pupil, ring
+from device.optics.matrix import chain_of, ring
 from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
@@ -245,14 +245,6 @@ def _refuse_another_head(head: Head) -> None:
         raise HeadMismatch(
             f"head {known.serial} was calibrated as {known.calibration_id[:16]}, loaded is {head.calibration.id}"
         )
-
-
-def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
-    """The ring that the head file describes, or that fits the pupil which it names; None without one."""
-    chain, light = spec.light.chain, spec.light
-    if chain is None or light.pupil_mm is None or spec.optics is None:
-        return chain
-    return for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)
 
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:

@@ -8,8 +8,8 @@ import numpy as np
 
 from device.clock import Clock
 from device.errors import HardwareError
-from device.head import Opening, chain_of
-from device.optics.matrix import ring
+from device.head import Opening
+from device.optics.matrix import chain_of, ring
 from device.ports import Camera, Light
 from device.spec import ChainSpec, InstrumentSpec
 from device.values import Charge, Frame, Glow, Shot

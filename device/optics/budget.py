@@ -7,7 +7,7 @@ from device.errors import SpecError
 from device.optics.eye import Relay, reflex_free_mm, size_mm
 from device.optics.illumination import Budget, half_period_deg, photon_budget, tried
 from device.optics.light_path import LightPath, relay_of
-from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.optics.matrix import chain_of, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
 from device.sensors import SensorProfile
 from device.spec import ChainSpec, InstrumentSpec, OpticsSpec
 from device.values import Colour
@@ -82,12 +82,12 @@ class OpticalBudget:
 
 
 def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
-    """A head's own numbers; a ring that it does not describe is the path's. SpecError for a head without optics."""
+    """A head's own numbers; a ring or pupil that it does not name is the path's. SpecError for one without optics."""
     if spec.optics is None:
         raise SpecError(f"{spec.name}: no table [optics], so nothing is known of its light path")
-    chain, camera, eye = spec.light.chain or path.ring, spec.camera, path.eye
+    chain, camera, pupil_mm = chain_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
     return Design(
-        spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, eye.focal_mm, eye.pupil_mm,
+        spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, path.eye.focal_mm, pupil_mm,
         spec.light.colour, camera.exposure_s,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from math import hypot
 
 from device.errors import SpecError
-from device.spec import ChainSpec
+from device.spec import ChainSpec, InstrumentSpec
 
 LEAST_LEDS = 4  # fewer do not light a field from all around
 
@@ -63,3 +63,11 @@ def for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> ChainS
     raise SpecError(
         f"light.pupil_mm = {pupil_mm:g}: no ring of at least {LEAST_LEDS} LEDs of this matrix fits into that pupil"
     )
+
+
+def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
+    """The ring that the head file describes, or that fits the pupil which it names; None without one."""
+    chain, light = spec.light.chain, spec.light
+    if chain is None or light.pupil_mm is None or spec.optics is None:
+        return chain
+    return for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)

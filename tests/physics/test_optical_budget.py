@@ -138,6 +138,18 @@ def test_the_papers_ring_and_ours_in_the_pupil() -> None:
     assert ours.reflex_free_mm == pytest.approx(2.24, abs=0.005)
 
 
+def test_a_head_that_names_its_pupil_is_judged_by_it_and_by_the_ring_that_it_lights() -> None:
+    """The next clean ring inside of 10.04 mm is that of the four inner LEDs, 3.37 mm at the pupil: in the reflex."""
+    head = load_head(HARDWARE / "heads" / "imx296.toml")
+    small = head.model_copy(update={"light": head.light.model_copy(update={"pupil_mm": 7.0})})
+    design = design_of_head(PATH, small)
+    found = optical_budget(design)
+    assert design.pupil_mm == 7.0
+    assert found.leds == 4
+    assert found.ring_at_pupil_mm == pytest.approx(3.175 * 2**0.5 * 0.75, abs=0.001)
+    assert found.ring_at_pupil_mm / 2 < found.reflex_free_mm
+
+
 def test_the_light_of_the_papers_ring() -> None:
     """optics.md 3.8, green, within the 9 % by which its cone differs from the field's area."""
     found = optical_budget(design_of_head(PATH, load_head(HARDWARE / "heads" / "paper.toml")))

@@ -13,7 +13,7 @@ import pytest
 
 from device.optics.budget import design_of_head, optical_budget
 from device.optics.light_path import load_light_path
-from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.optics.matrix import for_pupil, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
 from device.spec import ChainSpec, load_head
 from services.instrument.light_path_plot import drawn
 from tests.drawings import boxes, overlapping
@@ -143,6 +143,17 @@ def test_what_a_builder_is_told_to_add_to_a_head_loads(tmp_path: Path) -> None:
     assert {str(gpio.button)} == said_of("gpio.button")
 
 
+def test_the_gate_closes_in_time_with_the_parts_on_the_bill() -> None:
+    """0.3 to 0.5 s (hardware/dead-man.md): R C for the 74LVC1G123, TI's SLVA720A; 0.45 R C for the other one."""
+    uf = float(re.findall(r"([\d.]+) uF", parts()["timing capacitor"]["what_for"])[0])
+    ours_k, others_k = map(float, re.findall(r"(\d+) k\b", parts()["timing resistor"]["what_for"]))
+    assert parts()["one-shot"]["from"] == "74LVC1G123"
+    assert 0.3 < ours_k * uf / 1000 < 0.5
+    assert 0.3 < 0.45 * others_k * uf / 1000 < 0.5
+    assert f"{ours_k:g} k, {uf:g} uF" in text("hardware/pictures/wiring.svg")
+    assert f"C {uf:g} uF, and R {ours_k:g} k for a 74LVC1G123" in text("hardware/dead-man.md")
+
+
 def test_the_drawing_of_the_wiring_shows_the_table() -> None:
     root = ElementTree.fromstring(text("hardware/pictures/wiring.svg"))
     found = boxes(root)
@@ -181,6 +192,7 @@ def test_every_figure_of_the_assembly_is_the_optics() -> None:
         f"about {200 * tan(radians(budget.field_deg / 2)) + budget.ring_at_pupil_mm:.1f} mm",
         f"LEDs {', '.join(map(str, ring(path.ring)))}", f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
         f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm", f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
+        f"the inner four: {ring_at_pupil_mm(for_pupil(path.ring, 7, 0.75), 0.75):.2f} mm at the pupil",
         f"its beam is {wide.splitter_mm:.1f} mm wide",
     ]  # fmt: skip
     said = " ".join(text("hardware/assembly.md").split())
