@@ -46,6 +46,8 @@ class Heartbeat:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+        if self._high:  # so that the next light begins with a rising edge, the only one that the gate hears
+            self._toggle()
 
     def close(self) -> None:
         """Be still, and let the line go."""

@@ -19,10 +19,13 @@ class Gate:
     def __init__(self) -> None:
         self.high, self.closed = False, False
         self.edges_s: list[float] = []
+        self.rising_s: list[float] = []  # the only ones that the one-shot hears
 
     def set(self, high: bool) -> None:
         if high != self.high:
             self.edges_s.append(time.monotonic())
+            if high:
+                self.rising_s.append(self.edges_s[-1])
         self.high = high
 
     def close(self) -> None:
@@ -48,6 +51,21 @@ def test_edges_come_closer_than_the_gate_closes_and_end_with_the_light():
     assert max(b - a for a, b in zip(gate.edges_s, gate.edges_s[1:], strict=False)) < GATE_S
     time.sleep(2 * BEAT_S)
     assert len(gate.edges_s) == edges
+    assert max(b - a for a, b in zip(gate.rising_s, gate.rising_s[1:], strict=False)) < GATE_S
+
+
+@pytest.mark.parametrize("beats", [1.5, 2.5])
+def test_every_light_begins_with_an_edge_that_the_gate_hears(beats):
+    gate = Gate()
+    pulse = Heartbeat(gate)
+    for _ in range(2):
+        heard, begin_s = len(gate.rising_s), time.monotonic()
+        pulse.start(5.0)
+        assert len(gate.rising_s) == heard + 1
+        assert gate.rising_s[-1] - begin_s < 0.1
+        time.sleep(beats * BEAT_S)
+        pulse.stop()
+    assert not gate.high
 
 
 def test_a_holder_that_never_stops_it_outlives_its_lease_by_no_edge():
