@@ -7,6 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from device.calibration.archive import Archive
 from device.clock import Clock
 from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.drivers.button import GpioButton
@@ -122,9 +123,22 @@ class Opening:
         if self.spec.sim is None:
             raise SpecError(
                 f"{self.spec.name} has no calibration: without its PSF no picture can be made",
-                "Calibrate the head first, or add the table [sim] to try its parts with a simulated calibration.",
+                "Calibrate the head and name the archive in the table [calibration], or add the table [sim] to try its "
+                "parts with a simulated calibration.",
             )
         return World(self.spec, self.clock)
+
+    def calibration(self) -> Calibration:
+        """The one in force in the archive that the head file names; without a name that of the simulated world."""
+        if self.spec.calibration is None:
+            return simulated_calibration(self.world)
+        kept, camera = Archive(self.spec.calibration.archive).load(), self.spec.camera
+        found = kept.calibration
+        if found.psfs[0].shape != (camera.rows, camera.cols):
+            raise HeadMismatch(f"the calibration of {kept.provenance.serial} has the PSF shape {found.psfs[0].shape}")
+        if found.simulated and not is_simulated(self.spec):
+            raise HeadMismatch(f"{found.id}, of {kept.provenance.serial}, was measured on a simulated head")
+        return found
 
     def lamp(self, chain: ChainSpec | None = None) -> Light:
         """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
@@ -229,13 +243,14 @@ def _replayed(opening: Opening, ledger: Ledger) -> Head:
 
 
 def _opened(opening: Opening, ledger: Ledger) -> Head:
-    spec, world = opening.spec, opening.world
+    spec, calibration = opening.spec, opening.calibration()
     if spec.camera.backend == "sim":
+        world = opening.world
         for colour in {spec.light.colour, spec.light.preview_colour}:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
-    return Head(spec, camera, light, simulated_calibration(world), opening.chips(), opening.button())
+    return Head(spec, camera, light, calibration, opening.chips(), opening.button())
 
 
 def _refuse_another_head(head: Head) -> None:

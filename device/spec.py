@@ -4,7 +4,7 @@ import difflib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from device.errors import SpecError
 from device.radiometry import RadiometrySpec
@@ -150,6 +150,17 @@ class ReplaySpec(Table):
     flat: Path | None = None
 
 
+class CalibrationTable(Table):
+    """Where calibrations are kept (`diffuscope calibrate`), relative to the head file; the one in force is used."""
+
+    archive: Path
+
+    @field_validator("archive")
+    @classmethod
+    def _from_the_head_file(cls, archive: Path, info: ValidationInfo) -> Path:
+        return archive if info.context is None else Path(info.context["folder"]) / archive
+
+
 class InstrumentSpec(Table):
     """A whole head. `sim` and `replay` hold what only that backend needs."""
 
@@ -159,6 +170,7 @@ class InstrumentSpec(Table):
     optics: OpticsSpec | None = None
     bus: BusSpec | None = None
     gpio: GpioSpec | None = None
+    calibration: CalibrationTable | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 

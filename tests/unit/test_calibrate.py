@@ -9,16 +9,20 @@ import pytest
 from device.calibration.archive import Archive
 from device.calibration.procedure import Job, Operator, Procedure, Stand
 from device.clock import VirtualClock
-from device.errors import CalibrationMissing, CalibrationRefused, CameraStalled, SpecError
+from device.errors import CalibrationMissing, CalibrationRefused, CameraStalled, HeadMismatch, SpecError
+from device.head import Head, Opening, is_simulated, open_head
+from device.ledger import MemoryLedger
 from device.sim import stage
 from device.sim.camera import SimCamera
 from device.sim.world import World
-from device.spec import InstrumentSpec
-from device.values import Glow
+from device.spec import InstrumentSpec, load_head
+from device.values import Calibration, Glow, Psf, Sensor
 from services.instrument.calibrating import Wish, calibrate, staging
 from tests import scenes
 from tests.bench.calibration import pictures, true_calibration
 from tests.unit.test_measure import FLAWS, small_world
+
+HEADS = Path(__file__).parents[2] / "hardware" / "heads"
 
 
 class Table:
@@ -176,3 +180,46 @@ def test_the_command_calibrates_a_simulated_head_and_refuses_a_nameless_or_a_rec
 
 def replayed(spec: InstrumentSpec) -> InstrumentSpec:
     return spec.model_copy(update={"camera": spec.camera.model_copy(update={"backend": "replay"})})
+
+
+# A head file that names an archive
+
+
+def opened(spec: InstrumentSpec) -> Head:
+    clock = VirtualClock()
+    return open_head(spec, clock, MemoryLedger(clock))
+
+
+def head_file(folder: Path, camera: str) -> InstrumentSpec:
+    """A head whose file names the archive beside it."""
+    text = (HEADS / camera).read_text(encoding="utf-8").replace("rows = 1080", "rows = 135")
+    text = text.replace("cols = 1920", "cols = 240").replace("pitch_um = 5.04", "pitch_um = 40.32")
+    path = folder / "head.toml"
+    path.write_text(text + '\n[calibration]\narchive = "archive"\n', encoding="utf-8")
+    return load_head(path)
+
+
+def test_a_head_opens_with_the_calibration_in_force(quick: Table, tmp_path: Path) -> None:
+    spec = head_file(tmp_path, "sim.toml")
+    with pytest.raises(CalibrationMissing):
+        opened(spec)
+    id = quick.run()
+    head = opened(spec)
+    assert head.calibration.id == id
+    assert head.kind == "simulated"
+
+
+def test_a_real_head_needs_no_simulated_calibration_and_refuses_one(quick: Table, tmp_path: Path) -> None:
+    spec = head_file(tmp_path, "imx296.toml").model_copy(update={"sim": None})
+    assert not is_simulated(spec)
+    archive = quick.archive
+    made = archive.load(quick.run())
+    with Opening(spec, VirtualClock()) as opening:
+        with pytest.raises(HeadMismatch, match="shape"):
+            opening.calibration()
+        psf = Psf(np.ones((spec.camera.rows, spec.camera.cols), np.float32))
+        archive.keep(Calibration((psf,), Sensor(), simulated=True), made.provenance)
+        with pytest.raises(HeadMismatch, match="simulated"):
+            opening.calibration()
+        id = archive.keep(Calibration((psf,), Sensor(black_dn=60.0)), made.provenance)
+        assert opening.calibration().id == id
