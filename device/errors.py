@@ -20,6 +20,9 @@ DiffuscopeError
 ├── CalibrationError             what the factory measured cannot be used
 │   ├── CalibrationMissing       there is none
 │   ├── CalibrationDamaged       its files are not what was kept
+│   ├── CalibrationOld           it is so long ago that it must be made anew
+│   ├── CalibrationStale         ordinary pictures show that the head is no longer as it was measured
+│   ├── CalibrationOtherMode     it was measured in another sensor mode than the head's file says
 │   └── CalibrationRefused       what stands before the head is not what this step measures
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
@@ -175,6 +178,27 @@ class CalibrationDamaged(CalibrationError):
 
     code = "calibration.damaged"
     default_remedy = "This calibration is damaged. Go back to an earlier one, or import it again."
+
+
+class CalibrationOld(CalibrationError):
+    """The calibration was made so long ago that it must be made anew."""
+
+    code = "calibration.old"
+    default_remedy = "This calibration is too old. Calibrate the head again before the next patient."
+
+
+class CalibrationStale(CalibrationError):
+    """Ordinary pictures show that the head is no longer as it was when it was calibrated."""
+
+    code = "calibration.stale"
+    default_remedy = "Something in the head has moved or aged since it was calibrated. Calibrate it again."
+
+
+class CalibrationOtherMode(CalibrationError):
+    """The calibration was measured in another mode of the sensor than the head's file says."""
+
+    code = "calibration.mode"
+    default_remedy = "Start with the head file that the head was calibrated with, or calibrate it in this mode."
 
 
 class CalibrationRefused(CalibrationError):
