@@ -27,7 +27,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner, processor
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.sim.staged import staged
-from device.spec import load_head
+from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.frontier_plot import drawn
 from services.instrument.once import Order, calibrated, refuse_place, written
@@ -96,33 +96,42 @@ class Point:
 def frontier(wish: Wish, say: Say) -> dict[str, Any]:
     """Measure, write the JSON and the plot, and return what the JSON says; `say` hears how far it is."""
     _refuse(wish)
-    clock = SystemClock()
-    Deadline.after(clock, wish.budget_s)  # refuses what is not a time
-    case = _case(wish)
-    bench = _Bench(case, Planner(wish.plans), clock, say)
-    points, choice = bench.measure(wish.budget_s, wish.repeats)
+    Deadline.after(SystemClock(), wish.budget_s)  # refuses what is not a time
+    found = measured(_case(wish), wish.plans, wish.budget_s, wish.repeats, say)
+    text = json.dumps(found, indent=1) + "\n"
+    written(wish.json, lambda: wish.json.write_text(text, encoding="utf-8"))
+    picture = drawn(found)
+    written(wish.plot, lambda: wish.plot.write_text(picture, encoding="utf-8"))
+    return found
+
+
+def measured(case: Case, plans: Path, budget_s: float, repeats: int, say: Say) -> dict[str, Any]:
+    """Every point of one case, what the instrument chooses within a budget, and all that a reader needs to know."""
+    bench = _Bench(case, Planner(plans), SystemClock(), say)
+    points, choice = bench.measure(budget_s, repeats)
     for point, on in zip(points, on_edge([(p.seconds_median, p.psnr_db) for p in points]), strict=True):
         point.pareto = on
     kept = {point.method for point in points if point.pareto}
-    found: dict[str, Any] = {
+    return {
         "machine": {"cpu": processor(), "cores": os.cpu_count(), "system": platform.platform(), "fft_threads": 1},
         "versions": _versions(),
         "scene": case.name,
         "simulated": case.calibration.simulated,
         "frame": {"rows": case.shape[0], "cols": case.shape[1]},
         "region": bench.region(),
-        "timing": f"counts in memory to picture on the sensor grid, plans made; {wish.repeats} interleaved repeats",
+        "timing": f"counts in memory to picture on the sensor grid, plans made; {repeats} interleaved repeats",
         "edge": "seconds_median against psnr_db",
         "points": [asdict(point) for point in points],
-        "budget_s": wish.budget_s,
+        "budget_s": budget_s,
         "choice": choice,
         "dominated": [method for method in METHODS if method not in kept],
     }
-    text = json.dumps(found, indent=1) + "\n"
-    written(wish.json, lambda: wish.json.write_text(text, encoding="utf-8"))
-    picture = drawn(found)
-    written(wish.plot, lambda: wish.plot.write_text(picture, encoding="utf-8"))
-    return found
+
+
+def scene_case(spec: InstrumentSpec) -> Case:
+    """One exposure of a simulated head, with its truth."""
+    scene = staged(spec)
+    return Case(spec.name, scene.counts, scene.truth, scene.vessels, scene.calibration, False)
 
 
 def on_edge(places: Sequence[tuple[float, float]]) -> list[bool]:
@@ -309,9 +318,7 @@ def _refuse(wish: Wish) -> None:
 
 def _case(wish: Wish) -> Case:
     if wish.scene is not None:
-        spec = load_head(wish.scene)
-        scene = staged(spec)
-        return Case(spec.name, scene.counts, scene.truth, scene.vessels, scene.calibration, False)
+        return scene_case(load_head(wish.scene))
     assert wish.raw is not None
     assert wish.psf is not None
     assert wish.truth is not None
