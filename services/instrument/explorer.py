@@ -17,7 +17,6 @@ from typing import Any, Literal
 from device.calibration.archive import write_synced
 from device.clock import Clock, SystemClock
 from device.errors import Busy, DiffuscopeError, SettingError
-from device.images import read_image
 from device.recon.methods import METHODS
 from device.recon.model import field_box
 from device.recon.plan import Planner
@@ -39,10 +38,10 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Kept:
-    """A capture to be made again: its frames as they were kept, and what the head was calibrated as."""
+    """A capture to be made again: its frames as they were kept (TIFF), and what the head was calibrated as."""
 
-    raw_tiff: Path
-    dark_tiff: Path
+    raw_tiff: bytes
+    dark_tiff: bytes
     calibration: Calibration
     simulated: bool
 
@@ -153,7 +152,7 @@ def _frontier(spec: InstrumentSpec, plans: Path, say: Callable[[str], None]) -> 
 
 
 def _made_again(kept: Kept, recipe: Recipe, plans: Path, say: Callable[[str], None]) -> bytes:
-    counts, dark = read_image(kept.raw_tiff), read_image(kept.dark_tiff)
+    (counts, _), (dark, _) = picture.read_raw_tiff(kept.raw_tiff), picture.read_raw_tiff(kept.dark_tiff)
     shape = (counts.shape[0], counts.shape[1])
     say("making plans")
     steps = (recipe,)

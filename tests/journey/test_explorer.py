@@ -85,12 +85,10 @@ def test_a_measurement_is_of_this_devices_own_pixels_and_is_still_there_afterwar
 
 
 def test_a_capture_is_made_again_by_another_method_and_says_that_it_is_simulated(
-    explorer: Explorer, spec: InstrumentSpec, tmp_path: Path
+    explorer: Explorer, spec: InstrumentSpec
 ) -> None:
     scene = staged(spec)
-    raw, dark = tmp_path / "raw.tiff", tmp_path / "dark.tiff"
-    raw.write_bytes(raw_tiff(scene.counts, {}))
-    dark.write_bytes(raw_tiff(np.full_like(scene.counts, 64), {}))
+    raw, dark = raw_tiff(scene.counts, {}), raw_tiff(np.full_like(scene.counts, 64), {})
     kept = Kept(raw, dark, scene.calibration, simulated=True)
     picture = Image.open(BytesIO(explorer.picture(kept, Recipe("gradient", 1))))
     assert picture.text["simulated"] == "true"
