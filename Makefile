@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-peers lock clean
+.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -68,6 +68,9 @@ bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times,
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
+
+bench-wifi: .venv/ready browser ## Print how the page fares at the end of a bad link (network namespace; needs root).
+	@$(BIN)/python -m tests.bench.wifi
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.

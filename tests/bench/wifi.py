@@ -1,0 +1,210 @@
+"""A tablet at the end of a bad link: how old the live picture is, when a lost link is told, how soon the page is there.
+
+The tablet is a real Chromium in a network namespace of its own, behind a queue that lets only so many bits through; the
+server is `diffuscope run`. Needs root. A relay between the two notes when each live picture leaves, and the browser
+when it is drawn: both read one clock. By itself: `make bench-wifi`.
+"""
+
+import asyncio
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from tests.bench.timing import head, row
+from tests.browser.conftest import CHROMIUM, Server, free_port
+
+SPACE, HERE, THERE = "diffuscope-tablet", "10.77.0.1", "10.77.0.2"
+OURS, THEIRS = "dsc-here", "dsc-there"
+WATCHED_S = 20.0
+AGED = re.compile(rb"x-frame: (\d+)\r\nx-age-ms: (\d+)", re.IGNORECASE)
+DRAWN = """
+window.drawn = [];
+const fetched = window.fetch;
+let latest = 0;
+window.fetch = async (...words) => {
+  const answer = await fetched(...words);
+  if (answer.headers.has("X-Frame")) latest = Number(answer.headers.get("X-Frame"));
+  return answer;
+};
+const draw = CanvasRenderingContext2D.prototype.drawImage;
+CanvasRenderingContext2D.prototype.drawImage = function (...words) {
+  draw.apply(this, words);
+  if (this.canvas.closest("eye-live")) window.drawn.push([latest, performance.timeOrigin + performance.now()]);
+};
+"""
+
+
+def sh(*words: str) -> None:
+    subprocess.run(words, check=True, capture_output=True)
+
+
+@contextmanager
+def namespace() -> Iterator[None]:
+    """A second host on this machine, with one wire to it."""
+    subprocess.run(["ip", "netns", "del", SPACE], check=False, capture_output=True)
+    sh("ip", "netns", "add", SPACE)
+    try:
+        sh("ip", "link", "add", OURS, "type", "veth", "peer", "name", THEIRS, "netns", SPACE)
+        sh("ip", "addr", "add", f"{HERE}/24", "dev", OURS)
+        sh("ip", "link", "set", OURS, "up")
+        for words in (
+            ["addr", "add", f"{THERE}/24", "dev", THEIRS],
+            ["link", "set", THEIRS, "up"],
+            ["link", "set", "lo", "up"],
+        ):
+            sh("ip", "-n", SPACE, *words)
+        yield
+    finally:
+        subprocess.run(["ip", "netns", "del", SPACE], check=False, capture_output=True)
+
+
+def throttle(mbit_per_s: int) -> None:
+    """Both ways through a queue of 400 ms."""
+    queue = ["root", "tbf", "rate", f"{mbit_per_s}mbit", "burst", "16kb", "latency", "400ms"]
+    sh("tc", "qdisc", "replace", "dev", OURS, *queue)
+    sh("ip", "netns", "exec", SPACE, "tc", "qdisc", "replace", "dev", THEIRS, *queue)
+
+
+class Relay:
+    """Hands bytes between the tablet and the server, and notes when the light of each live picture was collected."""
+
+    def __init__(self, server_port: int) -> None:
+        self.port, self._server_port = free_port(), server_port
+        self.lit_ms: dict[int, float] = {}
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        asyncio.run_coroutine_threadsafe(asyncio.start_server(self._relay, HERE, self.port), self._loop).result(5)
+
+    async def _relay(self, tablet_in: asyncio.StreamReader, tablet_out: asyncio.StreamWriter) -> None:
+        server_in, server_out = await asyncio.open_connection("127.0.0.1", self._server_port)
+        await asyncio.gather(self._pass(tablet_in, server_out, False), self._pass(server_in, tablet_out, True))
+
+    async def _pass(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, note: bool) -> None:
+        try:
+            while data := await source.read(65536):
+                if note and (found := AGED.search(data)):
+                    self.lit_ms[int(found[1])] = time.time() * 1000 - int(found[2])
+                sink.write(data)
+                await sink.drain()
+        except OSError:
+            return
+        finally:
+            sink.close()
+
+
+@contextmanager
+def tablet(folder: Path) -> Iterator[Browser]:
+    """Chromium at the other end of the wire."""
+    wrapper = folder / "chromium"
+    wrapper.write_text(f'#!/bin/sh\nexec ip netns exec {SPACE} {CHROMIUM} "$@"\n')
+    wrapper.chmod(0o755)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=str(wrapper), args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+def opened(browser: Browser, url: str, slower: int = 1) -> tuple[Page, float]:
+    """The page at its live picture, on a processor that many times slower; and how long that took."""
+    page = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True).new_page()
+    page.add_init_script(DRAWN)
+    page.context.new_cdp_session(page).send("Emulation.setCPUThrottlingRate", {"rate": slower})
+    begin_s = time.monotonic()
+    page.goto(url)
+    page.wait_for_selector("eye-live[data-frame]", timeout=60_000)
+    return page, time.monotonic() - begin_s
+
+
+def ages(browser: Browser, relay: Relay, url: str, mbit_per_s: int, limit_ms: float | None) -> None:
+    """Print how old the live picture is when it is drawn, and how many come."""
+    throttle(mbit_per_s)
+    page, _ = opened(browser, url)
+    page.wait_for_timeout(2000)
+    page.evaluate("window.drawn = []")
+    page.wait_for_timeout(WATCHED_S * 1000)
+    first: dict[int, float] = {}
+    for number, at_ms in page.evaluate("window.drawn"):
+        first.setdefault(int(number), at_ms)
+    aged = [at_ms - relay.lit_ms[number] for number, at_ms in first.items() if number in relay.lit_ms]
+    p95 = float(np.percentile(aged, 95))
+    row(
+        f"live picture at {mbit_per_s} Mbit/s: age p95, ms",
+        float(np.median(aged)),
+        p95,
+        len(first) / WATCHED_S,
+        limit=limit_ms,
+        value=p95,
+    )
+    page.context.close()
+
+
+def losses(browser: Browser, url: str) -> None:
+    """Print when a cut wire is told, and when its return is noticed."""
+    throttle(8)
+    page, _ = opened(browser, url)
+    told = page.get_by_text("not answering").first
+    told_s, back_s = [], []
+    for _ in range(3):
+        page.wait_for_timeout(1500)
+        sh("ip", "link", "set", OURS, "down")
+        begin_s = time.monotonic()
+        told.wait_for(state="visible", timeout=20_000)
+        told_s.append(time.monotonic() - begin_s)
+        sh("ip", "link", "set", OURS, "up")
+        begin_s = time.monotonic()
+        told.wait_for(state="hidden", timeout=20_000)
+        back_s.append(time.monotonic() - begin_s)
+    for name, times, limit in (("lost link told, s", told_s, 5.0), ("its return noticed, s", back_s, 2.0)):
+        row(name, float(np.median(times)), max(times), 0.0, limit=limit, value=max(times))
+    page.context.close()
+
+
+def first_use(browser: Browser, url: str) -> None:
+    """Print how soon a slow tablet on 8 Mbit/s shows the live picture."""
+    throttle(8)
+    opened(browser, url)[0].context.close()  # the preview runs
+    times = []
+    for _ in range(5):
+        page, took_s = opened(browser, url, slower=6)
+        times.append(took_s)
+        page.context.close()
+    row(
+        "usable at 8 Mbit/s, CPU/6, s",
+        float(np.median(times)),
+        max(times),
+        0.0,
+        limit=1.5,
+        value=float(np.median(times)),
+    )
+
+
+def main() -> None:
+    """Measure all of it."""
+    with tempfile.TemporaryDirectory() as place, namespace():
+        server = Server(Path(place) / "data")
+        server.start()
+        try:
+            server.wait_until_ready()
+            relay = Relay(server.port)
+            url = f"http://{HERE}:{relay.port}"
+            head("a tablet at the end of a bad link", "median", "p95/worst", "per s", "limit")
+            with tablet(Path(place)) as browser:
+                ages(browser, relay, url, 8, None)
+                ages(browser, relay, url, 2, 300.0)
+                losses(browser, url)
+                first_use(browser, url)
+        finally:
+            server.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
