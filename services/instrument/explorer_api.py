@@ -49,13 +49,7 @@ def explorer_routes(
         id: str, method: str, bin: int = Query(1, ge=1, le=16), rounds: int | None = Query(None, ge=0, le=1000)
     ) -> Response:
         """A kept capture as another method makes it, with the calibration that is in force now."""
-        capture, seen = store.get(id), calibration()
-        if capture.calibration_id != seen.id:
-            raise CalibrationMissing(
-                f"{id} was taken with calibration {capture.calibration_id}, and {seen.id} is in force",
-                "Choose a picture that was taken since, or go back to that calibration.",
-            )
-        kept = Kept(store.read(id, "raw.tiff"), store.read(id, "dark.tiff"), seen, capture.simulated)
+        kept = _kept(store, id, calibration())
         return Response(explorer.picture(kept, Recipe(method, bin, rounds)), media_type="image/png")
 
     @router.get("/diary")
@@ -64,3 +58,14 @@ def explorer_routes(
         return {"entries": diary.entries(limit, about)}
 
     return router
+
+
+def _kept(store: Store, id: str, seen: Calibration) -> Kept:
+    """A capture's frames; CalibrationMissing if the head sees by another calibration now."""
+    capture = store.get(id)
+    if capture.calibration_id != seen.id:
+        raise CalibrationMissing(
+            f"{id} was taken with calibration {capture.calibration_id}, and {seen.id} is in force",
+            "Choose a picture that was taken since, or go back to that calibration.",
+        )
+    return Kept(store.read(id, "raw.tiff"), store.read(id, "dark.tiff"), seen, capture.simulated)
