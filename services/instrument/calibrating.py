@@ -15,6 +15,7 @@ from device.head import Bench, open_bench
 from device.sim import stage
 from device.sim.world import World
 from device.spec import InstrumentSpec
+from device.values import Identity
 
 ASKED: dict[Stand, str] = {
     "cap": "Put the cap on the head and shade it.",
@@ -47,7 +48,10 @@ def calibrate(
         work = wish.archive / ".steps"
         procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
         archive = Archive(wish.archive)
-        return archive.load(procedure.run(archive))
+        kept = archive.load(procedure.run(archive))
+        if bench.chips.memory is not None:  # last: until then the instrument refuses to start, and says what to do
+            bench.chips.memory.write(Identity(kept.provenance.serial, kept.calibration.id))
+        return kept
 
 
 def staging(world: World) -> Callable[[Stand], None]:

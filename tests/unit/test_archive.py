@@ -76,7 +76,7 @@ def test_an_empty_archive_says_that_there_is_none(tmp_path):
 
 def test_every_wrong_byte_is_noticed_and_none_crashes(archive):
     """A thousand single bytes, spread over all files."""
-    files = [path for path in sorted(archive.root.rglob("*")) if path.is_file()]
+    files = [path for path in sorted(archive.root.rglob("*")) if path.is_file() and path.name != ".lock"]
     draw = random.Random(1)
     for _ in range(1000):
         path = draw.choice(files)
