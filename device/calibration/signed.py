@@ -120,10 +120,10 @@ def read_export(path: Path, trusted: tuple[Signer, ...]) -> tuple[dict[str, byte
     """
     try:
         with path.open("rb") as file:
-            whole = file.read(MOST_BYTES + 1)
+            whole = file.read(MOST_BYTES + 1) if os.fstat(file.fileno()).st_size <= MOST_BYTES else None
     except OSError as error:
         raise SettingError(f"{path} cannot be read: {error.strerror}", "Give the path of an exported file.") from error
-    if len(whole) > MOST_BYTES:
+    if whole is None or len(whole) > MOST_BYTES:
         raise CalibrationDamaged(f"{path} is larger than {MOST_BYTES / 1e6:.0f} MB, as no calibration is", AGAIN)
     return opened(whole, path.name, trusted)
 

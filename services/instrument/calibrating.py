@@ -17,6 +17,7 @@ from device.sim.world import World
 from device.spec import InstrumentSpec
 from device.values import Identity
 
+LONGEST_SERIAL = 64  # of characters: what a head's memory keeps
 ASKED: dict[Stand, str] = {
     "cap": "Put the cap on the head and shade it.",
     "screen": "Take the cap off and put the even screen before the head, switched on.",
@@ -42,16 +43,23 @@ def calibrate(
     `ask` says to a person what to put before the head, and returns when it is there.
     """
     with closing(open_bench(spec, clock)) as bench:
-        world = bench.world
-        job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
-        operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
-        work = wish.archive / ".steps"
-        procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
-        archive = Archive(wish.archive)
-        kept = archive.load(procedure.run(archive))
-        if bench.chips.memory is not None:  # last: until then the instrument refuses to start, and says what to do
-            bench.chips.memory.write(Identity(kept.provenance.serial, kept.calibration.id))
-        return kept
+        put = (lambda stand: ask(ASKED[stand])) if bench.world is None else staging(bench.world)
+        return calibrate_on(bench, spec, wish, clock, Operator(put, tell))
+
+
+def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, operator: Operator) -> Kept:
+    """The same with a head that is open already; its memory learns last whose calibration it is.
+
+    A power cut before that leaves a head that refuses to start, and says how its memory is written.
+    """
+    job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+    procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
+    archive = Archive(wish.archive)
+    kept = archive.load(procedure.run(archive))
+    if bench.chips.memory is not None:
+        bench.chips.memory.write(Identity(job.serial, kept.calibration.id))
+        operator.tell(f"memory: this head is {job.serial}, calibrated as {kept.calibration.id}")
+    return kept
 
 
 def staging(world: World) -> Callable[[Stand], None]:
@@ -72,6 +80,8 @@ def staging(world: World) -> Callable[[Stand], None]:
 
 def _serial(bench: Bench, wish: Wish) -> str:
     if wish.serial is not None:
+        if not 0 < len(wish.serial) <= LONGEST_SERIAL or not wish.serial.isprintable():
+            raise SettingError(f"{wish.serial!r} is no serial number", "Give one short line with --serial.")
         return wish.serial
     known = bench.chips.memory.read() if bench.chips.memory is not None else None
     if known is not None:
