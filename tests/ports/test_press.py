@@ -8,9 +8,10 @@ import libcamera
 import numpy as np
 import pytest
 
+from device.calibration.archive import Archive, Provenance
 from device.clock import SystemClock, VirtualClock
 from device.errors import BusFault, HeadMismatch, PowerLow, TooHot
-from device.head import Head, open_head
+from device.head import Head, head_memory, open_head
 from device.ledger import MemoryLedger
 from device.recon.metrics import Judge
 from device.recon.plan import Planner
@@ -19,8 +20,9 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.plan import decide
 from device.sim.world import World
-from device.spec import BusSpec, ChainSpec, InstrumentSpec, LightSpec
+from device.spec import BusSpec, CalibrationTable, ChainSpec, InstrumentSpec, LightSpec
 from device.values import Glow, Identity, Image, Shot
+from services.instrument.calibrations import put_in_force
 from tests.ports.conftest import small_head
 from tests.ports.emulators.memory import MemoryAllocator
 from tests.ports.emulators.sensor import Sensor
@@ -107,6 +109,40 @@ def test_the_memory_of_another_head_is_refused_and_everything_is_closed_again(he
         opened_again()
     assert not libcamera.plugged[-1].held
     assert not wires().lit
+
+
+def test_a_head_that_was_not_told_of_its_calibration_refuses_until_it_is(head, tmp_path):
+    """Over the real smbus2: blank, told, forgotten by a power cut after the archive, told again."""
+    archive = Archive(tmp_path / "archive")
+    said = Provenance("DS-0042", SystemClock().wall(), "a technician", "0.1.0")
+    first = archive.keep(head.calibration, said)
+    calibrated = real_parts().model_copy(update={"calibration": CalibrationTable(archive=archive.root)})
+    head.close()
+
+    def started() -> str:
+        plug_in()
+        opened = open_head(calibrated, SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
+        opened.close()
+        return opened.calibration.id
+
+    def told(id: str) -> None:
+        with head_memory(calibrated, SystemClock()) as memory:
+            put_in_force(archive, archive.load(id), memory)
+
+    wires().break_("memory.blank")
+    with pytest.raises(HeadMismatch, match="knows none"):
+        started()
+    wires().break_()
+    told(first)
+    assert started() == first
+    newer = archive.keep(replace(head.calibration, field_deg=30.0), said)  # and here the power goes away
+    with pytest.raises(HeadMismatch, match=f"DS-0042 was calibrated as {first}, loaded is {newer}") as mismatch:
+        started()
+    assert f"calibrations use {newer}" in mismatch.value.remedy
+    told(newer)
+    assert started() == newer
+    told(first)
+    assert started() == first
 
 
 def test_a_silent_bus_stops_the_head_from_opening(head):
