@@ -190,7 +190,9 @@ def test_a_psf_from_others_says_what_nobody_knows_of_it(say, theirs, tmp_path):
     assert "no calibration is in force" in say("list", "--archive", archive.root)
 
 
-def test_pictures_by_an_imported_psf_are_those_by_the_psf_itself(diffuscope: Diffuscope, say, theirs, tmp_path):
+def test_pictures_by_an_imported_psf_are_those_by_the_psf_itself(
+    diffuscope: Diffuscope, environment: dict[str, str], say, theirs, tmp_path
+):
     archive = Archive(tmp_path / "archive")
     id = imported(say, archive, theirs / "psf.tiff")
     before = tree(archive.root)
@@ -203,7 +205,8 @@ def test_pictures_by_an_imported_psf_are_those_by_the_psf_itself(diffuscope: Dif
     made, expected = np.load(tmp_path / "by_id.npy"), np.load(tmp_path / "by_psf.npy")
     assert np.array_equal(made, expected)
     assert made[42:58, 52:78].mean() > 5 * np.abs(made[:30]).mean()  # the bright rectangle is where it was
-    assert tree(archive.root) == before  # what FFTW learned of this machine is beside, never inside
+    assert tree(archive.root) == before  # what FFTW learned of this machine is elsewhere, never inside
+    assert list(Path(environment["XDG_CACHE_HOME"]).rglob("fftw-*.wisdom"))
 
 
 def test_the_one_in_force_makes_pictures_and_no_words_are_guessed(
