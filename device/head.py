@@ -91,8 +91,9 @@ def is_simulated(spec: InstrumentSpec) -> bool:
 def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
     """Refuse a calibration that this head cannot have: of another shape, simulated, or of others; HeadMismatch."""
     found, camera, said = kept.calibration, spec.camera, kept.provenance
-    if found.psfs[0].shape != (camera.rows, camera.cols):
-        raise HeadMismatch(f"the calibration of {said.serial} has the PSF shape {found.psfs[0].shape}")
+    maps = [one for one in (found.dark_dn, found.flat, found.bad) if one is not None]
+    if others := {one.shape for one in (*found.psfs, *maps)} - {(camera.rows, camera.cols)}:
+        raise HeadMismatch(f"the calibration of {said.serial} has the PSF shape {max(others)}")
     if found.simulated and not is_simulated(spec):
         raise HeadMismatch(f"{found.id}, of {said.serial}, was measured on a simulated head")
     if said.origin == "imported" and not (spec.calibration and spec.calibration.imported):

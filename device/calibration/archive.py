@@ -8,6 +8,7 @@ A calibration is never changed. A new one is written beside the old ones and tak
 the same rename. A power cut at any moment leaves the old one in force, or the new one, whole.
 """
 
+import errno
 import fcntl
 import hashlib
 import io
@@ -19,14 +20,22 @@ import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from device.errors import CalibrationDamaged, CalibrationError, CalibrationFormat, CalibrationMissing
+from device.errors import (
+    CalibrationDamaged,
+    CalibrationError,
+    CalibrationFormat,
+    CalibrationMissing,
+    StoreError,
+    StoreFull,
+)
 from device.values import Calibration, Geometry, Psf, Sensor
 
 MANIFEST, CURRENT = "manifest.toml", "current"
@@ -105,11 +114,18 @@ class Archive:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Wait until no other process changes the archive; a killed one gives its place up."""
-        self.root.mkdir(parents=True, exist_ok=True)
-        with (self.root / ".lock").open("ab") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
+        """Wait until no other process changes the archive; a killed one gives its place up. StoreError if none may."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with (self.root / ".lock").open("ab") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                yield
+        except OSError as error:
+            full = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else StoreError
+            raise full(
+                f"{self.root} cannot be written: {error.strerror or error}",
+                "Make room there or choose another folder; the calibrations that were kept are as before.",
+            ) from error
 
     def use(self, id: str) -> None:
         """Put a kept calibration in force; it is read and checked first."""
@@ -228,17 +244,16 @@ def _read(files: Mapping[str, bytes], id: str) -> Kept:
         said = _said(files)
         arrays = {name: _array(_named(files, name), digest) for name, digest in said["sha256"].items()}
         calibration = Calibration(
-            psfs=tuple(Psf(arrays[f"psf{k}.npy"], name) for k, name in enumerate(said["psf_names"])),
-            sensor=Sensor(**said["sensor"]),
-            geometry=Geometry(**said["geometry"]) if "geometry" in said else None,
-            field_deg=said.get("field_deg"),
-            simulated=said["simulated"],
-            **{name: arrays.get(f"{name}.npy") for name in MAPS},
+            psfs=tuple(Psf(arrays[f"psf{k}.npy"], str(name)) for k, name in enumerate(said["psf_names"])),
+            sensor=Sensor(**_numbers(said["sensor"])),
+            geometry=Geometry(**_numbers(said["geometry"])) if "geometry" in said else None,
+            field_deg=_numbers({"field_deg": said.get("field_deg")})["field_deg"],
+            simulated=_TRUTH.validate_python(said["simulated"]),
+            **{name: _map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
-        whose = said["provenance"] | {"made_at": datetime.fromisoformat(said["provenance"]["made_at"])}
-        whose["unknown"] = tuple(whose.get("unknown", ()))
         figures = tuple(said["figures"].items())
-        kept = Kept(calibration, Provenance(**{key: whose.get(key) for key in _NAMES if key in whose}, figures=figures))
+        whose = _WHOSE.validate_python(said["provenance"] | {"figures": figures})
+        kept = Kept(calibration, whose)
     except _BROKEN as error:
         raise CalibrationDamaged(f"calibration {id}: {error}") from error
     if kept.calibration.id != id:
@@ -246,8 +261,20 @@ def _read(files: Mapping[str, bytes], id: str) -> Kept:
     return kept
 
 
+_TRUTH, _NUMBERS, _WHOSE = TypeAdapter(bool), TypeAdapter(dict[str, float | None]), TypeAdapter(Provenance)
 _BROKEN = (ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RecursionError)
-_NAMES = tuple(field.name for field in fields(Provenance) if field.name != "figures")
+
+
+def _numbers(table: dict[str, Any]) -> dict[str, Any]:
+    """The same table, or ValueError if it holds anything but numbers; their digits are part of the id."""
+    _NUMBERS.validate_python(table, strict=True)
+    return table
+
+
+def _map(array: np.ndarray | None, name: str) -> np.ndarray | None:
+    if array is not None and (array.ndim != 2 or array.dtype != (np.bool_ if name == "bad" else np.float32)):
+        raise ValueError(f"{name} holds {array.dtype} of the shape {array.shape}, which is no map of a sensor")
+    return array
 
 
 def _npy(array: np.ndarray) -> bytes:

@@ -74,7 +74,7 @@ def _put_in_force(archive: Archive, id: str, head: Path | None) -> str:
             memory = held.enter_context(head_memory(spec, SystemClock()))
         put_in_force(archive, found, memory)
     told = "" if memory is None else f", and head {found.provenance.serial} knows it"
-    return f"{id} is in force in {archive.root}{told}"
+    return f"{id} is in force in {archive.root}{told}; the instrument uses it from its next start"
 
 
 def put_in_force(archive: Archive, kept: Kept, memory: HeadMemory | None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from device.calibration.archive import Archive, Provenance
-from device.errors import CalibrationDamaged, CalibrationError, CalibrationMissing
+from device.errors import CalibrationDamaged, CalibrationError, CalibrationMissing, StoreError
 from device.values import Calibration, Geometry, Psf, Sensor
 from tests.scenes import speckle
 
@@ -61,6 +61,15 @@ def test_an_earlier_one_can_be_put_in_force_again(archive):
     archive.use(first)
     assert archive.load().calibration.sensor.black_dn == 64.25
     assert archive.ids() == (first, second)
+
+
+def test_a_folder_that_cannot_be_written_is_said_and_nothing_changes(archive, tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StoreError, match="cannot be written") as told:
+        Archive(tmp_path / "file").keep(calibration(), WHO)
+    assert "as before" in told.value.remedy
+    with pytest.raises(StoreError):
+        Archive(tmp_path / "file" / "below").keep(calibration(), WHO)
 
 
 def test_an_empty_archive_says_that_there_is_none(tmp_path):

@@ -158,6 +158,13 @@ def resealed(files: Files, name: str, content: bytes) -> Files:
     return files | {name: content, "manifest.toml": kept._sealed(said.replace(old, digest))}
 
 
+def saying(files: Files, old: str, new: str) -> Files:
+    """With other words in its manifest."""
+    said = kept._unsealed(files["manifest.toml"])
+    assert old in said.replace('"black_dn"', "black_dn")
+    return files | {"manifest.toml": kept._sealed(said.replace('"black_dn"', "black_dn").replace(old, new))}
+
+
 def promising(shape: str) -> bytes:
     """An array file whose header promises more than there is."""
     header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117) + b"\n"
@@ -197,6 +204,10 @@ HOSTILE: dict[str, Callable[[Files], bytes]] = {
     "a manifest as deep as the sea": lambda files: zipped(
         files | {"manifest.toml": kept._sealed("format = 1\nx = " + "[" * 50000)}
     ),
+    "a flat that is no map": lambda files: zipped(resealed(files, "flat.npy", files["psf0.npy"][:-4])),
+    "a black level in words": lambda files: zipped(saying(files, "black_dn = 64.25", 'black_dn = "dark"')),
+    "a signer's joke as serial number": lambda files: zipped(saying(files, '"DS-0042"', "[1, 2]")),
+    "an origin that nobody knows": lambda files: zipped(saying(files, '"measured"', '"found"')),
     "a manifest of something else": lambda files: zipped(
         {"manifest.toml": kept._sealed("format = 1\nsha256 = 3\nid = 4")}
     ),
