@@ -281,9 +281,9 @@ def refuse_another_head(head: Head) -> None:
     """A head that knows whose it is must be the one that the calibration was measured on."""
     if head.chips.memory is None:
         return
-    known, loaded = head.chips.memory.read(), head.calibration.id
-    if known is None and head.spec.calibration is None:
-        return  # it was never calibrated, and what is loaded is made up
+    known, loaded, bus = head.chips.memory.read(), head.calibration.id, head.spec.bus
+    if known is None and (head.spec.calibration is None or (bus is not None and bus.backend == "sim")):
+        return  # never calibrated, and what is loaded is made up; or a simulated memory, which ends with its process
     if known is None or known.calibration_id != loaded:
         knows = (
             f"head {known.serial} was calibrated as {known.calibration_id[:16]}" if known else "this head knows none"

@@ -16,7 +16,7 @@ from device.sim.camera import SimCamera
 from device.sim.chips import SimHeadMemory
 from device.sim.light import SimLight
 from device.sim.world import World
-from device.spec import CalibrationTable
+from device.spec import BusSpec, CalibrationTable
 from device.values import Identity
 from services.instrument.calibrating import Wish, calibrate_on, staging
 from services.instrument.calibrations import put_in_force
@@ -49,9 +49,9 @@ def archive(tmp_path: Path) -> Archive:
     return Archive(tmp_path / "archive")
 
 
-def started(world: World, archive: Archive) -> Head:
+def started(world: World, archive: Archive, bus: BusSpec | None = None) -> Head:
     """The simulated head as `open_head` opens it, with a world and so a memory that outlive it."""
-    spec = world.spec.model_copy(update={"calibration": CalibrationTable(archive=archive.root)})
+    spec = world.spec.model_copy(update={"calibration": CalibrationTable(archive=archive.root), "bus": bus})
     lamp = GuardedLight(SimLight(world), world.clock, 1.0, hazard_of(spec), MemoryLedger(world.clock))
     head = Head(spec, SimCamera(world), lamp, archive.load().calibration, Chips(memory=SimHeadMemory(world)))
     refuse_another_head(head)
@@ -116,3 +116,11 @@ def test_a_silent_memory_changes_nothing(world, archive):
         put_in_force(archive, archive.load(second), SimHeadMemory(world))
     world.faults = set()
     assert archive.current() == first
+
+
+def test_a_simulated_memory_that_ended_with_its_process_stops_nobody(world, archive):
+    world.identity = None
+    archive.keep(calibration(), WHO)
+    bus = BusSpec(backend="sim", memory=0x50)
+    head = started(world, archive, bus=bus)
+    assert head.chips.memory.read() is None
