@@ -10,7 +10,7 @@ from pathlib import Path
 from device.calibration.archive import Archive, Kept
 from device.calibration.procedure import FILLED, Job, Operator, Procedure, Stand
 from device.clock import Clock
-from device.errors import SettingError
+from device.errors import MemoryDamaged, SettingError
 from device.head import Bench, open_bench
 from device.sim import stage
 from device.sim.world import World
@@ -52,7 +52,7 @@ def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, o
 
     A power cut before that leaves a head that refuses to start, and says how its memory is written.
     """
-    job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+    job = Job(spec, _serial(bench, wish, operator.tell), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
     procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
     archive = Archive(wish.archive)
     kept = archive.load(procedure.run(archive))
@@ -78,12 +78,20 @@ def staging(world: World) -> Callable[[Stand], None]:
     return put
 
 
-def _serial(bench: Bench, wish: Wish) -> str:
+def _serial(bench: Bench, wish: Wish, tell: Callable[[str], None]) -> str:
+    """Whose calibration it becomes; a memory that does not answer is an error now, not after all the work."""
+    try:
+        known = bench.chips.memory.read() if bench.chips.memory is not None else None
+    except MemoryDamaged:
+        if wish.serial is None:
+            raise
+        known = None  # torn by a power cut, and about to be written anew
     if wish.serial is not None:
         if not 0 < len(wish.serial) <= LONGEST_SERIAL or not wish.serial.isprintable():
             raise SettingError(f"{wish.serial!r} is no serial number", "Give one short line with --serial.")
+        if known is not None and known.serial != wish.serial:
+            tell(f"memory: this head was {known.serial}, and becomes {wish.serial}")
         return wish.serial
-    known = bench.chips.memory.read() if bench.chips.memory is not None else None
     if known is not None:
         return known.serial
     if bench.world is not None:

@@ -8,7 +8,7 @@ import pytest
 
 from device.calibration.archive import Archive
 from device.calibration.procedure import Operator
-from device.errors import BusFault, HeadMismatch, MemoryDamaged
+from device.errors import BusFault, HeadMismatch, MemoryDamaged, SettingError
 from device.guard import GuardedLight
 from device.head import Bench, Chips, Head, hazard_of, refuse_another_head
 from device.ledger import MemoryLedger
@@ -66,6 +66,15 @@ def test_a_calibrated_head_knows_itself_and_one_that_was_not_told_is_noticed(wor
     assert SimHeadMemory(world).read() == Identity("DS-0042", kept.calibration.id)
     assert said[-1] == f"memory: this head is DS-0042, calibrated as {kept.calibration.id}"
     assert started(world, archive).calibration.id == kept.calibration.id
+
+    with pytest.raises(SettingError, match="no serial number"):
+        calibrate_on(
+            bench, world.spec, replace(wish, serial="x" * 65), world.clock, Operator(lambda _: None, said.append)
+        )
+    world.faults = {"bus.silent"}
+    with pytest.raises(BusFault):  # now, not after minutes of work
+        calibrate_on(bench, world.spec, wish, world.clock, Operator(lambda _: None, said.append))
+    world.faults = set()
 
     newer = archive.keep(calibration(65.0), replace(WHO, serial="DS-0042"))  # and here the power goes away
     with pytest.raises(HeadMismatch, match=kept.calibration.id) as told:
