@@ -93,7 +93,9 @@ def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
     found, camera, said = kept.calibration, spec.camera, kept.provenance
     maps = [one for one in (found.dark_dn, found.flat, found.bad) if one is not None]
     if others := {one.shape for one in (*found.psfs, *maps)} - {(camera.rows, camera.cols)}:
-        raise HeadMismatch(f"the calibration of {said.serial} has the PSF shape {max(others)}")
+        raise HeadMismatch(
+            f"the calibration of {said.serial} has the shape {max(others)}, the camera {(camera.rows, camera.cols)}"
+        )
     if found.simulated and not is_simulated(spec):
         raise HeadMismatch(f"{found.id}, of {said.serial}, was measured on a simulated head")
     if said.origin == "imported" and not (spec.calibration and spec.calibration.imported):

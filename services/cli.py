@@ -72,7 +72,8 @@ def reconstruct(
         list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
     ] = None,
     calibration: Annotated[
-        str | None, typer.Option(metavar="DIR[:ID]", help="Instead of PSFs: a kept calibration, else the one in force.")
+        str | None,
+        typer.Option(metavar="DIR[:ID]", help="Instead of PSFs: a kept calibration; without ID the one in force."),
     ] = None,
     method: Annotated[
         str | None, typer.Option(help="A name of `diffuscope methods`; by default what suits the frame.")
