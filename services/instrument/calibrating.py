@@ -52,14 +52,18 @@ def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, o
 
     A power cut before that leaves a head that refuses to start, and says how its memory is written.
     """
-    job = Job(spec, _serial(bench, wish, operator.tell), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+    job = Job(spec, serial_of(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
     procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
     archive = Archive(wish.archive)
     kept = archive.load(procedure.run(archive))
-    if bench.chips.memory is not None:
-        bench.chips.memory.write(Identity(job.serial, kept.calibration.id))
-        operator.tell(f"memory: this head is {job.serial}, calibrated as {kept.calibration.id}")
+    note_in_head(bench, kept)
     return kept
+
+
+def note_in_head(bench: Bench, kept: Kept) -> None:
+    """The head's memory, where it has one, says from now on who it is and which calibration is its own."""
+    if bench.chips.memory is not None:
+        bench.chips.memory.write(Identity(kept.provenance.serial, kept.calibration.id))
 
 
 def staging(world: World) -> Callable[[Stand], None]:
@@ -78,8 +82,11 @@ def staging(world: World) -> Callable[[Stand], None]:
     return put
 
 
-def _serial(bench: Bench, wish: Wish, tell: Callable[[str], None]) -> str:
-    """Whose calibration it becomes; a memory that does not answer is an error now, not after all the work."""
+def serial_of(bench: Bench, wish: Wish) -> str:
+    """What the wish, the head's memory or the simulator says, in this order; SettingError if nobody knows.
+
+    A memory that does not answer is an error now, not after all the work.
+    """
     try:
         known = bench.chips.memory.read() if bench.chips.memory is not None else None
     except MemoryDamaged:
@@ -89,8 +96,6 @@ def _serial(bench: Bench, wish: Wish, tell: Callable[[str], None]) -> str:
     if wish.serial is not None:
         if not 0 < len(wish.serial) <= LONGEST_SERIAL or not wish.serial.isprintable():
             raise SettingError(f"{wish.serial!r} is no serial number", "Give one short line with --serial.")
-        if known is not None and known.serial != wish.serial:
-            tell(f"memory: this head was {known.serial}, and becomes {wish.serial}")
         return wish.serial
     if known is not None:
         return known.serial
