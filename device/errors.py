@@ -14,6 +14,7 @@ DiffuscopeError
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
 │   ├── BusFault                 a chip on the I2C bus does not answer
+│   │   └── MemoryDamaged        the head's memory answers, and holds no whole identity
 │   ├── HeadMismatch             the head's memory names another head
 │   ├── TooHot                   the head is too warm to go on
 │   └── PowerLow                 the battery is nearly empty
@@ -23,6 +24,8 @@ DiffuscopeError
 │   ├── CalibrationOld           it is so long ago that it must be made anew
 │   ├── CalibrationStale         ordinary pictures show that the head is no longer as it was measured
 │   ├── CalibrationOtherMode     it was measured in another sensor mode than the head's file says
+│   ├── CalibrationFormat        it was kept by another version of this software
+│   ├── CalibrationUntrusted     nobody whom we trust has signed it as it is
 │   └── CalibrationRefused       what stands before the head is not what this step measures
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
@@ -138,6 +141,16 @@ class BusFault(HardwareError):
     )
 
 
+class MemoryDamaged(BusFault):
+    """The head's memory answers, but what it holds is not whole: power went away while it was written."""
+
+    code = "head.memory"
+    default_remedy = (
+        "The device does not know which head is fitted. Call the technician, who writes the head's memory anew with "
+        "`diffuscope calibrations use ID --archive DIR --head HEAD`."
+    )
+
+
 class HeadMismatch(HardwareError):
     """The head's memory names another head or another calibration than the one that is loaded."""
 
@@ -199,6 +212,20 @@ class CalibrationOtherMode(CalibrationError):
 
     code = "calibration.mode"
     default_remedy = "Start with the head file that the head was calibrated with, or calibrate it in this mode."
+
+
+class CalibrationFormat(CalibrationError):
+    """The calibration was kept in a format that this version of the software does not read."""
+
+    code = "calibration.format"
+    default_remedy = "Export it again with the version of the software that is installed here, or calibrate the head."
+
+
+class CalibrationUntrusted(CalibrationError):
+    """A calibration from elsewhere that nobody whom we trust has signed as it is now."""
+
+    code = "calibration.untrusted"
+    default_remedy = "Do not use this file. Ask the service centre for it again, and for its public key."
 
 
 class CalibrationRefused(CalibrationError):

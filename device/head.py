@@ -1,13 +1,14 @@
 """The one place that chooses: a head file becomes a camera, a guarded light and a calibration. Never a fallback."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from device.calibration.archive import Archive
+from device.calibration.archive import Archive, Kept
 from device.clock import Clock
 from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.drivers.button import GpioButton
@@ -87,6 +88,28 @@ def is_simulated(spec: InstrumentSpec) -> bool:
     return "sim" in backends or spec.sim is not None
 
 
+def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
+    """Refuse a calibration that this head cannot have: of another shape, simulated, or of others; HeadMismatch."""
+    found, camera, said = kept.calibration, spec.camera, kept.provenance
+    maps = [one for one in (found.dark_dn, found.flat, found.bad) if one is not None]
+    if others := {one.shape for one in (*found.psfs, *maps)} - {(camera.rows, camera.cols)}:
+        raise HeadMismatch(
+            f"the calibration of {said.serial} has the shape {max(others)}, the camera {(camera.rows, camera.cols)}"
+        )
+    if found.simulated and not is_simulated(spec):
+        raise HeadMismatch(f"{found.id}, of {said.serial}, was measured on a simulated head")
+    if said.origin == "imported" and not (spec.calibration and spec.calibration.imported):
+        raise HeadMismatch(
+            f"{found.id} is a PSF from {said.source}, not measured on this head",
+            "Calibrate the head. To try this PSF all the same, write `imported = true` under [calibration].",
+        )
+    if missing := {"black_dn", "white_dn"} & set(said.unknown):
+        raise HeadMismatch(
+            f"{found.id} does not say {' and '.join(sorted(missing))}, without which no head can use it",
+            "Import the PSF again with --black-dn and --white-dn.",
+        )
+
+
 def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any = None) -> Head:
     """Open the parts that the head file names; a part that is missing is an error, never replaced by another.
 
@@ -98,7 +121,7 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with Opening(spec, clock, allocator) as opening:
         head = _replayed(opening, ledger) if spec.camera.backend == "replay" else _opened(opening, ledger)
-        _refuse_another_head(head)
+        refuse_another_head(head)
         return replace(head, held=opening.undo.pop_all())
 
 
@@ -132,13 +155,9 @@ class Opening:
         """The one in force in the archive that the head file names; without a name that of the simulated world."""
         if self.spec.calibration is None:
             return simulated_calibration(self.world)
-        kept, camera = Archive(self.spec.calibration.archive).load(), self.spec.camera
-        found = kept.calibration
-        if found.psfs[0].shape != (camera.rows, camera.cols):
-            raise HeadMismatch(f"the calibration of {kept.provenance.serial} has the PSF shape {found.psfs[0].shape}")
-        if found.simulated and not is_simulated(self.spec):
-            raise HeadMismatch(f"{found.id}, of {kept.provenance.serial}, was measured on a simulated head")
-        return found
+        kept = Archive(self.spec.calibration.archive).load()
+        refuse_unfit(kept, self.spec)
+        return kept.calibration
 
     def lamp(self, chain: ChainSpec | None = None) -> Light:
         """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
@@ -232,6 +251,13 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
         return Bench(camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.undo.pop_all())
 
 
+@contextmanager
+def head_memory(spec: InstrumentSpec, clock: Clock) -> Iterator[HeadMemory | None]:
+    """The memory of a head, and nothing else of it; None if its file names none."""
+    with Opening(spec, clock) as opening:
+        yield opening.chips().memory
+
+
 def _replayed(opening: Opening, ledger: Ledger) -> Head:
     spec, clock = opening.spec, opening.clock
     assert spec.replay is not None
@@ -253,12 +279,21 @@ def _opened(opening: Opening, ledger: Ledger) -> Head:
     return Head(spec, camera, light, calibration, opening.chips(), opening.button())
 
 
-def _refuse_another_head(head: Head) -> None:
+def refuse_another_head(head: Head) -> None:
     """A head that knows whose it is must be the one that the calibration was measured on."""
-    known = head.chips.memory.read() if head.chips.memory is not None else None
-    if known is not None and known.calibration_id != head.calibration.id:
+    if head.chips.memory is None:
+        return
+    known, loaded, bus = head.chips.memory.read(), head.calibration.id, head.spec.bus
+    if known is None and (head.spec.calibration is None or (bus is not None and bus.backend == "sim")):
+        return  # never calibrated, and what is loaded is made up; or a simulated memory, which ends with its process
+    if known is None or known.calibration_id != loaded:
+        knows = (
+            f"head {known.serial} was calibrated as {known.calibration_id[:16]}" if known else "this head knows none"
+        )
         raise HeadMismatch(
-            f"head {known.serial} was calibrated as {known.calibration_id[:16]}, loaded is {head.calibration.id}"
+            f"{knows}, loaded is {loaded}",
+            "Do not take pictures; call the technician. If this head was calibrated just now, `diffuscope calibrations "
+            f"use {loaded} --archive DIR --head HEAD` tells it; another calibration is put in force the same way.",
         )
 
 

@@ -79,7 +79,7 @@ class HeadMemory(Protocol):
     """A few bytes that travel with the optical head: who it is, and which calibration is its own."""
 
     def read(self) -> Identity | None:
-        """What it holds; None if nothing was ever written. BusFault if it does not answer, or is damaged."""
+        """What it holds; None if nothing was ever written. BusFault if it does not answer, MemoryDamaged if torn."""
 
     def write(self, identity: Identity) -> None:
         """Keep this from now on, also without power; it has been read back when this returns. BusFault otherwise."""

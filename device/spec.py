@@ -151,9 +151,13 @@ class ReplaySpec(Table):
 
 
 class CalibrationTable(Table):
-    """Where calibrations are kept (`diffuscope calibrate`), relative to the head file; the one in force is used."""
+    """Where calibrations are kept (`diffuscope calibrate`), relative to the head file; the one in force is used.
+
+    `imported` lets the head use a PSF that others measured (`diffuscope calibrations import-psf`).
+    """
 
     archive: Path
+    imported: bool = False
 
     @field_validator("archive")
     @classmethod

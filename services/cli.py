@@ -16,12 +16,14 @@ from device.head import recording
 from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
+from services.instrument import calibrations
 from services.instrument.once import Order, reconstruct_file, written
 
 app = typer.Typer(
     name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
     add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
+app.add_typer(calibrations.app, name="calibrations")
 
 SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
 
@@ -65,8 +67,14 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
 @app.command()
 def reconstruct(
     raw: Annotated[Path, typer.Argument(help="Raw frame: tiff, png or npy; 2-D or three channels.")],
-    psf: Annotated[list[Path], typer.Option(help="Measured PSF; several are a stack, the best is chosen.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
+    psf: Annotated[
+        list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
+    ] = None,
+    calibration: Annotated[
+        str | None,
+        typer.Option(metavar="DIR[:ID]", help="Instead of PSFs: a kept calibration; without ID the one in force."),
+    ] = None,
     method: Annotated[
         str | None, typer.Option(help="A name of `diffuscope methods`; by default what suits the frame.")
     ] = None,
@@ -84,7 +92,10 @@ def reconstruct(
     ] = None,
 ) -> None:
     """Turn one raw frame into a picture, without a head and without a page."""
-    order = Order(raw, tuple(psf), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report, sweep)
+    order = Order(
+        raw, tuple(psf or ()), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report, sweep,
+        calibration,
+    )  # fmt: skip
     made = reconstruct_file(order)
     text = json.dumps(asdict(made.report), indent=1)
     if report is not None:

@@ -121,24 +121,34 @@ def code_in(markdown: str) -> list[str]:
 
 
 def commands() -> dict[str, set[str]]:
-    """The words of `diffuscope`, each with its options."""
+    """The words of `diffuscope`, also those of two words, each with its options."""
     group = typer.main.get_group(app)
-    return {name: {"--help"}.union(*(p.opts for p in command.params)) for name, command in group.commands.items()}
+    inner = [(f"{name} {second}", command) for name, outer in group.commands.items()
+             for second, command in getattr(outer, "commands", {}).items()]  # fmt: skip
+    return {
+        name: {"--help"}.union(*(p.opts for p in command.params)) for name, command in [*group.commands.items(), *inner]
+    }
 
 
 def unknown_words(command_line: str) -> list[str]:
     """What a command line says that `diffuscope` does not know."""
     known = commands()
-    found = re.search(r"\bdiffuscope ([a-z][\w-]*)(.*)", command_line)
-    if found is None or found[1] not in known:
-        return [found[1]] if found else []
-    return [o for o in re.findall(r"(?<!\S)--?[a-z][\w-]*", found[2]) if o not in known[found[1]]]
+    found = re.search(r"\bdiffuscope ([a-z][\w-]*)((?: [a-z][\w-]*)?)(.*)", command_line)
+    if found is None:
+        return []
+    word = found[1] + found[2] if any(name.startswith(f"{found[1]} ") for name in known) else found[1]
+    if word not in known:
+        return [word]
+    return [o for o in re.findall(r"(?<!\S)--?[a-z][\w-]*", found[3]) if o not in known[word]]
 
 
 def test_a_wrong_command_line_is_noticed() -> None:
     assert unknown_words("diffuscope fly") == ["fly"]
     assert unknown_words(".venv/bin/diffuscope run --port 1 --fly=1 -y") == ["--fly", "-y"]
+    assert unknown_words("diffuscope calibrations fly --archive a") == ["calibrations fly"]
+    assert unknown_words("diffuscope calibrations use 0f --archive a --fly") == ["--fly"]
     assert unknown_words("diffuscope reconstruct a.tiff --psf p.tiff -o out.png") == []
+    assert unknown_words("diffuscope calibrations") == []
 
 
 @pytest.mark.parametrize("readme", readmes())

@@ -8,31 +8,49 @@ A calibration is never changed. A new one is written beside the old ones and tak
 the same rename. A power cut at any moment leaves the old one in force, or the new one, whole.
 """
 
+import errno
+import fcntl
 import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import tempfile
 import tomllib
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import TypeAdapter
 
-from device.errors import CalibrationDamaged, CalibrationError, CalibrationMissing
+from device.errors import (
+    CalibrationDamaged,
+    CalibrationError,
+    CalibrationFormat,
+    CalibrationMissing,
+    StoreError,
+    StoreFull,
+)
 from device.values import Calibration, Geometry, Psf, Sensor
 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
 FORMAT = 1
+ID, NAME = re.compile("[0-9a-f]{16}"), re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a calibration comes from: head, moment, person, software, and how warm it was; figures that were found."""
+    """Where a calibration comes from: head, moment, person, software, and how warm it was; figures that were found.
+
+    `origin` is "imported" for a PSF that others measured, and `source` says where; `unknown` names what nobody knows
+    of it, by the names of `Calibration` and `Sensor`. What stands there instead is a value that means nothing.
+    """
 
     serial: str
     made_at: datetime
@@ -40,6 +58,9 @@ class Provenance:
     software: str
     temperature_c: float | None = None
     figures: tuple[tuple[str, float], ...] = ()
+    origin: Literal["measured", "imported"] = "measured"
+    source: str | None = None
+    unknown: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,40 +79,81 @@ class Archive:
 
     def keep(self, calibration: Calibration, provenance: Provenance) -> str:
         """Write it to the disk whole, put it in force, and return its id; keeping the same one twice is harmless."""
-        self.root.mkdir(parents=True, exist_ok=True)
-        for left in self.root.glob(".part*"):  # by a power cut
-            shutil.rmtree(left)
-        place = self.root / calibration.id
-        if not self._is_whole(calibration.id):
-            shutil.rmtree(place, ignore_errors=True)
-            part = Path(tempfile.mkdtemp(prefix=".part", dir=self.root))
-            try:
-                for name, content in _files(calibration, provenance).items():
-                    write_synced(part / name, content)
-                sync_folder(part)
-                part.rename(place)
-            except BaseException:
-                shutil.rmtree(part, ignore_errors=True)
-                raise
-            sync_folder(self.root)
-        self.use(calibration.id)
-        return calibration.id
+        id = self.add(calibration, provenance)
+        self.use(id)
+        return id
+
+    def add(self, calibration: Calibration, provenance: Provenance) -> str:
+        """The same without putting it in force."""
+        return self.adopt(_files(calibration, provenance))
+
+    def adopt(self, files: Mapping[str, bytes]) -> str:
+        """Keep the files of a calibration as they are, without putting it in force, and return its id.
+
+        They are checked first, as `load` does; one that is here already, whole, stays as it is. A power cut leaves the
+        archive as it was, or with it.
+        """
+        id = kept_elsewhere(files).calibration.id
+        with self._alone():
+            for left in self.root.glob(".part*"):  # by a power cut
+                shutil.rmtree(left)
+            place = self.root / id
+            if not self._is_whole(id):
+                shutil.rmtree(place, ignore_errors=True)
+                part = Path(tempfile.mkdtemp(prefix=".part", dir=self.root))
+                try:
+                    for name, content in files.items():
+                        write_synced(part / name, content)
+                    sync_folder(part)
+                    part.rename(place)
+                except BaseException:
+                    shutil.rmtree(part, ignore_errors=True)
+                    raise
+                sync_folder(self.root)
+        return id
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Wait until no other process changes the archive; a killed one gives its place up. StoreError if none may."""
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with (self.root / ".lock").open("ab") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                yield
+        except OSError as error:
+            full = StoreFull if error.errno in (errno.ENOSPC, errno.EDQUOT) else StoreError
+            raise full(
+                f"{self.root} cannot be written: {error.strerror or error}",
+                "Make room there or choose another folder; the calibrations that were kept are as before.",
+            ) from error
 
     def use(self, id: str) -> None:
         """Put a kept calibration in force; it is read and checked first."""
         self.load(id)
-        part = self.root / f".{CURRENT}"
-        write_synced(part, id.encode("ascii"))
-        part.rename(self.root / CURRENT)
-        sync_folder(self.root)
+        with self._alone():
+            part = self.root / f".{CURRENT}"
+            write_synced(part, id.encode("ascii"))
+            part.rename(self.root / CURRENT)
+            sync_folder(self.root)
 
     def load(self, id: str | None = None) -> Kept:
         """The one in force, or the one of that name; CalibrationMissing, or CalibrationDamaged at one wrong byte."""
         id = id or self.current()
-        place = self.root / id
-        if not (place / MANIFEST).is_file():
-            raise CalibrationMissing(f"there is no calibration {id} in {self.root}")
-        return _read(place, id)
+        return _read(_content(self._place(id)), id)
+
+    def files(self, id: str) -> dict[str, bytes]:
+        """The files of a calibration exactly as they are kept; they have been checked."""
+        found = _content(self._place(id))
+        _read(found, id)
+        return {name: found[name] for name in (MANIFEST, *_said(found)["sha256"])}
+
+    def _place(self, id: str) -> Path:
+        if not ID.fullmatch(id) or not (self.root / id).is_dir():
+            raise CalibrationMissing(
+                f"there is no calibration {id} in {self.root}",
+                "See `diffuscope calibrations list` for those that are kept.",
+            )
+        return self.root / id
 
     def _is_whole(self, id: str) -> bool:
         try:
@@ -104,18 +166,21 @@ class Archive:
         """The id in force."""
         path = self.root / CURRENT
         if not path.is_file():
-            raise CalibrationMissing(f"no calibration is in force in {self.root}")
+            remedy = "Choose one with `diffuscope calibrations use`." if self.ids() else None
+            raise CalibrationMissing(f"no calibration is in force in {self.root}", remedy)
         id = path.read_bytes().decode("ascii", "replace")
-        if len(id) != 16 or not all(digit in "0123456789abcdef" for digit in id):
-            raise CalibrationDamaged(f"{path} does not hold the name of a calibration")
+        if not ID.fullmatch(id):
+            raise CalibrationDamaged(
+                f"{path} does not hold the name of a calibration", "Choose one with `diffuscope calibrations use`."
+            )
         return id
 
     def ids(self) -> tuple[str, ...]:
-        """All that are kept, the oldest first."""
+        """All that are kept, damaged ones too, the oldest first."""
         if not self.root.is_dir():
             return ()
-        found = [place for place in self.root.iterdir() if (place / MANIFEST).is_file() and place.name[0] != "."]
-        return tuple(place.name for place in sorted(found, key=lambda place: (place / MANIFEST).stat().st_mtime_ns))
+        found = [place for place in self.root.iterdir() if ID.fullmatch(place.name) and place.is_dir()]
+        return tuple(place.name for place in sorted(found, key=lambda place: place.stat().st_mtime_ns))
 
 
 def _files(calibration: Calibration, provenance: Provenance) -> dict[str, bytes]:
@@ -126,8 +191,24 @@ def _files(calibration: Calibration, provenance: Provenance) -> dict[str, bytes]
     return found
 
 
+def kept_elsewhere(files: Mapping[str, bytes]) -> Kept:
+    """What is in files that were not kept here; CalibrationDamaged unless they are all of one calibration, and whole.
+
+    Nothing that they name is looked for in any folder.
+    """
+    try:
+        said = _said(files)
+        id, names = str(said["id"]), {MANIFEST, *said["sha256"]}
+    except _BROKEN as error:
+        raise CalibrationDamaged(f"this is not a whole calibration: {error}") from error
+    if set(files) != names or not all(NAME.fullmatch(name) for name in names):
+        raise CalibrationDamaged("this calibration holds other files than its manifest names")
+    return _read(files, id)
+
+
 def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str, bytes]) -> dict[str, Any]:
     said = asdict(provenance) | {"made_at": provenance.made_at.isoformat(), "figures": None}
+    said["unknown"] = list(provenance.unknown)
     return {
         "format": FORMAT, "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
@@ -138,29 +219,62 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     }  # fmt: skip
 
 
-def _read(place: Path, id: str) -> Kept:
+def _content(place: Path) -> dict[str, bytes]:
     try:
-        said = tomllib.loads(_unsealed((place / MANIFEST).read_bytes()))
-        arrays = {name: _array((place / name).read_bytes(), digest) for name, digest in said["sha256"].items()}
+        return {path.name: path.read_bytes() for path in sorted(place.iterdir()) if path.is_file()}
+    except OSError as error:
+        raise CalibrationDamaged(f"calibration {place.name} cannot be read: {error.strerror}") from error
+
+
+def _said(files: Mapping[str, bytes]) -> dict[str, Any]:
+    said = tomllib.loads(_unsealed(_named(files, MANIFEST)))
+    if said["format"] != FORMAT:
+        raise CalibrationFormat(f"this calibration was kept in format {said['format']}; known here is {FORMAT}")
+    return said
+
+
+def _named(files: Mapping[str, bytes], name: str) -> bytes:
+    if name not in files:
+        raise ValueError(f"{name} is missing")
+    return files[name]
+
+
+def _read(files: Mapping[str, bytes], id: str) -> Kept:
+    try:
+        said = _said(files)
+        arrays = {name: _array(_named(files, name), digest) for name, digest in said["sha256"].items()}
         calibration = Calibration(
-            psfs=tuple(Psf(arrays[f"psf{k}.npy"], name) for k, name in enumerate(said["psf_names"])),
-            sensor=Sensor(**said["sensor"]),
-            geometry=Geometry(**said["geometry"]) if "geometry" in said else None,
-            field_deg=said.get("field_deg"),
-            simulated=said["simulated"],
-            **{name: arrays.get(f"{name}.npy") for name in MAPS},
+            psfs=tuple(Psf(arrays[f"psf{k}.npy"], str(name)) for k, name in enumerate(said["psf_names"])),
+            sensor=Sensor(**_numbers(said["sensor"])),
+            geometry=Geometry(**_numbers(said["geometry"])) if "geometry" in said else None,
+            field_deg=_numbers({"field_deg": said.get("field_deg")})["field_deg"],
+            simulated=_TRUTH.validate_python(said["simulated"]),
+            **{name: _map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
-        whose = said["provenance"] | {"made_at": datetime.fromisoformat(said["provenance"]["made_at"])}
         figures = tuple(said["figures"].items())
-        kept = Kept(calibration, Provenance(**{key: whose.get(key) for key in _NAMES if key in whose}, figures=figures))
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        whose = _WHOSE.validate_python(said["provenance"] | {"figures": figures})
+        kept = Kept(calibration, whose)
+    except _BROKEN as error:
         raise CalibrationDamaged(f"calibration {id}: {error}") from error
     if kept.calibration.id != id:
         raise CalibrationDamaged(f"calibration {id} holds {kept.calibration.id}")
     return kept
 
 
-_NAMES = tuple(field.name for field in fields(Provenance) if field.name != "figures")
+_TRUTH, _NUMBERS, _WHOSE = TypeAdapter(bool), TypeAdapter(dict[str, float | None]), TypeAdapter(Provenance)
+_BROKEN = (ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RecursionError)
+
+
+def _numbers(table: dict[str, Any]) -> dict[str, Any]:
+    """The same table, or ValueError if it holds anything but numbers; their digits are part of the id."""
+    _NUMBERS.validate_python(table, strict=True)
+    return table
+
+
+def _map(array: np.ndarray | None, name: str) -> np.ndarray | None:
+    if array is not None and (array.ndim != 2 or array.dtype != (np.bool_ if name == "bad" else np.float32)):
+        raise ValueError(f"{name} holds {array.dtype} of the shape {array.shape}, which is no map of a sensor")
+    return array
 
 
 def _npy(array: np.ndarray) -> bytes:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from device.clock import Clock
-from device.errors import BusFault
+from device.errors import BusFault, MemoryDamaged
 from device.values import Charge, Identity
 
 TMP117_PER_C = 128
@@ -90,12 +90,12 @@ class Eeprom24:
         if head == b"\xff" * len(head):
             return None
         if not head.startswith(MAGIC):
-            raise BusFault("the head's memory holds something else than an identity")
+            raise MemoryDamaged("the head's memory holds something else than an identity")
         size = int.from_bytes(head[len(MAGIC) :], "big")
         body = self._bus.fetch(self._address, len(head), min(size, 1024) + 4)
         text, sum_ = body[:-4], body[-4:]
         if zlib.crc32(text) != int.from_bytes(sum_, "big"):
-            raise BusFault("the head's memory is damaged: its checksum does not fit")
+            raise MemoryDamaged("the head's memory is damaged: its checksum does not fit")
         return Identity(**json.loads(text))
 
     def write(self, identity: Identity) -> None:

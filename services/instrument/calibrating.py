@@ -10,12 +10,14 @@ from pathlib import Path
 from device.calibration.archive import Archive, Kept
 from device.calibration.procedure import FILLED, Job, Operator, Procedure, Stand
 from device.clock import Clock
-from device.errors import SettingError
+from device.errors import MemoryDamaged, SettingError
 from device.head import Bench, open_bench
 from device.sim import stage
 from device.sim.world import World
 from device.spec import InstrumentSpec
+from device.values import Identity
 
+LONGEST_SERIAL = 64  # of characters: what a head's memory keeps
 ASKED: dict[Stand, str] = {
     "cap": "Put the cap on the head and shade it.",
     "screen": "Take the cap off and put the even screen before the head, switched on.",
@@ -41,13 +43,27 @@ def calibrate(
     `ask` says to a person what to put before the head, and returns when it is there.
     """
     with closing(open_bench(spec, clock)) as bench:
-        world = bench.world
-        job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
-        operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
-        work = wish.archive / ".steps"
-        procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
-        archive = Archive(wish.archive)
-        return archive.load(procedure.run(archive))
+        put = (lambda stand: ask(ASKED[stand])) if bench.world is None else staging(bench.world)
+        return calibrate_on(bench, spec, wish, clock, Operator(put, tell))
+
+
+def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, operator: Operator) -> Kept:
+    """The same with a head that is open already; its memory learns last whose calibration it is.
+
+    A power cut before that leaves a head that refuses to start, and says how its memory is written.
+    """
+    job = Job(spec, serial_of(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+    procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
+    archive = Archive(wish.archive)
+    kept = archive.load(procedure.run(archive))
+    note_in_head(bench, kept)
+    return kept
+
+
+def note_in_head(bench: Bench, kept: Kept) -> None:
+    """The head's memory, where it has one, says from now on who it is and which calibration is its own."""
+    if bench.chips.memory is not None:
+        bench.chips.memory.write(Identity(kept.provenance.serial, kept.calibration.id))
 
 
 def staging(world: World) -> Callable[[Stand], None]:
@@ -66,10 +82,21 @@ def staging(world: World) -> Callable[[Stand], None]:
     return put
 
 
-def _serial(bench: Bench, wish: Wish) -> str:
+def serial_of(bench: Bench, wish: Wish) -> str:
+    """What the wish, the head's memory or the simulator says, in this order; SettingError if nobody knows.
+
+    A memory that does not answer is an error now, not after all the work.
+    """
+    try:
+        known = bench.chips.memory.read() if bench.chips.memory is not None else None
+    except MemoryDamaged:
+        if wish.serial is None:
+            raise
+        known = None  # torn by a power cut, and about to be written anew
     if wish.serial is not None:
+        if not 0 < len(wish.serial) <= LONGEST_SERIAL or not wish.serial.isprintable():
+            raise SettingError(f"{wish.serial!r} is no serial number", "Give one short line with --serial.")
         return wish.serial
-    known = bench.chips.memory.read() if bench.chips.memory is not None else None
     if known is not None:
         return known.serial
     if bench.world is not None:

@@ -2,11 +2,12 @@
 
 import errno
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from device.calibration.archive import Archive
 from device.clock import Deadline, SystemClock
 from device.errors import FrameError, SettingError, SpecError, StoreError, StoreFull
 from device.images import Raw, as_raw, read_image, read_psf, refuse_other_sizes, says_simulated, write_linear
@@ -40,6 +41,7 @@ class Order:
     plans: Path
     report: Path | None = None
     sweep: Path | None = None
+    calibration: str | None = None
 
 
 def reconstruct_file(order: Order) -> Reconstruction:
@@ -71,6 +73,8 @@ def _refuse_places(order: Order) -> None:
     """Refuse an ending or a folder that nothing can be written to."""
     if order.output.suffix.lower() not in (".npy", ".tif", ".tiff", ".png"):
         raise SettingError(f"{order.output}: a picture is written as .npy, .tiff or .png", "Choose one of these.")
+    if (order.calibration is None) == (not order.psfs):
+        raise SettingError("a picture needs either PSFs or a calibration", "Give --psf FILE or --calibration DIR[:ID].")
     if order.sweep is not None and len(order.psfs) < 2:
         raise SettingError("a sweep compares several PSFs", "Give --psf more than once, or leave --sweep out.")
     for place in (order.output, order.report, order.sweep):
@@ -108,7 +112,9 @@ def _recipes(order: Order, calibration: Calibration, shape: tuple[int, int], ind
 
 
 def calibrated(order: Order, raw: Raw) -> Calibration:
-    """A calibration from the files of an order; what a head file does not say stays unknown."""
+    """What an order says about the optics and the sensor; what nobody says stays unknown."""
+    if order.calibration is not None:
+        return _archived(order.calibration, order, raw)
     spec: InstrumentSpec | None = None if order.head is None else load_head(order.head)
     geometry: Geometry | None = None
     sensor = Sensor(white_dn=raw.white_dn)
@@ -135,6 +141,27 @@ def calibrated(order: Order, raw: Raw) -> Calibration:
         psfs=psfs, sensor=sensor, geometry=geometry, field_deg=field_deg,
         dark_dn=dark, flat=flat, bad=raw.bad, simulated=simulated,
     )  # fmt: skip
+
+
+def _archived(place: str, order: Order, raw: Raw) -> Calibration:
+    """A kept calibration, `DIR` (the one in force) or `DIR:ID`; a dark or flat frame of the order replaces its own."""
+    if order.head is not None or order.field_deg is not None:
+        raise SettingError("a calibration says itself what it knows", "Leave --head and --field-deg out.")
+    folder, colon, id = ("", "", "") if Path(place).is_dir() else place.rpartition(":")
+    archive = Archive(Path(folder if colon else place))
+    kept = archive.load(id if colon else None)
+    found = kept.calibration
+    refuse_other_sizes(found.psfs, (raw.pixels.shape[0], raw.pixels.shape[1]))
+    known = "white_dn" not in kept.provenance.unknown
+    white_dn = min(found.sensor.white_dn, raw.white_dn) if known else raw.white_dn
+    return replace(
+        found,
+        sensor=replace(found.sensor, white_dn=white_dn),
+        dark_dn=found.dark_dn if order.dark is None else _companion(order.dark, raw),
+        flat=found.flat if order.flat is None else _companion(order.flat, raw),
+        bad=raw.bad if found.bad is None else found.bad | raw.bad,
+        simulated=found.simulated or says_simulated(order.raw),
+    )
 
 
 def _companion(path: Path, raw: Raw) -> Image:

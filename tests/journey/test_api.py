@@ -19,8 +19,9 @@ from services.instrument.api import STATUS, refusal
 CHOSEN = {  # every leaf has a status that somebody chose
     "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
     "CameraMissing": 503, "CameraStalled": 503, "CameraWrong": 503, "CameraPacked": 503, "LightFault": 423,
-    "LightLimit": 423, "BusFault": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
-    "CalibrationMissing": 423, "CalibrationDamaged": 423, "CalibrationRefused": 423,
+    "LightLimit": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
+    "CalibrationMissing": 423, "CalibrationDamaged": 423, "CalibrationRefused": 423, "CalibrationFormat": 423,
+    "CalibrationUntrusted": 423,
     "Busy": 409, "StoreFull": 507, "StoreDamaged": 500, "NotKept": 404,
 }  # fmt: skip
 OD = {"eye": "OD"}

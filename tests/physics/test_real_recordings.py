@@ -1,12 +1,17 @@
 """Other people's recordings, without a known field: does the solver that the ladder chooses hold on real light."""
 
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from device.calibration.archive import Archive, Provenance
+from device.calibration.others import Hearsay, read_others
 from device.clock import SystemClock
 from device.images import as_raw, read_image, read_psf
+from device.recon.focus import sharpest
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.values import Calibration, Image, Sensor
@@ -62,8 +67,17 @@ def test_the_units_of_the_frame_do_not_matter(scale: float) -> None:
     assert np.abs(scaled / scale - unit).max() < 0.02 * unit.max()
 
 
-def test_the_hand_is_a_hand_without_streaks() -> None:
-    pixels, calibration = loaded("tutorial/rawdata_hand_sample.tif", "tutorial/psf_sample.tif")
+def kept_by_others(folder: Path, *psfs: str) -> Calibration:
+    """Imported into an archive, and read from there."""
+    found, archive = read_others(tuple(DATA / psf for psf in psfs), Hearsay()), Archive(folder)
+    when = datetime(2026, 11, 21, tzinfo=UTC)
+    said = Provenance("unknown", when, "a test", "0", None, found.figures, "imported", "DiffuserCam", found.unknown)
+    return archive.load(archive.add(found.calibration, said)).calibration
+
+
+def test_the_hand_is_a_hand_without_streaks(tmp_path: Path) -> None:
+    pixels, by_file = loaded("tutorial/rawdata_hand_sample.tif", "tutorial/psf_sample.tif")
+    calibration = replace(kept_by_others(tmp_path, "tutorial/psf_sample.tif"), sensor=by_file.sensor, bad=by_file.bad)
     picture = Reconstructor(calibration, pixels.shape, PLANNER, SystemClock(), (Recipe("open", 8),))(pixels).picture
     bright = float(np.percentile(picture, 99))
     # the closed form leaves streaks across the whole frame, 0.3 of the hand; above and left of it there is nothing
@@ -71,9 +85,13 @@ def test_the_hand_is_a_hand_without_streaks() -> None:
     assert np.percentile(picture[:, :350], 95) < 0.1 * bright
 
 
-def test_the_bars_of_the_target_are_apart() -> None:
-    pixels, calibration = loaded("diffusercam3d/example_raw.png", "diffusercam3d/psf/psf16.tiff")
-    picture = Reconstructor(calibration, pixels.shape, PLANNER, SystemClock(), (Recipe("open", 1),))(pixels).picture
+def test_the_bars_of_the_target_are_apart(tmp_path: Path) -> None:
+    pixels, _ = loaded("diffusercam3d/example_raw.png", "diffusercam3d/psf/psf16.tiff")
+    calibration = kept_by_others(tmp_path, *(f"diffusercam3d/psf/psf{depth:02}.tiff" for depth in range(0, 44, 4)))
+    index, scores = sharpest(calibration, pixels, PLANNER)
+    assert (len(scores), calibration.psfs[index].name) == (11, "psf16.tiff")
+    make = Reconstructor(calibration, pixels.shape, PLANNER, SystemClock(), (Recipe("open", 1),), index)
+    picture = make(pixels).picture
     assert picture[80:195, 115:215].sum() > 0.9 * picture.sum()
     across = picture[140:150, 168:186].mean(axis=0)  # three bars of the group in focus
     inner = across[1:-1]

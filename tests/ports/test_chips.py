@@ -7,7 +7,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
-from device.errors import BusFault
+from device.errors import BusFault, MemoryDamaged
 from device.ports import Battery, HeadMemory, Thermometer
 from device.sim.chips import SimBattery, SimHeadMemory, SimThermometer
 from device.sim.world import World
@@ -89,8 +89,39 @@ def test_a_damaged_memory_is_told_from_an_empty_one(place, message):
     memory = Eeprom24(bus, 0x50, VirtualClock())
     memory.write(IDENTITY)
     bus.send(0x50, place.to_bytes(2, "big") + b"\x00")
-    with pytest.raises(BusFault, match=message):
+    with pytest.raises(MemoryDamaged, match=message) as told:
         memory.read()
+    assert "diffuscope calibrations use" in told.value.remedy
+    bus.close()
+
+
+class ShortOfPower(VirtualClock):
+    """Power goes away while the memory keeps its n-th page."""
+
+    def __init__(self, pages: int) -> None:
+        super().__init__()
+        self.pages = pages
+
+    def sleep(self, duration_s: float) -> None:
+        self.pages -= 1
+        if not self.pages:
+            raise KeyboardInterrupt
+        super().sleep(duration_s)
+
+
+@pytest.mark.parametrize("pages", [1, 2, 3])
+def test_a_power_cut_while_it_is_written_is_noticed_and_writing_again_mends_it(pages):
+    wires().break_()
+    bus = I2cBus("/dev/i2c-1")
+    memory = Eeprom24(bus, 0x50, VirtualClock())
+    memory.write(IDENTITY)
+    other = Identity("DS-0007-rebuilt", "0a" * 32)
+    with pytest.raises(KeyboardInterrupt):
+        Eeprom24(bus, 0x50, ShortOfPower(pages)).write(other)
+    with pytest.raises(MemoryDamaged):
+        memory.read()
+    memory.write(other)
+    assert memory.read() == other
     bus.close()
 
 
