@@ -139,11 +139,15 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Geometry:
-    """How degrees at the eye become pixels: paper, section "Optical design"; optics first-order numbers."""
+    """How degrees at the eye become pixels: paper, section "Optical design"; optics first-order numbers.
+
+    `measured_scale_per_dpt` is what a moved point source said of this one head (`calibration/dioptres.py`), if asked.
+    """
 
     pitch_um: float
     diffuser_to_sensor_um: float
     angular_magnification: float
+    measured_scale_per_dpt: float | None = None
 
     @property
     def px_per_deg(self) -> float:
@@ -152,7 +156,13 @@ class Geometry:
 
     @property
     def scale_per_dpt(self) -> float:
-        """Relative shrinking of the caustic per dioptre of myopia: z a^2 (Fresnel scaling)."""
+        """Relative shrinking of the caustic per dioptre of myopia: as measured, else as the drawings say."""
+        measured = self.measured_scale_per_dpt
+        return self.nominal_scale_per_dpt if measured is None else measured
+
+    @property
+    def nominal_scale_per_dpt(self) -> float:
+        """The same by the drawings: z a^2 (Fresnel scaling)."""
         return self.diffuser_to_sensor_um * 1e-6 * self.angular_magnification**2
 
 

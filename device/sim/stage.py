@@ -25,9 +25,12 @@ def screen(world: World, e_per_s: float) -> Image:
     return _seen(world, even)
 
 
-def point(world: World, e_per_s: float, moved_px: tuple[int, int] = (0, 0)) -> Image:
-    """The factory's point source on the axis, its brightest pixel at `e_per_s`; `moved_px` is (down, right)."""
-    caustic = calibration_point(world)
+def point(world: World, e_per_s: float, moved_px: tuple[int, int] = (0, 0), moved_mm: float = 0.0) -> Image:
+    """The factory's point source on the axis, its brightest pixel at `e_per_s`.
+
+    `moved_px` is (down, right); `moved_mm` along the axis, away from the model eye's lens.
+    """
+    caustic = calibration_point(world, moved_mm)
     rows, cols = (size // 2 - by for size, by in zip(caustic.shape, moved_px, strict=True))
     there = fitted(caustic, world.shape, (rows, cols))
     return _seen(world, there * np.float32(e_per_s / float(there.max())))

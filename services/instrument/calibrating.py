@@ -8,7 +8,7 @@ from math import degrees
 from pathlib import Path
 
 from device.calibration.archive import Archive, Kept
-from device.calibration.procedure import FILLED, Job, Operator, Procedure, Stand
+from device.calibration.procedure import FILLED, MOVES, Job, Operator, Procedure, Stand
 from device.clock import Clock
 from device.errors import SettingError
 from device.head import Bench, open_bench
@@ -16,21 +16,30 @@ from device.sim import stage
 from device.sim.world import World
 from device.spec import InstrumentSpec
 
+EYE_MM = 25.0  # the paper's model eye
 ASKED: dict[Stand, str] = {
     "cap": "Put the cap on the head and shade it.",
     "screen": "Take the cap off and put the even screen before the head, switched on.",
     "point": "Put the point source before the head, on its axis, and switch the screen off.",
+    **{
+        stand: f"Move the point source along the axis to {moved_mm:+g} mm ({way} the lens) of where it was first."
+        for stand, moved_mm in MOVES.items()
+        for way in ["away from" if moved_mm > 0 else "towards"]
+    },
 }
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What the command line says; None: what the head knows itself."""
+    """What the command line says; None: what the head knows itself. What `dioptres` and `keep_raw` say is in Job."""
 
     archive: Path
     serial: str | None
     made_by: str
     source_deg: float | None
+    eye_mm: float | None = None
+    dioptres: bool = False
+    keep_raw: bool = False
 
 
 def calibrate(
@@ -42,7 +51,8 @@ def calibrate(
     """
     with closing(open_bench(spec, clock)) as bench:
         world = bench.world
-        job = Job(spec, _serial(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+        who = _serial(bench, wish), wish.made_by, version("diffuscope")
+        job = Job(spec, *who, _source_deg(spec, wish), _eye_mm(spec, wish), wish.dioptres, wish.keep_raw)
         operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
         work = wish.archive / ".steps"
         procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
@@ -60,8 +70,8 @@ def staging(world: World) -> Callable[[Stand], None]:
                 world.stage = stage.cap(world)
             case "screen":
                 world.stage = stage.screen(world, e_per_s)
-            case "point":
-                world.stage = stage.point(world, e_per_s)
+            case _:
+                world.stage = stage.point(world, e_per_s, moved_mm=MOVES.get(stand, 0.0))
 
     return put
 
@@ -81,3 +91,9 @@ def _source_deg(spec: InstrumentSpec, wish: Wish) -> float:
     if wish.source_deg is not None or spec.sim is None:
         return wish.source_deg or 0.0
     return degrees(spec.sim.calibration.source_um / spec.sim.eye.focal_length_um)
+
+
+def _eye_mm(spec: InstrumentSpec, wish: Wish) -> float:
+    if wish.eye_mm is not None or spec.sim is None:
+        return wish.eye_mm or EYE_MM
+    return spec.sim.eye.focal_length_um / 1000
