@@ -1,7 +1,7 @@
 """The values that travel through the instrument: frozen, their arrays read-only, checked at birth."""
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal, Self
 
@@ -101,10 +101,12 @@ class Psf:
     float32 (rows, cols), sum 1, centre at (rows//2, cols//2).
 
     Paper, section "Algorithm": the h of y = h * x. A shift of it shifts the picture and changes nothing else.
+    `colour` is the light that it was measured in; None: it stands for every colour.
     """
 
     pixels: Image
     name: str = "psf"
+    colour: Colour | None = None
 
     def __post_init__(self) -> None:
         pixels = self.pixels
@@ -170,8 +172,9 @@ class Geometry:
 class Calibration:
     """What the factory measured about one head, once.
 
-    `psfs` has one entry, or a stack over depth; `dark_dn` and `flat` are (rows, cols) or None; `bad` marks pixels
-    not to be believed; `field_deg` is the illuminated disc around the centre (None: not known).
+    `psfs` has one entry, or a stack over depth, for every colour or for each (`seen_in`); `dark_dn` and `flat` are
+    (rows, cols) or None; `bad` marks pixels not to be believed; `field_deg` is the illuminated disc around the centre
+    (None: not known).
     """
 
     psfs: tuple[Psf, ...]
@@ -190,10 +193,20 @@ class Calibration:
             raise PsfError("the PSFs of one stack must all have the same rows and columns")
         _freeze(self, "dark_dn", "flat", "bad")
 
+    def seen_in(self, colour: Colour) -> Self:
+        """The same with the PSFs of one colour only; a colour that nobody measured is seen through the first PSF.
+
+        What is left is one PSF, or a stack over depth: which of these explains a frame is asked of the frame.
+        """
+        own = tuple(psf for psf in self.psfs if psf.colour == colour)
+        every = tuple(psf for psf in self.psfs if psf.colour is None)
+        return replace(self, psfs=own or every or self.psfs[:1])
+
     @property
     def id(self) -> str:
         """Sixteen hexadecimal digits that change whenever anything that was measured changes."""
-        digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg)).encode())
+        colours = tuple(psf.colour for psf in self.psfs)
+        digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]

@@ -16,6 +16,7 @@ from device.head import recording
 from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
+from device.values import Colour
 from services.instrument.once import Order, reconstruct_file, written
 
 app = typer.Typer(
@@ -132,6 +133,9 @@ def calibrate_head(
     eye_mm: Annotated[
         float | None, typer.Option(min=10, max=60, help="Focal length of the model eye's lens; 25 if nothing is given.")
     ] = None,
+    colours: Annotated[
+        str, typer.Option(help="Also show the source in these, such as red,blue: a PSF of its own where they differ.")
+    ] = "",
     keep_raw: Annotated[
         bool, typer.Option("--keep-raw", help="Keep every raw frame beside the calibration, with its SHA-256.")
     ] = False,
@@ -142,12 +146,20 @@ def calibrate_head(
     def ask(said: str) -> None:
         typer.prompt(f"{said} Then press Enter", default="", show_default=False)
 
-    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, keep_raw)
+    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw)
     kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
     sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
     typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")
     typer.echo(f"read noise {sensor.read_noise_e:.2f} e-, " + ", ".join(f"{k} {v:.3g}" for k, v in known.items()))
     typer.echo(f"{kept.calibration.id} is in force in {archive}")
+
+
+def _colours(words: str) -> tuple[Colour, ...]:
+    known: dict[str, Colour] = {"red": "red", "green": "green", "blue": "blue"}
+    named = [word.strip() for word in words.split(",") if word.strip()]
+    if strange := [word for word in named if word not in known]:
+        raise typer.BadParameter(f"--colours {strange[0]!r} is none of {', '.join(known)}")
+    return tuple(known[word] for word in named)
 
 
 @app.command()

@@ -131,6 +131,7 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     return {
         "format": FORMAT, "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
+        "psf_colours": [psf.colour or "every" for psf in calibration.psfs],
         "sensor": asdict(calibration.sensor),
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
         "provenance": said, "figures": dict(provenance.figures),
@@ -143,7 +144,10 @@ def _read(place: Path, id: str) -> Kept:
         said = tomllib.loads(_unsealed((place / MANIFEST).read_bytes()))
         arrays = {name: _array((place / name).read_bytes(), digest) for name, digest in said["sha256"].items()}
         calibration = Calibration(
-            psfs=tuple(Psf(arrays[f"psf{k}.npy"], name) for k, name in enumerate(said["psf_names"])),
+            psfs=tuple(
+                Psf(arrays[f"psf{k}.npy"], name, None if colour == "every" else colour)
+                for k, (name, colour) in enumerate(zip(said["psf_names"], said["psf_colours"], strict=True))
+            ),
             sensor=Sensor(**said["sensor"]),
             geometry=Geometry(**said["geometry"]) if "geometry" in said else None,
             field_deg=said.get("field_deg"),

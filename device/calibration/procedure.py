@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from device.calibration.archive import Archive, Provenance
+from device.calibration.colours import SAME, differs, refuse_other_source
 from device.calibration.darks import Darks, measured_darks
 from device.calibration.dioptres import Dioptres, between, measured_dioptres, refuse_other_place
 from device.calibration.flats import Flats, measured_flats
@@ -24,9 +25,13 @@ from device.clock import Clock
 from device.errors import CalibrationRefused
 from device.ports import Camera, Thermometer
 from device.spec import InstrumentSpec
-from device.values import Calibration, Counts, Frame, Geometry, Sensor, Shot
+from device.values import Calibration, Colour, Counts, Frame, Geometry, Psf, Sensor, Shot
 
-Stand = Literal["cap", "screen", "point", "point -4 mm", "point -2 mm", "point +2 mm", "point +4 mm"]
+Stand = Literal[
+    "cap", "screen", "point", "point -4 mm", "point -2 mm", "point +2 mm", "point +4 mm",
+    "point red", "point green", "point blue",
+]  # fmt: skip
+TINTED: dict[Colour, Stand] = {"red": "point red", "green": "point green", "blue": "point blue"}
 MOVES: dict[Stand, float] = {"point -4 mm": -4.0, "point -2 mm": -2.0, "point +2 mm": 2.0, "point +4 mm": 4.0}
 
 SHORTEST_S, LONGEST_S = 1e-3, 10.0
@@ -52,7 +57,8 @@ class Job:
     """One calibration of one head: who makes it, and through which source, `source_deg` wide as the head sees it.
 
     What may be left out: `dioptres` moves the source along the axis behind the model eye's lens, whose focal length is
-    `eye_mm`; `keep_raw` keeps every raw frame.
+    `eye_mm`; `colours` shows it in these colours too (the first of all is the picture's); `keep_raw` keeps every raw
+    frame.
     """
 
     spec: InstrumentSpec
@@ -62,12 +68,19 @@ class Job:
     source_deg: float = 0.0
     eye_mm: float = 25.0
     dioptres: bool = False
+    colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
+
+    @property
+    def others(self) -> tuple[Colour, ...]:
+        """The colours beside the picture's."""
+        return tuple(colour for colour in TINTED if colour in self.colours and colour != self.spec.light.colour)
 
     @property
     def stands(self) -> tuple[Stand, ...]:
         """What will be put before the head, in this order."""
-        return ("cap", "screen", "point", *(MOVES if self.dioptres else ()))
+        tinted = (TINTED[colour] for colour in self.others)
+        return ("cap", "screen", "point", *(MOVES if self.dioptres else ()), *tinted)
 
     @property
     def geometry(self) -> Geometry | None:
@@ -101,8 +114,10 @@ class Procedure:
         point = self._step("point", Point, "point", lambda: self._point(darks, flats))
         self.operator.tell(f"point: {abs(point.off_px[0])}, {abs(point.off_px[1])} pixels off the middle")
         dioptres = self._dioptres(darks, flats, point, geometry) if geometry is not None else None
-        calibration = self._assembled(darks, flats, point, dioptres)
-        id = archive.keep(calibration, self._provenance(_figures(darks, flats, point) | _said(dioptres)))
+        psfs, colours = self._colours(darks, flats, point)
+        calibration = self._assembled(darks, flats, psfs, dioptres)
+        figures = _figures(darks, flats, point) | _said(dioptres) | colours
+        id = archive.keep(calibration, self._provenance(figures))
         if self.raws is not None:
             self.raws.finish(archive.root / f"{id}.raw")
         self.steps.clear()
@@ -153,6 +168,26 @@ class Procedure:
         factor, nominal = found.scale_per_dpt, geometry.nominal_scale_per_dpt
         self.operator.tell(f"dioptres: {factor:.3%} of stretch each, {factor / nominal - 1:+.1%} beside the drawings")
         return found
+
+    def _colours(self, darks: Darks, flats: Flats, point: Point) -> tuple[tuple[Psf, ...], dict[str, float]]:
+        """The PSF, and one for each colour in which it is another; how like the first each of them is."""
+        job, own, figures = self.job, dict[Colour, Psf](), dict[str, float]()
+        for colour in job.others:
+
+            def measure(colour: Colour = colour) -> Point:
+                there = self._point(darks, flats)
+                refuse_other_source(colour, between(point, there, job.spec.camera.pitch_um), job.geometry)
+                return there
+
+            there = self._step(f"point-{colour}", Point, TINTED[colour], measure)
+            found = between(point, there, job.spec.camera.pitch_um)
+            figures |= {f"psf_{colour}_likeness": found.likeness, f"psf_{colour}_scale": found.scale}
+            kept = "kept as a PSF of its own" if differs(found) else "the same PSF"
+            self.operator.tell(f"{colour}: {kept}, correlation {found.likeness:.4f} (the same from {SAME})")
+            if differs(found):
+                own[colour] = replace(there.psf, name=f"point source, {colour}", colour=colour)
+        first = replace(point.psf, colour=job.spec.light.colour) if own else point.psf
+        return (first, *own.values()), figures
 
     def _darks(self) -> Darks:
         picture_s = self.job.spec.camera.exposure_s
@@ -210,13 +245,13 @@ class Procedure:
             exposure_s = wanted_s
         return exposure_s
 
-    def _assembled(self, darks: Darks, flats: Flats, point: Point, dioptres: Dioptres | None) -> Calibration:
+    def _assembled(self, darks: Darks, flats: Flats, psfs: tuple[Psf, ...], dioptres: Dioptres | None) -> Calibration:
         spec, geometry, gain = self.job.spec, self.job.geometry, flats.gain_e_per_dn
         if geometry is not None and dioptres is not None:
             geometry = replace(geometry, measured_scale_per_dpt=dioptres.scale_per_dpt)
         sensor = Sensor(darks.black_dn, gain, _read_noise_e(darks, gain), flats.white_dn)
         return Calibration(
-            psfs=(point.psf,),
+            psfs=psfs,
             sensor=sensor,
             geometry=geometry,
             field_deg=spec.optics.field_deg if spec.optics else None,

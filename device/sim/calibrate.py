@@ -9,7 +9,7 @@ from device.sim.render import dotted, fitted, psf
 from device.sim.sensor import SensorModel
 from device.sim.setup import Setup
 from device.sim.world import World
-from device.values import Calibration, Image, Psf, Sensor
+from device.values import Calibration, Colour, Image, Psf, Sensor
 
 FRAMES = 16
 FILLED = 0.8  # of the full well: bright, and nowhere saturated
@@ -56,12 +56,12 @@ def flat_frame(world: World) -> Image | None:
     return flat
 
 
-def calibration_point(world: World, moved_mm: float = 0.0) -> Image:
+def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None = None) -> Image:
     """What the point source of the factory becomes: another eye, another distance, and a dot of some size.
 
     `moved_mm` away from the lens of the model eye it is that of a longer eye: M = 1/f - 1/s, and looks smaller.
     """
-    setup, said = world.setup(world.spec.light.colour), world.scene.sim.calibration
+    setup, said = world.setup(colour or world.spec.light.colour), world.scene.sim.calibration
     eye_mm = world.scene.sim.eye.focal_length_um / 1000
     there = Setup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
     longer_dpt = -correction_dpt(eye_mm + moved_mm, eye_mm)

@@ -8,13 +8,14 @@ from math import degrees
 from pathlib import Path
 
 from device.calibration.archive import Archive, Kept
-from device.calibration.procedure import FILLED, MOVES, Job, Operator, Procedure, Stand
+from device.calibration.procedure import FILLED, MOVES, TINTED, Job, Operator, Procedure, Stand
 from device.clock import Clock
 from device.errors import SettingError
 from device.head import Bench, open_bench
 from device.sim import stage
 from device.sim.world import World
 from device.spec import InstrumentSpec
+from device.values import Colour
 
 EYE_MM = 25.0  # the paper's model eye
 ASKED: dict[Stand, str] = {
@@ -26,12 +27,13 @@ ASKED: dict[Stand, str] = {
         for stand, moved_mm in MOVES.items()
         for way in ["away from" if moved_mm > 0 else "towards"]
     },
+    **{stand: f"Put the point source back where it was first, and let it shine in {c}." for c, stand in TINTED.items()},
 }
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What the command line says; None: what the head knows itself. What `dioptres` and `keep_raw` say is in Job."""
+    """What the command line says; None: what the head knows itself. What the rest says is in Job."""
 
     archive: Path
     serial: str | None
@@ -39,6 +41,7 @@ class Wish:
     source_deg: float | None
     eye_mm: float | None = None
     dioptres: bool = False
+    colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
 
 
@@ -52,7 +55,8 @@ def calibrate(
     with closing(open_bench(spec, clock)) as bench:
         world = bench.world
         who = _serial(bench, wish), wish.made_by, version("diffuscope")
-        job = Job(spec, *who, _source_deg(spec, wish), _eye_mm(spec, wish), wish.dioptres, wish.keep_raw)
+        source = _source_deg(spec, wish), _eye_mm(spec, wish)
+        job = Job(spec, *who, *source, wish.dioptres, wish.colours, wish.keep_raw)
         operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
         work = wish.archive / ".steps"
         procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
@@ -71,7 +75,8 @@ def staging(world: World) -> Callable[[Stand], None]:
             case "screen":
                 world.stage = stage.screen(world, e_per_s)
             case _:
-                world.stage = stage.point(world, e_per_s, moved_mm=MOVES.get(stand, 0.0))
+                colour = next((colour for colour, name in TINTED.items() if name == stand), None)
+                world.stage = stage.point(world, e_per_s, moved_mm=MOVES.get(stand, 0.0), colour=colour)
 
     return put
 
