@@ -6,7 +6,7 @@ ARCHIVE                          changed by the last lines only: until then the 
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import isnan, sqrt
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from device.calibration.moments import Moments
 from device.calibration.point import Point, Steady, measured_point, refuse_level
 from device.calibration.raws import Raws
 from device.calibration.steps import Step, Steps
+from device.calibration.warmth import Dark, dark_steps, fitted_warmth
 from device.clock import Clock
 from device.errors import CalibrationRefused
 from device.ports import Camera, Thermometer
@@ -116,7 +117,7 @@ class Procedure:
         dioptres = self._dioptres(darks, flats, point, geometry) if geometry is not None else None
         psfs, colours = self._colours(darks, flats, point)
         calibration = self._assembled(darks, flats, psfs, dioptres)
-        figures = _figures(darks, flats, point) | _said(dioptres) | colours
+        figures = _figures(darks, flats, point) | self._warmth(archive, darks, flats) | _said(dioptres) | colours
         id = archive.keep(calibration, self._provenance(figures))
         if self.raws is not None:
             self.raws.finish(archive.root / f"{id}.raw")
@@ -169,6 +170,22 @@ class Procedure:
         self.operator.tell(f"dioptres: {factor:.3%} of stretch each, {factor / nominal - 1:+.1%} beside the drawings")
         return found
 
+    def _warmth(self, archive: Archive, darks: Darks, flats: Flats) -> dict[str, float]:
+        """How warm it was, and the law of this dark step and the earlier ones of this head."""
+        if isnan(darks.warm_c):
+            return {}
+        now = Dark(darks.warm_c, darks.dark_dn_per_s * flats.gain_e_per_dn)
+        found = {"dark_c": darks.warm_c, "dark_map_s": darks.map_s}
+        law = fitted_warmth((*dark_steps(archive, self.job.serial), now))
+        if law is None:
+            return found
+        said = f"dark current: {now.e_per_s:.3g} e-/s at {now.warm_c:.1f} C, twice that every {law.doubling_c:.1f} C"
+        if not law.is_plausible:
+            self.operator.tell(f"{said}: this is not the sensor's warmth, and is not kept; light leaks in")
+            return found
+        self.operator.tell(f"{said}, by {law.steps} dark steps")
+        return found | law.figures
+
     def _colours(self, darks: Darks, flats: Flats, point: Point) -> tuple[tuple[Psf, ...], dict[str, float]]:
         """The PSF, and one for each colour in which it is another; how like the first each of them is."""
         job, own, figures = self.job, dict[Colour, Psf](), dict[str, float]()
@@ -192,7 +209,8 @@ class Procedure:
     def _darks(self) -> Darks:
         picture_s = self.job.spec.camera.exposure_s
         exposures = [self._moments(each_s, MANY) for each_s in (SHORTEST_S, picture_s, min(4 * picture_s, LONGEST_S))]
-        return measured_darks(exposures, picture_s, self.job.spec.camera.white_dn)
+        darks = measured_darks(exposures, picture_s, self.job.spec.camera.white_dn)
+        return darks if self.warmth is None else replace(darks, warm_c=self.warmth.read_c())
 
     def _flats(self, darks: Darks) -> Flats:
         full_s = self._exposure_for(FILLED, darks, 50.0, 3.0)
