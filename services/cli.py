@@ -139,6 +139,9 @@ def calibrate_head(
     keep_raw: Annotated[
         bool, typer.Option("--keep-raw", help="Keep every raw frame beside the calibration, with its SHA-256.")
     ] = False,
+    leds: Annotated[
+        Path | None, typer.Option(help="TOML with what a meter said of each LED; trims the ring, tells the guard.")
+    ] = None,
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
@@ -146,7 +149,7 @@ def calibrate_head(
     def ask(said: str) -> None:
         typer.prompt(f"{said} Then press Enter", default="", show_default=False)
 
-    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw)
+    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds)
     kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
     sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
     typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")

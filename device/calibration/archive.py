@@ -32,7 +32,10 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a calibration comes from: head, moment, person, software, and how warm it was; figures that were found."""
+    """Where a calibration comes from: head, moment, person, software, and how warm it was; figures that were found.
+
+    `meter` is what the LEDs were measured with, and when.
+    """
 
     serial: str
     made_at: datetime
@@ -40,6 +43,7 @@ class Provenance:
     software: str
     temperature_c: float | None = None
     figures: tuple[tuple[str, float], ...] = ()
+    meter: str | None = None
 
 
 @dataclass(frozen=True)

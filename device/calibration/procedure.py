@@ -17,6 +17,7 @@ from device.calibration.colours import SAME, differs, refuse_other_source
 from device.calibration.darks import Darks, measured_darks
 from device.calibration.dioptres import Dioptres, between, measured_dioptres, refuse_other_place
 from device.calibration.flats import Flats, measured_flats
+from device.calibration.leds import LedReadings
 from device.calibration.moments import Moments
 from device.calibration.point import Point, Steady, measured_point, refuse_level
 from device.calibration.raws import Raws
@@ -59,7 +60,7 @@ class Job:
 
     What may be left out: `dioptres` moves the source along the axis behind the model eye's lens, whose focal length is
     `eye_mm`; `colours` shows it in these colours too (the first of all is the picture's); `keep_raw` keeps every raw
-    frame.
+    frame; `leds` is what a meter said of each LED.
     """
 
     spec: InstrumentSpec
@@ -71,6 +72,7 @@ class Job:
     dioptres: bool = False
     colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
+    leds: LedReadings | None = None
 
     @property
     def others(self) -> tuple[Colour, ...]:
@@ -281,8 +283,11 @@ class Procedure:
 
     def _provenance(self, figures: dict[str, float]) -> Provenance:
         warm_c = self.warmth.read_c() if self.warmth is not None else None
-        job = self.job
-        return Provenance(job.serial, self.clock.wall(), job.made_by, job.software, warm_c, tuple(figures.items()))
+        job, leds = self.job, self.job.leds
+        if leds is not None:
+            figures = figures | leds.figures
+        who = job.serial, self.clock.wall(), job.made_by, job.software
+        return Provenance(*who, warm_c, tuple(figures.items()), leds.measured if leds else None)
 
 
 def _read_noise_e(darks: Darks, gain_e_per_dn: float) -> float:

@@ -8,6 +8,7 @@ from math import degrees
 from pathlib import Path
 
 from device.calibration.archive import Archive, Kept
+from device.calibration.leds import led_readings, unknown
 from device.calibration.procedure import FILLED, MOVES, TINTED, Job, Operator, Procedure, Stand
 from device.clock import Clock
 from device.errors import SettingError
@@ -43,6 +44,7 @@ class Wish:
     dioptres: bool = False
     colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
+    leds: Path | None = None
 
 
 def calibrate(
@@ -52,11 +54,14 @@ def calibrate(
 
     `ask` says to a person what to put before the head, and returns when it is there.
     """
+    leds = led_readings(wish.leds, spec) if wish.leds is not None else None
+    for line in unknown(leds, spec) if leds is not None else ():
+        tell(line)
     with closing(open_bench(spec, clock)) as bench:
         world = bench.world
         who = _serial(bench, wish), wish.made_by, version("diffuscope")
         source = _source_deg(spec, wish), _eye_mm(spec, wish)
-        job = Job(spec, *who, *source, wish.dioptres, wish.colours, wish.keep_raw)
+        job = Job(spec, *who, *source, wish.dioptres, wish.colours, wish.keep_raw, leds)
         operator = Operator((lambda stand: ask(ASKED[stand])) if world is None else staging(world), tell)
         work = wish.archive / ".steps"
         procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
