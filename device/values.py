@@ -131,12 +131,16 @@ class Psf:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the numbers of a frame mean: counts are `black_dn` + electrons / `gain_e_per_dn`, up to `white_dn`."""
+    """What the numbers of a frame mean: counts are `black_dn` + s (1 + `bend_per_dn` s), s = electrons / gain.
+
+    The gain is `gain_e_per_dn`; what has reached `white_dn` is full.
+    """
 
     black_dn: float = 0.0
     gain_e_per_dn: float | None = None
     read_noise_e: float | None = None
     white_dn: float = 65535.0
+    bend_per_dn: float = 0.0
 
 
 @dataclass(frozen=True)

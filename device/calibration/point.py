@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from scipy.special import j1
 
 from device.calibration.darks import Darks
-from device.calibration.flats import Flats
+from device.calibration.flats import Flats, straight
 from device.calibration.moments import Moments
 from device.errors import CalibrationRefused
 from device.values import Frame, Image, Mask, Psf
@@ -97,7 +97,7 @@ def merged(exposures: Sequence[Moments], darks: Darks, flats: Flats) -> Image:
     for one in sorted(exposures, key=lambda one: one.exposure_s):
         usable = (one.highest < FULL * flats.white_dn) | (time_s == 0)
         lasting_s = np.float32(one.count * one.exposure_s)
-        signal += usable * (one.mean_dn - darks.at(one.exposure_s)) * np.float32(one.count)
+        signal += usable * straight(one.mean_dn - darks.at(one.exposure_s), flats.bend_per_dn) * np.float32(one.count)
         time_s += usable * lasting_s
     return signal / time_s
 

@@ -269,7 +269,7 @@ class Procedure:
         spec, geometry, gain = self.job.spec, self.job.geometry, flats.gain_e_per_dn
         if geometry is not None and dioptres is not None:
             geometry = replace(geometry, measured_scale_per_dpt=dioptres.scale_per_dpt)
-        sensor = Sensor(darks.black_dn, gain, _read_noise_e(darks, gain), flats.white_dn)
+        sensor = Sensor(darks.black_dn, gain, _read_noise_e(darks, gain), flats.white_dn, flats.bend_per_dn)
         return Calibration(
             psfs=psfs,
             sensor=sensor,
