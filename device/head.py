@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Any
 
 from device.calibration.archive import Archive, Kept
+from device.calibration.leds import with_measured_light
 from device.clock import Clock
 from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.drivers.button import GpioButton
@@ -117,6 +118,9 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
     camera driver takes its buffers from; None: where its library does. Whatever was opened before an error is dark and
     closed after it.
     """
+    if spec.calibration is not None:
+        kept = Archive(spec.calibration.archive).load()
+        spec = with_measured_light(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with Opening(spec, clock, allocator) as opening:

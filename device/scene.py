@@ -101,7 +101,8 @@ class SensorFlaws(Table):
 
     prnu: float = Field(default=0.0, ge=0, le=0.2)  # spread of the pixels' response
     dsnu_e: float = Field(default=0.0, ge=0, le=1000)
-    dark_e_per_s: float = Field(default=0.0, ge=0, le=1e5)
+    dark_e_per_s: float = Field(default=0.0, ge=0, le=1e5)  # at 25 C
+    dark_doubling_c: float = Field(default=7.0, gt=0, le=100)
     hot_pixels: float = Field(default=0.0, ge=0, le=0.05)  # their share
     nonlinearity: float = Field(default=0.0, ge=-0.2, le=0.2)  # quadratic, at full well
     line_s: float = Field(default=0.0, ge=0, le=1e-3)  # from one row to the next, of a rolling shutter

@@ -3,6 +3,7 @@
 import difflib
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,7 +78,7 @@ def _known_keys(kind: type[Table], tables: list[str]) -> list[str]:
 
 
 def _table(kind: type[Table], tables: list[str]) -> type[Table]:
-    for table in tables:
+    for table in (table for table in tables if not table.isdigit()):  # which of several [[tables]] it is
         annotation = kind.model_fields[table].annotation
         options = [annotation, *getattr(annotation, "__args__", ())]
         kind = next(option for option in options if isinstance(option, type) and issubclass(option, Table))
@@ -85,11 +86,15 @@ def _table(kind: type[Table], tables: list[str]) -> type[Table]:
 
 
 def line_of(text: str, keys: list[str]) -> int | None:
-    """The line of a TOML text (counted from 1) on which a key stands, or its table's, if it is missing."""
-    table, found = "", None
+    """The line of a TOML text (counted from 1) on which a key stands, or its table's, if it is missing.
+
+    The third of several [[tables]] is called `tables.2`.
+    """
+    table, found, times = "", None, Counter[str]()
     for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[+\s*([^\]]+?)\s*\]+", line):
-            table = header[1]
+        if header := re.match(r"\s*(\[+)\s*([^\]]+?)\s*\]+", line):
+            table = header[2] if header[1] == "[" else f"{header[2]}.{times[header[2]]}"
+            times[header[2]] += 1
             if table == ".".join(keys) or table == ".".join(keys[:-1]):
                 found = found or number
         elif (entry := re.match(r"\s*['\"]?([\w.-]+)['\"]?\s*=", line)) and (

@@ -1,7 +1,7 @@
 """The values that travel through the instrument: frozen, their arrays read-only, checked at birth."""
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Literal, Self
 
@@ -101,10 +101,12 @@ class Psf:
     float32 (rows, cols), sum 1, centre at (rows//2, cols//2).
 
     Paper, section "Algorithm": the h of y = h * x. A shift of it shifts the picture and changes nothing else.
+    `colour` is the light that it was measured in; None: it stands for every colour.
     """
 
     pixels: Image
     name: str = "psf"
+    colour: Colour | None = None
 
     def __post_init__(self) -> None:
         pixels = self.pixels
@@ -129,21 +131,29 @@ class Psf:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the numbers of a frame mean: counts are `black_dn` + electrons / `gain_e_per_dn`, up to `white_dn`."""
+    """What the numbers of a frame mean: counts are `black_dn` + s (1 + `bend_per_dn` s), s = electrons / gain.
+
+    The gain is `gain_e_per_dn`; what has reached `white_dn` is full.
+    """
 
     black_dn: float = 0.0
     gain_e_per_dn: float | None = None
     read_noise_e: float | None = None
     white_dn: float = 65535.0
+    bend_per_dn: float = 0.0
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """How degrees at the eye become pixels: paper, section "Optical design"; optics first-order numbers."""
+    """How degrees at the eye become pixels: paper, section "Optical design"; optics first-order numbers.
+
+    `measured_scale_per_dpt` is what a moved point source said of this one head (`calibration/dioptres.py`), if asked.
+    """
 
     pitch_um: float
     diffuser_to_sensor_um: float
     angular_magnification: float
+    measured_scale_per_dpt: float | None = None
 
     @property
     def px_per_deg(self) -> float:
@@ -152,7 +162,13 @@ class Geometry:
 
     @property
     def scale_per_dpt(self) -> float:
-        """Relative shrinking of the caustic per dioptre of myopia: z a^2 (Fresnel scaling)."""
+        """Relative shrinking of the caustic per dioptre of myopia: as measured, else as the drawings say."""
+        measured = self.measured_scale_per_dpt
+        return self.nominal_scale_per_dpt if measured is None else measured
+
+    @property
+    def nominal_scale_per_dpt(self) -> float:
+        """The same by the drawings: z a^2 (Fresnel scaling)."""
         return self.diffuser_to_sensor_um * 1e-6 * self.angular_magnification**2
 
 
@@ -160,8 +176,9 @@ class Geometry:
 class Calibration:
     """What the factory measured about one head, once.
 
-    `psfs` has one entry, or a stack over depth; `dark_dn` and `flat` are (rows, cols) or None; `bad` marks pixels
-    not to be believed; `field_deg` is the illuminated disc around the centre (None: not known).
+    `psfs` has one entry, or a stack over depth, for every colour or for each (`seen_in`); `dark_dn` and `flat` are
+    (rows, cols) or None; `bad` marks pixels not to be believed; `field_deg` is the illuminated disc around the centre
+    (None: not known).
     """
 
     psfs: tuple[Psf, ...]
@@ -180,10 +197,20 @@ class Calibration:
             raise PsfError("the PSFs of one stack must all have the same rows and columns")
         _freeze(self, "dark_dn", "flat", "bad")
 
+    def seen_in(self, colour: Colour) -> Self:
+        """The same with the PSFs of one colour only; a colour that nobody measured is seen through the first PSF.
+
+        What is left is one PSF, or a stack over depth: which of these explains a frame is asked of the frame.
+        """
+        own = tuple(psf for psf in self.psfs if psf.colour == colour)
+        every = tuple(psf for psf in self.psfs if psf.colour is None)
+        return replace(self, psfs=own or every or self.psfs[:1])
+
     @property
     def id(self) -> str:
         """Sixteen hexadecimal digits that change whenever anything that was measured changes."""
-        digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg)).encode())
+        colours = tuple(psf.colour for psf in self.psfs)
+        digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]

@@ -16,6 +16,7 @@ from device.head import recording
 from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
+from device.values import Colour
 from services.instrument import calibrations
 from services.instrument.once import Order, reconstruct_file, written
 
@@ -137,6 +138,21 @@ def calibrate_head(
     source_deg: Annotated[
         float | None, typer.Option(min=0, max=5, help="Width of the point source; 275 um behind a 25 mm lens: 0.63.")
     ] = None,
+    dioptres: Annotated[
+        bool, typer.Option("--dioptres", help="Also move the source by -4 to +4 mm: what one dioptre does to the PSF.")
+    ] = False,
+    eye_mm: Annotated[
+        float | None, typer.Option(min=10, max=60, help="Focal length of the model eye's lens; 25 if nothing is given.")
+    ] = None,
+    colours: Annotated[
+        str, typer.Option(help="Also show the source in these, such as red,blue: a PSF of its own where they differ.")
+    ] = "",
+    keep_raw: Annotated[
+        bool, typer.Option("--keep-raw", help="Keep every raw frame beside the calibration, with its SHA-256.")
+    ] = False,
+    leds: Annotated[
+        Path | None, typer.Option(help="TOML with what a meter said of each LED; trims the ring, tells the guard.")
+    ] = None,
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
@@ -144,11 +160,20 @@ def calibrate_head(
     def ask(said: str) -> None:
         typer.prompt(f"{said} Then press Enter", default="", show_default=False)
 
-    kept = calibrate(load_head(head), Wish(archive, serial, by, source_deg), SystemClock(), ask, typer.echo)
+    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds)
+    kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
     sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
     typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")
     typer.echo(f"read noise {sensor.read_noise_e:.2f} e-, " + ", ".join(f"{k} {v:.3g}" for k, v in known.items()))
     typer.echo(f"{kept.calibration.id} is in force in {archive}")
+
+
+def _colours(words: str) -> tuple[Colour, ...]:
+    known: dict[str, Colour] = {"red": "red", "green": "green", "blue": "blue"}
+    named = [word.strip() for word in words.split(",") if word.strip()]
+    if strange := [word for word in named if word not in known]:
+        raise typer.BadParameter(f"--colours {strange[0]!r} is none of {', '.join(known)}")
+    return tuple(known[word] for word in named)
 
 
 @app.command()

@@ -36,7 +36,7 @@ from device.errors import (
     StoreError,
     StoreFull,
 )
-from device.values import Calibration, Geometry, Psf, Sensor
+from device.values import Calibration, Colour, Geometry, Psf, Sensor
 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
@@ -50,6 +50,7 @@ class Provenance:
 
     `origin` is "imported" for a PSF that others measured, and `source` says where; `unknown` names what nobody knows
     of it, by the names of `Calibration` and `Sensor`. What stands there instead is a value that means nothing.
+    `meter` is what the LEDs were measured with, and when.
     """
 
     serial: str
@@ -61,6 +62,7 @@ class Provenance:
     origin: Literal["measured", "imported"] = "measured"
     source: str | None = None
     unknown: tuple[str, ...] = ()
+    meter: str | None = None
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,7 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     return {
         "format": FORMAT, "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
+        "psf_colours": [psf.colour or "every" for psf in calibration.psfs],
         "sensor": asdict(calibration.sensor),
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
         "provenance": said, "figures": dict(provenance.figures),
@@ -244,7 +247,10 @@ def _read(files: Mapping[str, bytes], id: str) -> Kept:
         said = _said(files)
         arrays = {name: _array(_named(files, name), digest) for name, digest in said["sha256"].items()}
         calibration = Calibration(
-            psfs=tuple(Psf(arrays[f"psf{k}.npy"], str(name)) for k, name in enumerate(said["psf_names"])),
+            psfs=tuple(
+                Psf(arrays[f"psf{k}.npy"], str(name), None if colour == "every" else _COLOUR.validate_python(colour))
+                for k, (name, colour) in enumerate(zip(said["psf_names"], said["psf_colours"], strict=True))
+            ),
             sensor=Sensor(**_numbers(said["sensor"])),
             geometry=Geometry(**_numbers(said["geometry"])) if "geometry" in said else None,
             field_deg=_numbers({"field_deg": said.get("field_deg")})["field_deg"],
@@ -262,6 +268,7 @@ def _read(files: Mapping[str, bytes], id: str) -> Kept:
 
 
 _TRUTH, _NUMBERS, _WHOSE = TypeAdapter(bool), TypeAdapter(dict[str, float | None]), TypeAdapter(Provenance)
+_COLOUR: TypeAdapter[Colour] = TypeAdapter(Colour)
 _BROKEN = (ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RecursionError)
 
 

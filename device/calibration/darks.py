@@ -6,7 +6,7 @@ and their variance is not that of the law; so the law itself is fitted to them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,8 @@ class Darks:
     """The dark of one sensor: `black_dn` without exposure, noise and pixel spread, warmth, and where it is hot.
 
     `read_noise_dn` is that of the exposure `shortest_s`, in which a little of the warmth may have arrived.
-    `map_dn` (rows, cols) is the mean dark frame at `map_s`; `hot` (rows, cols) marks pixels that are far from the rest.
+    `map_dn` (rows, cols) is the mean dark frame at `map_s`; `hot` (rows, cols) marks pixels that are far from the rest;
+    `warm_c` is how warm the head was, NaN if it cannot say.
     """
 
     black_dn: float
@@ -44,6 +45,7 @@ class Darks:
     map_s: float
     map_dn: Image
     hot: Mask
+    warm_c: float = nan
 
     def at(self, exposure_s: float) -> Image:
         """The dark frame of another exposure, (rows, cols), DN."""

@@ -17,6 +17,7 @@ ORDER = 4  # of the polynomial that a screen's shading is
 MOST_SHADING = 0.4  # from the darkest to the brightest part of a screen
 MOST_UNEVEN = 0.01  # of a block beside the smooth shading, beyond 6 sigma of the pixels
 LEAST_SHARE = 0.02  # of the converter: a flat below this is a cap
+MOST_BEND = 0.1  # at white
 DEAD = 0.5  # of its neighbours' response
 LEAST_FULL = 0.2  # share of pixels that end together: half of a mosaic's may see little of one colour
 FULL = 0.95  # of the converter: what is brighter is cut
@@ -29,12 +30,14 @@ class Flats:
     """The response of one sensor to even light.
 
     `response` (rows, cols) is each pixel's, 1 in the mean of its site of a colour mosaic; `dead` (rows, cols) marks
-    pixels below half; `nonlinearity` is the relative bend at white; `shading` the screen's own, brightest over darkest.
+    pixels below half; `nonlinearity` is the relative bend at white, `bend_per_dn` that of one count; `shading` is the
+    screen's own, brightest over darkest.
     """
 
     gain_e_per_dn: float
     white_dn: float
     nonlinearity: float
+    bend_per_dn: float
     shading: float
     response: Image
     dead: Mask
@@ -62,7 +65,19 @@ def measured_flats(levels: Sequence[Moments], bright: Moments, darks: Darks) -> 
     per_s, bend_per_dn = line_through_zero(times_s, means)
     variances = np.array([float(one.variance_dn2[good].mean(dtype=np.float64)) for one in levels])
     gain = photon_transfer(per_s * times_s, variances, bend_per_dn, darks)
-    return Flats(gain, white_dn, bend_per_dn * (white_dn - darks.black_dn), shading, response, dead)
+    bend = bend_per_dn * (white_dn - darks.black_dn)
+    if abs(bend) > MOST_BEND:
+        raise CalibrationRefused(
+            f"the counts do not grow with the exposure: they bend by {bend:+.1%} at white (at most {MOST_BEND:.0%})",
+            "Use a screen that does not flicker, and switch off the camera's own tone curve.",
+        )
+    return Flats(gain, white_dn, bend, bend_per_dn, shading, response, dead)
+
+
+def straight(light_dn: Image, bend_per_dn: float) -> Image:
+    """Counts above dark as a sensor without a bend would have counted: the s of s (1 + b s), to the third order."""
+    bent = np.float32(bend_per_dn) * light_dn
+    return np.asarray(light_dn * (1 - bent * (1 - 2 * bent)))
 
 
 def line_through_zero(times_s: Floats, means_dn: Floats) -> tuple[float, float]:

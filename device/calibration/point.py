@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from scipy.special import j1
 
 from device.calibration.darks import Darks
-from device.calibration.flats import Flats
+from device.calibration.flats import Flats, straight
 from device.calibration.moments import Moments
 from device.errors import CalibrationRefused
 from device.values import Frame, Image, Mask, Psf
@@ -53,15 +53,21 @@ class Steady:
 class Point:
     """A measured PSF, and what is known of its faults.
 
-    `off_px` (rows, cols) is how far the point was from the sensor's middle; `floor` the noise of a pixel over the peak,
-    `removed` the pedestal taken away, `residual` what may be left: shares of the PSF's mass.
+    `light` (rows, cols) is the PSF's pixels, sum 1, centre in the middle; `off_px` (rows, cols) is how far the point
+    was from the sensor's middle; `floor` the noise of a pixel over the peak, `removed` the pedestal taken away,
+    `residual` what may be left: shares of the PSF's mass.
     """
 
-    psf: Psf
+    light: Image
     off_px: tuple[int, int]
     floor: float
     removed: float
     residual: float
+
+    @property
+    def psf(self) -> Psf:
+        """As the calibration holds it."""
+        return Psf(self.light, name="point source")
 
 
 def measured_point(exposures: Sequence[Moments], darks: Darks, flats: Flats, disc_px: float = 0.0) -> Point:
@@ -71,7 +77,7 @@ def measured_point(exposures: Sequence[Moments], darks: Darks, flats: Flats, dis
     optics.md 2.1 (disc), 5.4 items 5, 6 and 12 (shift, pedestal, noise); paper, section "Methods".
     """
     bad = darks.hot | flats.dead
-    _refuse_level(min(exposures, key=lambda one: one.exposure_s), darks, flats, bad)
+    refuse_level(min(exposures, key=lambda one: one.exposure_s), darks, flats)
     light = mended(merged(exposures, darks, flats) / flats.response, bad)
     light, pedestal, residual, floor = without_pedestal(light, bad)
     if disc_px > 0:
@@ -79,7 +85,7 @@ def measured_point(exposures: Sequence[Moments], darks: Darks, flats: Flats, dis
     middle = light.shape[0] // 2, light.shape[1] // 2
     place = centroid_px(light)
     off_px = round(place[0]) - middle[0], round(place[1]) - middle[1]
-    return Point(Psf(moved(light, off_px), name="point source"), off_px, floor, pedestal, residual)
+    return Point(Psf(moved(light, off_px)).pixels, off_px, floor, pedestal, residual)
 
 
 def merged(exposures: Sequence[Moments], darks: Darks, flats: Flats) -> Image:
@@ -91,7 +97,7 @@ def merged(exposures: Sequence[Moments], darks: Darks, flats: Flats) -> Image:
     for one in sorted(exposures, key=lambda one: one.exposure_s):
         usable = (one.highest < FULL * flats.white_dn) | (time_s == 0)
         lasting_s = np.float32(one.count * one.exposure_s)
-        signal += usable * (one.mean_dn - darks.at(one.exposure_s)) * np.float32(one.count)
+        signal += usable * straight(one.mean_dn - darks.at(one.exposure_s), flats.bend_per_dn) * np.float32(one.count)
         time_s += usable * lasting_s
     return signal / time_s
 
@@ -171,7 +177,9 @@ def moved(light: Image, off_px: tuple[int, int]) -> Image:
     return out
 
 
-def _refuse_level(shortest: Moments, darks: Darks, flats: Flats, bad: Mask) -> None:
+def refuse_level(shortest: Moments, darks: Darks, flats: Flats) -> None:
+    """A point source that is too dark or too bright in its shortest exposure."""
+    bad = darks.hot | flats.dead
     signal = np.where(bad, 0, shortest.mean_dn - darks.at(shortest.exposure_s))
     peak_dn, white_dn = float(signal.max()), flats.white_dn - darks.black_dn
     if peak_dn < LEAST_PEAK * white_dn:

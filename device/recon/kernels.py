@@ -23,10 +23,19 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"
 
 @_jit
 def linearise(
-    counts: Pixels, dark: Pixels, gain: Image, white_dn: float, first: tuple[int, int], n: int, out: Image, good: Image
+    counts: Pixels,
+    dark: Pixels,
+    bend_per_dn: float,
+    gain: Image,
+    white_dn: float,
+    first: tuple[int, int],
+    n: int,
+    out: Image,
+    good: Image,
 ) -> tuple[int, int, float]:
-    """Counts to linear DN from pixel `first` on, n x n to one: out = mean of (counts - dark) * gain over good pixels.
+    """Counts to linear DN from pixel `first` on, n x n to one: out = mean of s(counts - dark) * gain over good pixels.
 
+    s takes the sensor's bend b out: s (1 + b s) = counts - dark, to the third order.
     `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
     A `dark` or a `gain` of one row holds for all rows. `good` becomes the good share of each block, 0 to 1; a block
     without a good pixel becomes 0. Returns the numbers of saturated and of good pixels, and the light on these in DN.
@@ -35,6 +44,7 @@ def linearise(
     wide = cols * n
     total, used, offset = np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
     saturated = believed = light = np.float64(0)
+    bend = np.float32(bend_per_dn)
     for i in range(rows):
         if n == 1:
             total, used = out[i], good[i]
@@ -44,7 +54,7 @@ def linearise(
             if len(dark) > 1 or a == first[0]:  # by itself: mixed into the loop below it halves its speed
                 offset[:] = dark[a % len(dark)][begin:end]
             gain_row = gain[a % len(gain)][begin:end]
-            saturated += _add_row(counts[a][begin:end], offset, gain_row, np.float32(white_dn), total, used)
+            saturated += _add_row(counts[a][begin:end], offset, gain_row, bend, np.float32(white_dn), total, used)
         row = _bin_row(total, used, n, out[i], good[i])
         believed += row[0]
         light += row[1]
@@ -52,14 +62,18 @@ def linearise(
 
 
 @_jit
-def _add_row(counts: Pixels, dark: Image, gain: Image, white_dn: Single, total: Image, used: Image) -> Single:
-    zero, one, lowest = np.float32(0), np.float32(1), np.float32(-3e38)
+def _add_row(
+    counts: Pixels, dark: Image, gain: Image, bend: Single, white_dn: Single, total: Image, used: Image
+) -> Single:
+    zero, one, two, lowest = np.float32(0), np.float32(1), np.float32(2), np.float32(-3e38)
     saturated = zero
     for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
         value = np.float32(counts[b])
         ok = (value < white_dn) & (value > lowest) & (gain[b] > zero)
         saturated += one if value >= white_dn else zero
-        total[b] += (value - dark[b]) * gain[b] if ok else zero
+        light = value - dark[b]
+        bent = bend * light
+        total[b] += light * (one - bent * (one - two * bent)) * gain[b] if ok else zero
         used[b] += one if ok else zero
     return saturated
 

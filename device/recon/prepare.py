@@ -1,4 +1,4 @@
-"""Counts to linear: black level, dark frame, flat frame, bad and saturated pixels, binning - in one pass."""
+"""Counts to linear: dark, the sensor's bend, flat frame, bad and saturated pixels, binning - in one pass."""
 
 from dataclasses import dataclass
 
@@ -35,7 +35,7 @@ class Preparer:
 
     def __init__(self, calibration: Calibration, grid: Grid, inbox: Image | None = None) -> None:
         self.grid, shape = grid, grid.sensor
-        self.white = calibration.sensor.white_dn
+        self.white, self.bend_per_dn = calibration.sensor.white_dn, calibration.sensor.bend_per_dn
         self.dark = np.full((1, shape[1]), calibration.sensor.black_dn, np.float32)  # one row stands for all
         self.gain = np.ones((1, shape[1]), np.float32)
         if calibration.dark_dn is not None:
@@ -72,7 +72,9 @@ class Preparer:
         offset = self.dark if dark is None else _fitting("dark frame", dark, self.grid.sensor)
         y, good, grid = self._out.y, self._out.good, self.grid
         first, n = grid.first_px, grid.n
-        saturated, believed, light_dn = kernels.linearise(counts, offset, self.gain, self.white, first, n, y, good)
+        saturated, believed, light_dn = kernels.linearise(
+            counts, offset, self.bend_per_dn, self.gain, self.white, first, n, y, good
+        )
         mean_good = believed / (good.size * n**2)
         if mean_good < 1 - MOST_BAD:
             raise FrameError(

@@ -3,12 +3,13 @@
 import numpy as np
 
 from device.optics.diffuser import Refraction, steepest_rad
+from device.optics.eye import correction_dpt
 from device.sim.effects.hot import hot_pixels
 from device.sim.render import dotted, fitted, psf
 from device.sim.sensor import SensorModel
 from device.sim.setup import Setup
 from device.sim.world import World
-from device.values import Calibration, Image, Psf, Sensor
+from device.values import Calibration, Colour, Image, Psf, Sensor
 
 FRAMES = 16
 FILLED = 0.8  # of the full well: bright, and nowhere saturated
@@ -55,16 +56,21 @@ def flat_frame(world: World) -> Image | None:
     return flat
 
 
-def calibration_point(world: World) -> Image:
-    """What the point source of the factory becomes: another eye, another distance, and a dot of some size."""
-    setup, said = world.setup(world.spec.light.colour), world.scene.sim.calibration
+def calibration_point(world: World, moved_mm: float = 0.0, colour: Colour | None = None) -> Image:
+    """What the point source of the factory becomes: another eye, another distance, and a dot of some size.
+
+    `moved_mm` away from the lens of the model eye it is that of a longer eye: M = 1/f - 1/s, and looks smaller.
+    """
+    setup, said = world.setup(colour or world.spec.light.colour), world.scene.sim.calibration
+    eye_mm = world.scene.sim.eye.focal_length_um / 1000
     there = Setup(setup.scene, setup.subject, setup.sensor, lines=setup.lines)
-    there.refraction = Refraction(said.m_dpt, said.j0_dpt, said.j45_dpt)
+    longer_dpt = -correction_dpt(eye_mm + moved_mm, eye_mm)
+    there.refraction = Refraction(said.m_dpt + longer_dpt, said.j0_dpt, said.j45_dpt)
     if said.diffuser_to_sensor_um is not None:
         there.optics = setup.optics.model_copy(update={"diffuser_to_sensor_um": said.diffuser_to_sensor_um})
     point = psf(there)
     scale = setup.optics.angular_magnification * setup.optics.diffuser_to_sensor_um
-    on_sensor_um = setup.source_um * scale / world.scene.sim.eye.focal_length_um
+    on_sensor_um = setup.source_um * scale / (1000 * (eye_mm + moved_mm))
     return dotted(point, on_sensor_um / world.spec.camera.pitch_um) if on_sensor_um else point
 
 

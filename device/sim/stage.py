@@ -8,7 +8,7 @@ import numpy as np
 from device.sim.calibrate import calibration_point
 from device.sim.render import fitted
 from device.sim.world import World
-from device.values import Image
+from device.values import Colour, Image
 
 SHADED = 0.05  # how much darker an even screen is at the sensor's corners: no screen is even
 
@@ -25,9 +25,15 @@ def screen(world: World, e_per_s: float) -> Image:
     return _seen(world, even)
 
 
-def point(world: World, e_per_s: float, moved_px: tuple[int, int] = (0, 0)) -> Image:
-    """The factory's point source on the axis, its brightest pixel at `e_per_s`; `moved_px` is (down, right)."""
-    caustic = calibration_point(world)
+def point(
+    world: World, e_per_s: float, moved_px: tuple[int, int] = (0, 0), moved_mm: float = 0.0,
+    colour: Colour | None = None,
+) -> Image:  # fmt: skip
+    """The factory's point source on the axis, its brightest pixel at `e_per_s`.
+
+    `moved_px` is (down, right); `moved_mm` along the axis, away from the model eye's lens; no `colour`: the picture's.
+    """
+    caustic = calibration_point(world, moved_mm, colour)
     rows, cols = (size // 2 - by for size, by in zip(caustic.shape, moved_px, strict=True))
     there = fitted(caustic, world.shape, (rows, cols))
     return _seen(world, there * np.float32(e_per_s / float(there.max())))

@@ -17,6 +17,7 @@ from device.sim.setup import Scene, Setup
 from device.spec import InstrumentSpec, OpticsSpec
 from device.values import Charge, Colour, Eye, Geometry, Glow, Identity, Image
 
+REFERENCE_C = 25.0  # where a scene's dark current is that of its file
 FAULTS = frozenset({"camera.missing", "camera.stalled", "light.fault", "light.silent", "bus.silent"})
 
 Choice = Callable[[Scene], tuple[Decision, ...]]
@@ -50,7 +51,7 @@ class World:
         self.stage: Image | None = None
         self.faults: set[str] = set()
         self.frames = 0
-        self.celsius, self.charge = 25.0, Charge(0.775, 3.88)
+        self.celsius, self.charge = REFERENCE_C, Charge(0.775, 3.88)
         self.identity: Identity | None = None
         self.pressed_since_s: float | None = None
         self._choose = choose
@@ -127,23 +128,28 @@ class World:
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
         if self.stage is not None:
-            dark_e_per_s = np.float32(self.setup(self.spec.light.colour).dark_e_per_s)
-            return (self.stage + dark_e_per_s) * np.float32(exposure_s)
-        always_e = np.asarray((self._always_e_per_s + self.ambient_e_per_s) * exposure_s, np.float32)
+            return (self.stage + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
+        always_e_per_s = self.dark_e_per_s + self._room_e_per_s + self.ambient_e_per_s
+        always_e = np.asarray(always_e_per_s * exposure_s, np.float32)
         glow = self.glow  # once: a guard may darken the lamp at any moment
         if glow is None:
             return np.broadcast_to(always_e, self.shape)
         return self.electrons_per_s(glow.colour) * np.float32(glow.level * exposure_s) + always_e
 
+    @property
+    def dark_e_per_s(self) -> float:
+        """What the sensor's warmth adds, as warm as it is now."""
+        warmer_c = self.celsius - REFERENCE_C
+        return self.setup(self.spec.light.colour).dark_e_per_s * float(
+            2 ** (warmer_c / self.scene.sim.sensor.dark_doubling_c)
+        )
+
     @cached_property
-    def _always_e_per_s(self) -> Image | float:
-        """What the scene's room and the sensor's warmth add, lamp or no lamp."""
+    def _room_e_per_s(self) -> Image | float:
+        """What the scene's room adds, lamp or no lamp."""
         setup = self.setup(self.spec.light.colour)
         if not setup.ambient:
-            return setup.dark_e_per_s
+            return 0.0
         self.electrons_per_s(self.spec.light.colour)  # says how bright the picture is, of which this is a share
         room_e_per_s = setup.ambient * setup.lit_e_per_s
-        if setup.response is None:
-            return setup.dark_e_per_s + room_e_per_s
-        always: Image = np.float32(setup.dark_e_per_s) + np.float32(room_e_per_s) * setup.response
-        return always
+        return room_e_per_s if setup.response is None else np.float32(room_e_per_s) * setup.response

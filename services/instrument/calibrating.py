@@ -8,31 +8,44 @@ from math import degrees
 from pathlib import Path
 
 from device.calibration.archive import Archive, Kept
-from device.calibration.procedure import FILLED, Job, Operator, Procedure, Stand
+from device.calibration.leds import led_readings, unknown
+from device.calibration.procedure import FILLED, MOVES, TINTED, Job, Operator, Procedure, Stand
 from device.clock import Clock
 from device.errors import MemoryDamaged, SettingError
 from device.head import Bench, open_bench
 from device.sim import stage
 from device.sim.world import World
 from device.spec import InstrumentSpec
-from device.values import Identity
+from device.values import Colour, Identity
 
+EYE_MM = 25.0  # the paper's model eye
 LONGEST_SERIAL = 64  # of characters: what a head's memory keeps
 ASKED: dict[Stand, str] = {
     "cap": "Put the cap on the head and shade it.",
     "screen": "Take the cap off and put the even screen before the head, switched on.",
     "point": "Put the point source before the head, on its axis, and switch the screen off.",
+    **{
+        stand: f"Move the point source along the axis to {moved_mm:+g} mm ({way} the lens) of where it was first."
+        for stand, moved_mm in MOVES.items()
+        for way in ["away from" if moved_mm > 0 else "towards"]
+    },
+    **{stand: f"Put the point source back where it was first, and let it shine in {c}." for c, stand in TINTED.items()},
 }
 
 
 @dataclass(frozen=True)
 class Wish:
-    """What the command line says; None: what the head knows itself."""
+    """What the command line says; None: what the head knows itself. What the rest says is in Job."""
 
     archive: Path
     serial: str | None
     made_by: str
     source_deg: float | None
+    eye_mm: float | None = None
+    dioptres: bool = False
+    colours: tuple[Colour, ...] = ()
+    keep_raw: bool = False
+    leds: Path | None = None
 
 
 def calibrate(
@@ -52,7 +65,12 @@ def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, o
 
     A power cut before that leaves a head that refuses to start, and says how its memory is written.
     """
-    job = Job(spec, serial_of(bench, wish), wish.made_by, version("diffuscope"), _source_deg(spec, wish))
+    leds = led_readings(wish.leds, spec) if wish.leds is not None else None
+    for line in unknown(leds, spec) if leds is not None else ():
+        operator.tell(line)
+    who = serial_of(bench, wish), wish.made_by, version("diffuscope")
+    source = _source_deg(spec, wish), _eye_mm(spec, wish)
+    job = Job(spec, *who, *source, wish.dioptres, wish.colours, wish.keep_raw, leds)
     procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
     archive = Archive(wish.archive)
     kept = archive.load(procedure.run(archive))
@@ -76,8 +94,9 @@ def staging(world: World) -> Callable[[Stand], None]:
                 world.stage = stage.cap(world)
             case "screen":
                 world.stage = stage.screen(world, e_per_s)
-            case "point":
-                world.stage = stage.point(world, e_per_s)
+            case _:
+                colour = next((colour for colour, name in TINTED.items() if name == stand), None)
+                world.stage = stage.point(world, e_per_s, moved_mm=MOVES.get(stand, 0.0), colour=colour)
 
     return put
 
@@ -108,3 +127,9 @@ def _source_deg(spec: InstrumentSpec, wish: Wish) -> float:
     if wish.source_deg is not None or spec.sim is None:
         return wish.source_deg or 0.0
     return degrees(spec.sim.calibration.source_um / spec.sim.eye.focal_length_um)
+
+
+def _eye_mm(spec: InstrumentSpec, wish: Wish) -> float:
+    if wish.eye_mm is not None or spec.sim is None:
+        return wish.eye_mm or EYE_MM
+    return spec.sim.eye.focal_length_um / 1000

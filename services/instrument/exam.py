@@ -25,7 +25,7 @@ from device.recon.model import field_box
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.sequence import lit
-from device.values import EYES, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
+from device.values import EYES, Calibration, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.instrument.watchdog import BEAT_S, Watchdog
@@ -183,18 +183,20 @@ class Exam:
                 self._died()
 
     def _plan(self) -> None:
-        planner = Planner(self._plans)
-        index = self._best_psf(planner)
-        calibration, shape = self.head.calibration, self.head.camera.shape
+        planner, said, shape = Planner(self._plans), self.head.spec.light, self.head.camera.shape
+        calibration, live = (self.head.calibration.seen_in(colour) for colour in (said.colour, said.preview_colour))
+        index = self._best_psf(calibration, planner)
         recipes = ladder(calibration, shape, index)
-        self._reconstructor = Reconstructor(calibration, shape, planner, self.clock, recipes, index)
+        self._reconstructor = self._live = Reconstructor(calibration, shape, planner, self.clock, recipes, index)
+        if live.psfs[0] is not calibration.psfs[0]:  # aiming has a colour, and that colour a PSF, of its own
+            self._live = Reconstructor(live, shape, planner, self.clock, recipes[:1], refract=False)
 
-    def _best_psf(self, planner: Planner) -> int:
+    def _best_psf(self, calibration: Calibration, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
-        if len(self.head.calibration.psfs) == 1:
+        if len(calibration.psfs) == 1:
             return 0
         frame, _ = self._expose(EYES)
-        return sharpest(self.head.calibration, frame.counts, planner)[0]
+        return sharpest(calibration, frame.counts, planner)[0]
 
     def _end(self) -> None:
         """Nobody waits for a picture that will never be taken."""
@@ -363,7 +365,7 @@ class Exam:
             self.head.light.off()
             dark_s = self.clock.now_s()
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
-        made = self._reconstructor(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
+        made = self._live(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
         return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s, dark_s
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:

@@ -26,9 +26,10 @@ from device.ports import Camera
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
+from device.sim.render import fitted
 from device.sim.world import World
 from device.spec import InstrumentSpec, load_head
-from device.values import Calibration
+from device.values import Calibration, Colour, Psf
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
@@ -164,6 +165,7 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         bulletin: Bulletin | None = None,
         wait: bool = True,
         psfs: int = 1,
+        tinted: tuple[Colour, ...] = (),
         watchdog: str | None = None,
     ) -> Rig:
         clock, died = GateClock(), Event()
@@ -174,6 +176,9 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
             SimLight(scene), clock, max_on_s, hazard_of(scene.spec), LightBook(shelf.engine, clock, DAY_S, boot="once")
         )
         stack = replace(calibration, psfs=calibration.psfs * psfs)
+        if tinted:
+            own = tuple(Psf(fitted(scene.psf(colour), scene.shape), colour, colour) for colour in tinted)
+            stack = replace(calibration, psfs=own)
         head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
         bulletin = bulletin or Bulletin()
         exam = Exam(head, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))

@@ -396,3 +396,15 @@ def test_a_problem_of_the_preview_is_told_once_and_forgotten_when_it_is_over(
     rig.world.faults.clear()
     assert rig.exam.preview(0) is not None
     wait_until(lambda: rig.exam.problem is None)
+
+
+def test_aiming_in_red_and_the_picture_in_green_each_have_their_own_psf(make_rig: Any) -> None:
+    rig = make_rig(tinted=("green", "red"))
+    assert rig.exam._reconstructor.calibration.psfs[0].colour == "green"
+    assert rig.exam._live.calibration.psfs[0].colour == "red"
+    assert rig.exam.preview(0) is not None
+    assert rig.exam.press("OD").result(30).calibration_id == rig.exam.head.calibration.id
+
+
+def test_one_psf_for_every_colour_needs_one_reconstructor(old_rig: Any) -> None:
+    assert old_rig.exam._live is old_rig.exam._reconstructor

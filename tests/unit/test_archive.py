@@ -21,7 +21,8 @@ def calibration(black_dn: float = 64.25) -> Calibration:
     shape = (24, 32)
     flat = np.random.default_rng(0).uniform(0.9, 1.1, shape).astype(np.float32)
     return Calibration(
-        (Psf(speckle((17, 19)), "0 dpt"), Psf(speckle((17, 19), 3), "2 dpt")), Sensor(black_dn, 5.7, 1.03, 4095.0),
+        (Psf(speckle((17, 19)), "0 dpt"), Psf(speckle((17, 19), 3), "2 dpt", "red")),
+        Sensor(black_dn, 5.7, 1.03, 4095.0),
         Geometry(5.04, 6000, 0.75), 33.4, np.full(shape, 64.5, np.float32), flat, flat > 1.09, True,
     )  # fmt: skip
 
@@ -37,7 +38,7 @@ def test_what_is_kept_is_what_comes_back(archive):
     found, expected = archive.load(), calibration()
     assert found.calibration.id == expected.id
     assert found.provenance == WHO
-    assert [psf.name for psf in found.calibration.psfs] == ["0 dpt", "2 dpt"]
+    assert [(psf.name, psf.colour) for psf in found.calibration.psfs] == [("0 dpt", None), ("2 dpt", "red")]
     assert found.calibration.simulated
     assert np.array_equal(found.calibration.bad, expected.bad)
     assert not found.calibration.flat.flags.writeable

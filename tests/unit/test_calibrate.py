@@ -95,6 +95,7 @@ def test_a_whole_calibration_is_kept_in_force_with_what_was_found(table: Table) 
     assert found.sensor.gain_e_per_dn == pytest.approx(camera.gain_e_per_dn, rel=0.01)
     assert found.sensor.read_noise_e == pytest.approx(camera.read_noise_e, rel=0.05)
     assert found.sensor.black_dn == pytest.approx(camera.black_dn, abs=0.2)
+    assert found.sensor.bend_per_dn * (camera.white_dn - camera.black_dn) == pytest.approx(-0.01, rel=0.05)
     assert found.geometry == world.geometry
     assert kept.provenance.serial == "D-1"
     assert dict(kept.provenance.figures)["dark_e_per_s"] == pytest.approx(50, rel=0.02)

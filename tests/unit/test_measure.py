@@ -208,6 +208,11 @@ def test_a_flat_refuses_a_cap_a_finger_and_a_screen_that_is_too_bright_or_too_di
     assert "is saturated" in refusal_of(measured_flats, several(world, (0.02, 0.1, 0.2)), bright, darks)
 
 
+def test_a_flat_refuses_counts_that_do_not_grow_with_the_exposure() -> None:
+    world = small_world(coarser=8, nonlinearity=-0.15)
+    assert "bend by -15" in refusal_of(flats_of, world, darks_of(world))
+
+
 def test_a_point_refuses_what_is_dark_saturated_or_moves(flawed: tuple[World, Darks, Flats]) -> None:
     world, darks, flats = flawed
     for e_per_s, said in ((2_000.0, "too dark"), (400_000.0, "saturated")):

@@ -13,6 +13,7 @@ from device.errors import FrameError, PsfError, SettingError
 from device.values import (
     Calibration,
     Capture,
+    Colour,
     Frame,
     Geometry,
     Glow,
@@ -125,6 +126,10 @@ def test_a_calibration_needs_psfs_of_one_size() -> None:
         Calibration((Psf(psf()), Psf(psf((6, 6)))), Sensor())
 
 
+COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
+COLOURED: tuple[tuple[str, Colour | None], ...] = (
+    ("every", None), ("near", "green"), ("far", "green"), ("red", "red"),
+)  # fmt: skip
 CHANGES: dict[str, Any] = {
     "psfs": (Psf(psf() ** 2),), "sensor": Sensor(black_dn=1), "geometry": Geometry(5, 6000, 0.75), "field_deg": 33.0,
     "dark_dn": psf(), "flat": psf(), "bad": psf() > 0.5,
@@ -137,6 +142,20 @@ def test_the_name_of_a_calibration_changes_with_whatever_was_measured(what: str)
     assert before.id == Calibration((Psf(psf()),), Sensor()).id
     assert len(before.id) == 16
     assert dataclasses.replace(before, **{what: CHANGES[what]}).id != before.id
+
+
+def test_a_calibration_is_seen_in_one_colour_by_what_was_measured_in_it() -> None:
+    every, near, far, red = (Psf(psf(), name, colour) for name, colour in COLOURED)
+    seen = {c: [p.name for p in Calibration((every, near, far, red), Sensor()).seen_in(c).psfs] for c in COLOURS}
+    assert seen == {"red": ["red"], "green": ["near", "far"], "blue": ["every"]}
+    assert Calibration((near, red), Sensor()).seen_in("blue").psfs == (near,)
+    depths = Calibration((every, every), Sensor())
+    assert depths.seen_in("green").psfs is not None
+    assert depths.seen_in("green").id == depths.id
+
+
+def test_whose_colour_a_psf_is_belongs_to_the_name() -> None:
+    assert Calibration((Psf(psf()),), Sensor()).id != Calibration((Psf(psf(), colour="red"),), Sensor()).id
 
 
 def test_a_dark_frame_is_not_a_flat_frame_to_the_name() -> None:
