@@ -7,7 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from device.calibration.archive import Archive
+from device.calibration.admission import refuse_old, refuse_other_mode
+from device.calibration.archive import Archive, Kept, Provenance
 from device.clock import Clock
 from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
 from device.drivers.button import GpioButton
@@ -46,7 +47,10 @@ class Chips:
 
 @dataclass(frozen=True)
 class Head:
-    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it."""
+    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it.
+
+    `provenance` is where that comes from; None where nobody measured it.
+    """
 
     spec: InstrumentSpec
     camera: Camera
@@ -55,6 +59,7 @@ class Head:
     chips: Chips = Chips()
     button: Button | None = None
     held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
+    provenance: Provenance | None = None
 
     @property
     def kind(self) -> str:
@@ -130,15 +135,19 @@ class Opening:
 
     def calibration(self) -> Calibration:
         """The one in force in the archive that the head file names; without a name that of the simulated world."""
+        return self.kept.calibration if self.kept is not None else simulated_calibration(self.world)
+
+    @cached_property
+    def kept(self) -> Kept | None:
+        """What the archive holds, if it fits the head's file and is not too old; None if the file names no archive."""
         if self.spec.calibration is None:
-            return simulated_calibration(self.world)
-        kept, camera = Archive(self.spec.calibration.archive).load(), self.spec.camera
-        found = kept.calibration
-        if found.psfs[0].shape != (camera.rows, camera.cols):
-            raise HeadMismatch(f"the calibration of {kept.provenance.serial} has the PSF shape {found.psfs[0].shape}")
-        if found.simulated and not is_simulated(self.spec):
-            raise HeadMismatch(f"{found.id}, of {kept.provenance.serial}, was measured on a simulated head")
-        return found
+            return None
+        kept = Archive(self.spec.calibration.archive).load()
+        refuse_other_mode(kept.calibration, kept.provenance, self.spec.camera)
+        refuse_old(kept.provenance, self.clock.wall())
+        if kept.calibration.simulated and not is_simulated(self.spec):
+            raise HeadMismatch(f"{kept.calibration.id}, of {kept.provenance.serial}, was measured on a simulated head")
+        return kept
 
     def lamp(self, chain: ChainSpec | None = None) -> Light:
         """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
@@ -250,16 +259,21 @@ def _opened(opening: Opening, ledger: Ledger) -> Head:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
-    return Head(spec, camera, light, calibration, opening.chips(), opening.button())
+    known = opening.kept.provenance if opening.kept is not None else None
+    return Head(spec, camera, light, calibration, opening.chips(), opening.button(), provenance=known)
 
 
 def _refuse_another_head(head: Head) -> None:
     """A head that knows whose it is must be the one that the calibration was measured on."""
     known = head.chips.memory.read() if head.chips.memory is not None else None
-    if known is not None and known.calibration_id != head.calibration.id:
+    if known is None:
+        return
+    if known.calibration_id != head.calibration.id:
         raise HeadMismatch(
             f"head {known.serial} was calibrated as {known.calibration_id[:16]}, loaded is {head.calibration.id}"
         )
+    if head.provenance is not None and head.provenance.serial != known.serial:
+        raise HeadMismatch(f"this is head {known.serial}, loaded is the calibration of {head.provenance.serial}")
 
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:
