@@ -1,26 +1,25 @@
 """What one dark frame of an ordinary press says about the sensor: black level, noise, pixels that turned hot."""
 
 from dataclasses import dataclass
-from math import sqrt
+from math import hypot, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device.calibration.archive import Provenance
-from device.calibration.darks import whole_counts
 from device.values import Calibration, Counts, Image
 
 PARTS = 8  # x 8 parts of the frame; the darkest stands for a dark row, which these sensors do not give
 HOT_SIGMAS, HOT_DN = 10.0, 3.0  # of one frame's noise and the pixels' spread: a normal pixel is beyond in no lifetime
-FRACTIONS = 10  # of a count, over which whole counts are averaged
+ROUNDED_DN = 12**-0.5  # what whole counts add to a noise at the most; where it is smaller they hide it
 
 
 @dataclass(frozen=True)
 class Darkness:
     """One dark frame against the calibration.
 
-    `black_off_dn` is how much brighter its darkest part is; `noise` the spread of its pixels over what is expected
-    (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and are not marked bad;
+    `black_off_dn` is how much brighter its darkest part is; `noise` the spread of its pixels over the most that is
+    expected of whole counts (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and are not marked bad;
     `warmth_dn` is what the sensor's warmth brought when it was calibrated.
     """
 
@@ -46,7 +45,7 @@ def darkness(calibration: Calibration, known: Provenance | None, counts: Counts,
     noise = None
     if sigma_dn is not None:
         flat = off if calibration.dark_dn is not None else counts.astype(np.float32)
-        noise = float(flat[good].std(dtype=np.float64)) / _whole_dn(sigma_dn, calibration, black_dn + warmth_dn)
+        noise = float(flat[good].std(dtype=np.float64)) / hypot(sigma_dn, ROUNDED_DN)
     return Darkness(_darkest_dn(off, good), noise, hot, warmth_dn)
 
 
@@ -57,17 +56,6 @@ def _sigma_dn(calibration: Calibration, figures: dict[str, float], warmth_dn: fl
         return None
     pattern_e = figures["pattern_e"] if calibration.dark_dn is None else 0.0
     return sqrt(read_e**2 + pattern_e**2 + warmth_dn * gain) / gain
-
-
-def _whole_dn(sigma_dn: float, calibration: Calibration, level_dn: float) -> float:
-    """What whole counts make of that noise, DN: over all fractions of a count where pixels have levels of their own."""
-    if calibration.dark_dn is None:
-        return sqrt(whole_counts(level_dn, sigma_dn)[1])
-    square = 0.0
-    for fraction in np.arange(FRACTIONS) / FRACTIONS:
-        mean, variance = whole_counts(float(fraction), sigma_dn)
-        square += variance + (mean - fraction) ** 2
-    return sqrt(square / FRACTIONS)
 
 
 def _seen_sigma_dn(off: NDArray[np.float32]) -> float:
