@@ -143,9 +143,7 @@ def calibrate_head(
 @app.command("check")
 def check_head(
     head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
-    archive: Annotated[
-        Path | None, typer.Option(help="Where calibrations are kept; by default the head's own.")
-    ] = None,
+    archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
 ) -> None:
     """Ask whether the calibration in force still fits the head: after a drop, or when pictures look odd.

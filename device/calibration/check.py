@@ -21,7 +21,7 @@ from device.calibration.archive import Provenance
 from device.calibration.darkness import Darkness, darkness
 from device.calibration.finding import Finding
 from device.errors import CalibrationOld, CalibrationStale
-from device.recon.witness import Testimony, Witness
+from device.recon.witness import Statement, Witness
 from device.values import Calibration, Counts
 
 LAST = 3  # captures that decide
@@ -45,11 +45,11 @@ ONCE_MORE = "Take another picture. If that says so too, none is taken any more u
 
 @dataclass(frozen=True)
 class Sight:
-    """What one capture showed; `testimony` is None where the lit frame says nothing."""
+    """What one capture showed; `statement` is None where the lit frame says nothing."""
 
     taken_at: datetime
     dark: Darkness
-    testimony: Testimony | None
+    statement: Statement | None
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def check(
 ) -> tuple[Finding, ...]:  # fmt: skip
     """Every finding that the captures allow, of `sights` and of all refractions since; the newest may come anywhere."""
     recent = sorted(sights, key=lambda one: one.taken_at)
-    told = [one.testimony for one in recent if one.testimony is not None and one.testimony.sd <= SURE_SD]
+    told = [one.statement for one in recent if one.statement is not None and one.statement.sd <= SURE_SD]
     fitting = [one for one in told if one.score >= LEAST_SCORE][-LAST:]
     found = [age(known, now)] if known is not None else []
     if told:
@@ -103,7 +103,7 @@ def refuse(findings: Sequence[Finding]) -> None:
         raise CalibrationStale(f"the calibration no longer fits this head, {said}")
 
 
-def _psf(told: Sequence[Testimony]) -> Finding:
+def _psf(told: Sequence[Statement]) -> Finding:
     """Whether the stored PSF is the one that light came through."""
     doubts = sum(one.score < LEAST_SCORE for one in told)
     value = median(one.score for one in told)
@@ -114,15 +114,15 @@ def _psf(told: Sequence[Testimony]) -> Finding:
     return Finding("psf", True, value, LEAST_SCORE, "of 1")
 
 
-def _field(told: Sequence[Testimony]) -> list[Finding]:
+def _field(told: Sequence[Statement]) -> list[Finding]:
     """Where the illuminated field lies, and how wide it is: lamp, diffuser or sensor have moved."""
     down, right = (median(one.off_deg[axis] for one in told) for axis in (0, 1))
     wider = median(one.wider for one in told)
     return [
         _hinted("shift", hypot(down, right), OFF_DEG, "deg", "The field is off its place: see whether the lamp, the "
                 "diffuser or the sensor sits loose, or whether eyes are held off the axis."),
-        _hinted("width", abs(wider), WIDER, "of 1", "The field has another size: the distance from the diffuser to "
-                "the sensor may have changed. Dioptres and micrometres are wrong by that share."),
+        _hinted("width", 100 * abs(wider), 100 * WIDER, "%", "The field has another size: the distance from the "
+                "diffuser to the sensor may have changed. Dioptres and micrometres are wrong by that share."),
     ]  # fmt: skip
 
 
@@ -168,8 +168,8 @@ def _darks(calibration: Calibration, darks: Sequence[Darkness]) -> list[Finding]
 
 def _hot(share: float) -> Finding:
     if share > MOST_HOT:
-        return Finding("hot pixels", False, share, MOST_HOT, "of 1", CALIBRATE)
-    return _hinted("hot pixels", share, HOT_FROM, "of 1", "More pixels shine in the dark. Plan a calibration.")
+        return Finding("hot pixels", False, 100 * share, 100 * MOST_HOT, "%", CALIBRATE)
+    return _hinted("hot pixels", 100 * share, 100 * HOT_FROM, "%", "More pixels shine in the dark. Plan a calibration.")
 
 
 def _hinted(name: str, value: float, limit: float, unit: str, remedy: str) -> Finding:

@@ -19,8 +19,8 @@ class Darkness:
     """One dark frame against the calibration.
 
     `black_off_dn` is how much brighter its darkest part is; `noise` the spread of its pixels over the most that is
-    expected of whole counts (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and are not marked bad;
-    `warmth_dn` is what the sensor's warmth brought when it was calibrated.
+    expected of whole counts (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and
+    are not marked bad; `warmth_dn` is what the sensor's warmth brought when it was calibrated.
     """
 
     black_off_dn: float
@@ -40,7 +40,7 @@ def darkness(calibration: Calibration, known: Provenance | None, counts: Counts,
     sigma_dn = _sigma_dn(calibration, figures, warmth_dn)
     middle_dn = float(np.median(off[good]))
     far_dn = HOT_DN + HOT_SIGMAS * max(sigma_dn or 0.0, _seen_sigma_dn(off[good]))
-    hot = _lonely(off, np.flatnonzero(good & (off > middle_dn + far_dn)), far_dn)
+    hot = _lonely(off, np.flatnonzero(good & (off > middle_dn + far_dn)), far_dn, gain or 1.0)
     good &= np.abs(off - np.float32(middle_dn)) <= far_dn
     noise = None
     if sigma_dn is not None:
@@ -64,15 +64,19 @@ def _seen_sigma_dn(off: NDArray[np.float32]) -> float:
     return float(high - low) / 2
 
 
-def _lonely(off: Image, bright: NDArray[np.int64], far_dn: float) -> NDArray[np.int64]:
-    """Those that also stand out from their neighbours: a lamp in the room shines on many pixels side by side."""
+def _lonely(off: Image, bright: NDArray[np.int64], far_dn: float, gain_e_per_dn: float) -> NDArray[np.int64]:
+    """Those that also stand out from their neighbours, and from the shot noise of what shines on them: a lamp in the
+    room shines on many pixels side by side.
+    """
     rows, cols = np.unravel_index(bright, off.shape)
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if (down, right) != (0, 0)]
     near = [
         off[np.clip(rows + down, 0, off.shape[0] - 1), np.clip(cols + right, 0, off.shape[1] - 1)]
         for down, right in around
     ]
-    return bright[off.ravel()[bright] > np.median(near, axis=0) + far_dn]
+    level_dn = np.median(near, axis=0)
+    shot_dn = np.sqrt(np.maximum(level_dn, 0) / gain_e_per_dn)
+    return bright[off.ravel()[bright] > level_dn + far_dn + HOT_SIGMAS * shot_dn]
 
 
 def _darkest_dn(off: Image, good: NDArray[np.bool_]) -> float:

@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Testimony:
+class Statement:
     """What one frame says about the PSF: the score and its standard deviation, and the eye's mean sphere M.
 
     `off_deg` is how far the illuminated field's middle is from the sensor's (down, right), `wider` by which share it is
@@ -54,7 +54,7 @@ class Witness:
         self._rings = np.array_split(order, max(1, order.size // RING))
         self._rim = Rim(refractor.model)
 
-    def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> Testimony | None:
+    def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> Statement | None:
         """What a frame (rows, cols) in counts says; None where nothing shines, or too few frequencies can tell.
 
         `between` is called every few milliseconds; what it raises ends the hearing.
@@ -76,14 +76,15 @@ class Witness:
         search = Search(unlikelihood)
         sphere_dpt = search.walk(search.ladder(of.step_dpt), of.step_dpt / 4)
         unlikelihood(sphere_dpt)
-        score, sd = self._score(_filled(frame) * of.taper, noise)
+        score, sd = self._score(_filled(frame), noise)
         of.model.refocus(of.otf(of.grid, sphere_dpt))
         edge, per_deg = self._rim.fit(frame.y, between), of.geometry.px_per_deg / of.grid.n
-        return Testimony(score, sd, sphere_dpt, (edge.off[0] / per_deg, edge.off[1] / per_deg), edge.wider)
+        return Statement(score, sd, sphere_dpt, (edge.off[0] / per_deg, edge.off[1] / per_deg), edge.wider)
 
-    def _score(self, tapered: Image, noise: float) -> tuple[float, float]:
+    def _score(self, y: Image, noise: float) -> tuple[float, float]:
         of = self._refractor
-        of.fft.space[:] = tapered
+        even = float(np.vdot(y, of.taper) / of.taper.sum())  # what is even never met the diffuser
+        np.multiply(y - np.float32(even), of.taper, out=of.fft.space)
         seen = np.abs(of.fft.forward().ravel()[of.band.where].astype(np.complex128)) ** 2
         power = of.band.power.astype(np.float64)
         found = expected = certainty = 0.0

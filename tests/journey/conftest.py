@@ -152,7 +152,7 @@ MakeRig = Callable[..., Rig]
 
 @pytest.fixture(scope="session")
 def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
-    """Build an instrument: `camera` wraps the simulated one, `store` gives its options, `max_on_s` is the guard's."""
+    """Build an instrument: `camera` wraps the simulated one, `max_on_s` is the guard's, `head` changes it."""
     dark_world, calibration = template
 
     def built(
@@ -165,6 +165,7 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         wait: bool = True,
         psfs: int = 1,
         watchdog: str | None = None,
+        head: Callable[[Head], Head] = lambda head: head,
     ) -> Rig:
         clock, died = GateClock(), Event()
         scene = copy(dark_world)
@@ -174,9 +175,9 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
             SimLight(scene), clock, max_on_s, hazard_of(scene.spec), LightBook(shelf.engine, clock, DAY_S, boot="once")
         )
         stack = replace(calibration, psfs=calibration.psfs * psfs)
-        head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
+        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack))
         bulletin = bulletin or Bulletin()
-        exam = Exam(head, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
+        exam = Exam(opened, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)
