@@ -27,7 +27,7 @@ from device.values import Calibration, Counts
 LAST = 3  # captures that decide
 AGREED = 2  # of them, before pictures are refused
 
-SURE_SD = 0.1  # a frame with a wider score is too dark, or shows nothing: it does not say anything about the PSF
+SURE_SD = 0.15  # a frame with a wider score is too dark, or shows nothing: it does not say anything about the PSF
 LEAST_SCORE = 0.6
 OFF_DEG = 0.5
 WIDER = 0.012
@@ -79,7 +79,7 @@ def check(
     """Every finding that the captures allow, of `sights` and of all refractions since; the newest may come anywhere."""
     recent = sorted(sights, key=lambda one: one.taken_at)
     told = [one.statement for one in recent if one.statement is not None and one.statement.sd <= SURE_SD]
-    fitting = [one for one in told if one.score >= LEAST_SCORE][-LAST:]
+    fitting = [one for one in told if one.most >= LEAST_SCORE][-LAST:]
     found = [age(known, now)] if known is not None else []
     if told:
         found.append(_psf(told[-LAST:]))
@@ -105,12 +105,12 @@ def refuse(findings: Sequence[Finding]) -> None:
 
 def _psf(told: Sequence[Statement]) -> Finding:
     """Whether the stored PSF is the one that light came through."""
-    doubts = sum(one.score < LEAST_SCORE for one in told)
-    value = median(one.score for one in told)
+    doubts = sum(one.most < LEAST_SCORE for one in told)
+    value = median(one.most for one in told)
     if doubts >= AGREED:
         return Finding("psf", False, value, LEAST_SCORE, "of 1", CALIBRATE)
-    if told[-1].score < LEAST_SCORE:
-        return Finding("psf", False, told[-1].score, LEAST_SCORE, "of 1", ONCE_MORE, hint=True)
+    if told[-1].most < LEAST_SCORE:
+        return Finding("psf", False, told[-1].most, LEAST_SCORE, "of 1", ONCE_MORE, hint=True)
     return Finding("psf", True, value, LEAST_SCORE, "of 1")
 
 

@@ -194,8 +194,11 @@ class Refractor:
         self._object[:] = self.model.fft.forward()
         return level
 
-    def residual(self, frame: Linear, m_dpt: float) -> None:
-        """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered."""
+    def residual(self, frame: Linear, m_dpt: float) -> float:
+        """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered.
+
+        Returns the even light that never met the diffuser, in DN.
+        """
         model, grid = self.model, self.grid
         stretch = transform(self.geometry, m_dpt)
         self.elastic.on(grid.shape, grid.n, stretch, self._otf)
@@ -204,6 +207,7 @@ class Refractor:
         level, stray = flat_fit(kernels.dots(frame.y, smooth, frame.good))
         kernels.residual(frame.y, smooth, self.seen, level, stray, (0, 0), self.fft.space)
         self.fft.forward()
+        return stray
 
     def unlikelihood(self, frame: Linear, noise: float, m_dpt: float, part: Band) -> float:
         """Minus the log evidence of a candidate in a part of the band; leaves |H|^2 in the part's `power`."""

@@ -43,6 +43,11 @@ class Statement:
     off_deg: tuple[float, float]
     wider: float
 
+    @property
+    def most(self) -> float:
+        """The score that it may be at the most, two standard deviations up: a dim frame is not a wrong PSF."""
+        return self.score + 2 * self.sd
+
 
 class Witness:
     """Asks the frames of one head, with what its Refractor has planned."""
@@ -75,16 +80,15 @@ class Witness:
 
         search = Search(unlikelihood)
         sphere_dpt = search.walk(search.ladder(of.step_dpt), of.step_dpt / 4)
-        unlikelihood(sphere_dpt)
-        score, sd = self._score(_filled(frame), noise)
+        unlikelihood(sphere_dpt)  # for its |H|^2
+        score, sd = self._score(_filled(frame) - np.float32(of.residual(frame, sphere_dpt)), noise)
         of.model.refocus(of.otf(of.grid, sphere_dpt))
         edge, per_deg = self._rim.fit(frame.y, between), of.geometry.px_per_deg / of.grid.n
         return Statement(score, sd, sphere_dpt, (edge.off[0] / per_deg, edge.off[1] / per_deg), edge.wider)
 
     def _score(self, y: Image, noise: float) -> tuple[float, float]:
         of = self._refractor
-        even = float(np.vdot(y, of.taper) / of.taper.sum())  # what is even never met the diffuser
-        np.multiply(y - np.float32(even), of.taper, out=of.fft.space)
+        np.multiply(y, of.taper, out=of.fft.space)
         seen = np.abs(of.fft.forward().ravel()[of.band.where].astype(np.complex128)) ** 2
         power = of.band.power.astype(np.float64)
         found = expected = certainty = 0.0

@@ -59,8 +59,7 @@ def test_a_good_head_is_not_doubted_by_any_eye(retina: int, m_dpt: float, record
     seen = [sight(lit(point(m_dpt), retina, light)) for light in LIGHTS]
     scores = [one.statement.score for one in seen if one.statement is not None]
     record_property("scores", scores)
-    assert min(scores) > 0.8
-    assert max(scores) < 1.3
+    assert 0.8 < min(scores) < max(scores) < 1.3
     findings = found(*seen)
     assert set(findings) == {"age", "psf", "shift", "width", "hot pixels", "black level", "dark noise"}
     assert all(one.ok and not one.remedy for one in findings.values())
