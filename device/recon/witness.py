@@ -57,7 +57,7 @@ class Witness:
         band = refractor.band
         order = np.argsort(np.hypot(band.rows, band.cols))
         self._rings = np.array_split(order, max(1, order.size // RING))
-        self._rim = Rim(refractor.model)
+        self._rim = Rim(refractor.model, refractor.low, refractor.high, refractor.taper)
 
     def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> Statement | None:
         """What a frame (rows, cols) in counts says; None where nothing shines, or too few frequencies can tell.

@@ -91,16 +91,22 @@ def test_an_axial_move_leaves_the_psf_as_it_was_and_is_seen_by_the_size_of_the_f
     assert told(frame).wider == pytest.approx(by_um / 6000, abs=0.006)
 
 
-def test_a_diffuser_pushed_aside_by_a_fifteenth_of_its_iris_is_not_noticed() -> None:
-    """200 um of 3200: fifteen sixteenths of the surface are the same, and the picture only moves."""
-    assert told(lit(misfits.slid(200.0))).score > 0.9
+@pytest.mark.parametrize(("by_um", "ok"), [(20.0, True), (50.0, False), (200.0, False)])
+def test_a_diffuser_pushed_aside_behind_its_iris_is_seen_by_where_the_picture_lies(by_um: float, ok: bool) -> None:
+    """Fifteen sixteenths of its surface are the same at 200 um, so the PSF is not blamed; 0.0127 deg to a micrometre."""
+    frame = lit(misfits.slid(by_um))
+    assert told(frame).score > 0.9
+    assert told(frame).off_deg == pytest.approx((0.0, -by_um * 0.01273), abs=0.15)
+    assert found(sight(frame))["shift"].ok is ok
 
 
-def test_a_field_that_has_moved_is_noticed_and_the_psf_is_not_blamed() -> None:
-    findings = found(sight(misfits.aside(1.0)))
-    assert findings["psf"].value > 1.0
-    assert findings["shift"].hint
-    assert found(sight(misfits.aside(0.25)))["shift"].ok
+@pytest.mark.parametrize("by_deg", [0.25, 1.0, 2.0])
+def test_a_field_that_has_moved_is_measured_and_the_psf_is_not_blamed(by_deg: float) -> None:
+    frame = misfits.aside(by_deg)
+    assert told(frame).score > 1.0
+    assert told(frame).off_deg == pytest.approx((0.0, by_deg), abs=0.06)
+    assert abs(told(frame).wider) < 0.002
+    assert found(sight(frame))["shift"].hint is (by_deg > check.OFF_DEG)
 
 
 def test_one_strange_picture_is_a_hint_two_of_three_refuse_and_new_good_ones_forgive() -> None:
