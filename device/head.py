@@ -8,7 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from device.calibration.archive import Archive, Kept
+from device.calibration.admission import refuse_old, refuse_other_mode
+from device.calibration.archive import Archive, Kept, Provenance
 from device.calibration.leds import with_measured_light
 from device.clock import Clock
 from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
@@ -48,7 +49,10 @@ class Chips:
 
 @dataclass(frozen=True)
 class Head:
-    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it."""
+    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it.
+
+    `provenance` is where that comes from; None where nobody measured it.
+    """
 
     spec: InstrumentSpec
     camera: Camera
@@ -57,6 +61,7 @@ class Head:
     chips: Chips = Chips()
     button: Button | None = None
     held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
+    provenance: Provenance | None = None
 
     @property
     def kind(self) -> str:
@@ -90,13 +95,9 @@ def is_simulated(spec: InstrumentSpec) -> bool:
 
 
 def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
-    """Refuse a calibration that this head cannot have: of another shape, simulated, or of others; HeadMismatch."""
-    found, camera, said = kept.calibration, spec.camera, kept.provenance
-    maps = [one for one in (found.dark_dn, found.flat, found.bad) if one is not None]
-    if others := {one.shape for one in (*found.psfs, *maps)} - {(camera.rows, camera.cols)}:
-        raise HeadMismatch(
-            f"the calibration of {said.serial} has the shape {max(others)}, the camera {(camera.rows, camera.cols)}"
-        )
+    """Refuse what this head cannot have: CalibrationOtherMode; HeadMismatch for a simulated one, or one of others."""
+    found, said = kept.calibration, kept.provenance
+    refuse_other_mode(found, said, spec.camera)
     if found.simulated and not is_simulated(spec):
         raise HeadMismatch(f"{found.id}, of {said.serial}, was measured on a simulated head")
     if said.origin == "imported" and not (spec.calibration and spec.calibration.imported):
@@ -157,11 +158,17 @@ class Opening:
 
     def calibration(self) -> Calibration:
         """The one in force in the archive that the head file names; without a name that of the simulated world."""
+        return self.kept.calibration if self.kept is not None else simulated_calibration(self.world)
+
+    @cached_property
+    def kept(self) -> Kept | None:
+        """What the archive holds, if it fits the head's file and is not too old; None if the file names no archive."""
         if self.spec.calibration is None:
-            return simulated_calibration(self.world)
+            return None
         kept = Archive(self.spec.calibration.archive).load()
         refuse_unfit(kept, self.spec)
-        return kept.calibration
+        refuse_old(kept.provenance, self.clock.wall())
+        return kept
 
     def lamp(self, chain: ChainSpec | None = None) -> Light:
         """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
@@ -280,7 +287,8 @@ def _opened(opening: Opening, ledger: Ledger) -> Head:
             world.electrons_per_s(colour)  # now, not while a lamp is lit
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
-    return Head(spec, camera, light, calibration, opening.chips(), opening.button())
+    known = opening.kept.provenance if opening.kept is not None else None
+    return Head(spec, camera, light, calibration, opening.chips(), opening.button(), provenance=known)
 
 
 def refuse_another_head(head: Head) -> None:
@@ -299,6 +307,9 @@ def refuse_another_head(head: Head) -> None:
             "Do not take pictures; call the technician. If this head was calibrated just now, `diffuscope calibrations "
             f"use {loaded} --archive DIR --head HEAD` tells it; another calibration is put in force the same way.",
         )
+    whose = head.provenance
+    if whose is not None and whose.origin == "measured" and whose.serial != known.serial:
+        raise HeadMismatch(f"this is head {known.serial}, loaded is the calibration of {whose.serial}")
 
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:

@@ -176,6 +176,27 @@ def _colours(words: str) -> tuple[Colour, ...]:
     return tuple(known[word] for word in named)
 
 
+@app.command("check")
+def check_head(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
+) -> None:
+    """Ask whether the calibration in force still fits the head: after a drop, or when pictures look odd.
+
+    The last captures tell; without any, dark frames are taken now. The exit status is 1 if a finding fails.
+    """
+    from services.instrument.checking import checked, table, with_archive  # the drivers, which others do not need
+
+    spec = with_archive(load_head(head), archive)
+    if spec.calibration is None:
+        raise typer.BadParameter("the head file names no archive of calibrations; give one with --archive")
+    found = checked(spec, data or _default_data(), SystemClock(), lambda line: typer.echo(line, err=True))
+    typer.echo(f"calibration {found.kept.calibration.id} of {found.kept.provenance.serial}")
+    typer.echo(table(found))
+    raise typer.Exit(1 if any(one.fails for one in found.findings) else 0)
+
+
 @app.command()
 def simulate(
     scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],

@@ -72,7 +72,7 @@ class Refraction:
 
 
 @dataclass(frozen=True)
-class _Band:
+class Band:
     """Frequencies that decide: where in the window's spectrum, in which ring, and what samples of n pixels pass."""
 
     where: NDArray[np.int64]
@@ -84,7 +84,7 @@ class _Band:
     power: Image
 
     @classmethod
-    def of(cls, window: Pair, low: float, high: float, n: int) -> "_Band":
+    def of(cls, window: Pair, low: float, high: float, n: int) -> "Band":
         """All frequencies of a window's spectrum between two, cycles per sample, in rings."""
         down = np.fft.fftfreq(window[0]).astype(np.float64)
         across = np.fft.rfftfreq(window[1]).astype(np.float64)
@@ -128,7 +128,7 @@ class Refractor:
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
         self._smooth: Image = np.zeros(self.grid.shape, np.float32)
         self._object, self._otf = (np.zeros(self.model.otf.shape, np.complex64) for _ in range(2))
-        self._seen = np.zeros(self.grid.window, np.float32)
+        self.seen = np.zeros(self.grid.window, np.float32)
 
     def _choose_frequencies(self) -> None:
         """The band that carries the speckle, in rings; and the quarter of all frequencies that carries least."""
@@ -137,29 +137,29 @@ class Refractor:
         frequency = np.hypot(rows, cols)
         power = np.abs(self.elastic.on(window, n, np.eye(2)).astype(np.complex128)) ** 2
         self.low, self.high = band(frequency, power, min(window))
-        self._band = _Band.of(window, self.low, self.high, n)
-        middle = float(np.median(frequency.ravel()[self._band.where])) if self._band.where.size else self.high
-        self._upper = _Band.of(window, middle, self.high, n)
+        self.band = Band.of(window, self.low, self.high, n)
+        middle = float(np.median(frequency.ravel()[self.band.where])) if self.band.where.size else self.high
+        self._upper = Band.of(window, middle, self.high, n)
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
 
     def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
         """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span."""
-        if self._band.where.size < LEAST_FREQUENCIES:
+        if self.band.where.size < LEAST_FREQUENCIES:
             return None
         frame = self.preparer(counts, dark)
-        np.multiply(frame.good, self.taper, out=self._seen)
-        if not self._fit_smooth(frame, self.model.stored) > 0:
+        np.multiply(frame.good, self.taper, out=self.seen)
+        if not self.fit_smooth(frame, self.model.stored) > 0:
             return None
-        self._residual(frame, 0.0)
-        noise = self._noise_power(frame)
-        coarse = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._band))
+        self.residual(frame, 0.0)
+        noise = self.noise_power(frame)
+        coarse = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self.band))
         sphere_dpt = coarse.ladder(self.step_dpt)
         if coarse.relief < LEAST_NATS:
             return None
         sphere_dpt = coarse.walk(sphere_dpt, self.step_dpt / 2)
-        self._fit_smooth(frame, self.otf(self.grid, sphere_dpt))
-        fine = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._band))
+        self.fit_smooth(frame, self.otf(self.grid, sphere_dpt))
+        fine = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self.band))
         for part in (2, 4):
             sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
         if abs(sphere_dpt) >= SPAN_DPT:
@@ -172,7 +172,7 @@ class Refractor:
 
     def _found_by_the_upper_half(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
         """The minimum downhill from a candidate when only the upper half of the band is asked."""
-        upper = _Search(lambda m_dpt: self._unlikelihood(frame, noise, m_dpt, self._upper))
+        upper = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self._upper))
         for part in (1, 2):
             sphere_dpt = upper.walk(sphere_dpt, self.step_dpt / part)
         return upper.parabola(sphere_dpt, self.step_dpt / 2)[0]
@@ -185,7 +185,7 @@ class Refractor:
         """The OTF on a grid as an eye with mean sphere M makes it."""
         return self.elastic.on(grid.shape, grid.n, transform(self.geometry, m_dpt))
 
-    def _fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
+    def fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
         """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
         self.model.refocus(otf)
         self.shading.refocus()
@@ -194,35 +194,40 @@ class Refractor:
         self._object[:] = self.model.fft.forward()
         return level
 
-    def _residual(self, frame: Linear, m_dpt: float) -> None:
-        """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered."""
+    def residual(self, frame: Linear, m_dpt: float) -> float:
+        """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered.
+
+        Returns the even light that never met the diffuser, in DN.
+        """
         model, grid = self.model, self.grid
         stretch = transform(self.geometry, m_dpt)
         self.elastic.on(grid.shape, grid.n, stretch, self._otf)
         np.multiply(self._object, self._otf, out=model.fft.spectrum)
         smooth = model.fft.inverse()[grid.slices]
         level, stray = flat_fit(kernels.dots(frame.y, smooth, frame.good))
-        kernels.residual(frame.y, smooth, self._seen, level, stray, (0, 0), self.fft.space)
+        kernels.residual(frame.y, smooth, self.seen, level, stray, (0, 0), self.fft.space)
         self.fft.forward()
+        return stray
 
-    def _unlikelihood(self, frame: Linear, noise: float, m_dpt: float, part: _Band) -> float:
-        self._residual(frame, m_dpt)
+    def unlikelihood(self, frame: Linear, noise: float, m_dpt: float, part: Band) -> float:
+        """Minus the log evidence of a candidate in a part of the band; leaves |H|^2 in the part's `power`."""
+        self.residual(frame, m_dpt)
         stretch = transform(self.geometry, m_dpt)
         otf = self.elastic.at(part.rows, part.cols, part.share, self.grid.n, stretch)
         return sweeps.unlikelihood(
             self.fft.spectrum, otf, part.where, part.ring, noise, SMEAR, TURNS, self._levels, part.energy, part.power
         )
 
-    def _noise_power(self, frame: Linear) -> float:
+    def noise_power(self, frame: Linear) -> float:
         """Noise per frequency of the tapered window, from the sensor's gain or from the silent frequencies."""
         silent = np.abs(self.fft.spectrum.ravel()[self._silent].astype(np.complex128)) ** 2
-        weight = float(np.vdot(self._seen, self._seen))
+        weight = float(np.vdot(self.seen, self.seen))
         noise = Noise.of(self.sensor, self.grid.n, float(np.median(silent)) / np.log(2) / weight, frame.mean_dn)
-        lit = float(np.einsum("ij,ij,ij->", frame.y, self._seen, self._seen))
+        lit = float(np.einsum("ij,ij,ij->", frame.y, self.seen, self.seen))
         return max(noise.per_dn * lit + noise.floor_dn2 * weight, 1e-20)
 
 
-class _Search:
+class Search:
     """The search for a minimum on a line that costs one evaluation per new candidate."""
 
     def __init__(self, value: Callable[[float], float]) -> None:

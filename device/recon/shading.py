@@ -36,10 +36,10 @@ class Shading:
         top, bottom, left, right = self.box
         self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
         spectra, seen = [], []
-        for row, mode in zip(self._modes, _modes(model) if known else [model.mask], strict=True):
+        for row, mode in zip(self._modes, modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
             spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
-            seen.append(_blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
+            seen.append(blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
         self._spectra = np.asarray(spectra, np.complex64)
         self._ridge = np.full(count + known, RIDGE)
         self._ridge[count:] = STRAY_RIDGE
@@ -93,7 +93,7 @@ class Shading:
 
     def fit(self, y: Image, out: Image) -> tuple[float, float]:
         """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN."""
-        coefficients = (self._inverse @ (self._weighted @ _blocks(y, self._block).ravel())).astype(np.float32)
+        coefficients = (self._inverse @ (self._weighted @ blocks(y, self._block).ravel())).astype(np.float32)
         top, bottom, left, right = self.box
         out[:] = 0
         smooth = coefficients[: len(self._modes)] @ self._modes
@@ -102,14 +102,15 @@ class Shading:
         return float(coefficients[0]), stray
 
 
-def _blocks(image: Image, n: int) -> Image:
+def blocks(image: Image, n: int) -> Image:
+    """Means over n x n samples; what is left over at the far edges is cut off."""
     rows, cols = (size // n for size in image.shape)
     cut = image[: rows * n, : cols * n].reshape(rows, n, cols, n)
     means: Image = cut.mean(axis=(1, 3))
     return means
 
 
-def _modes(model: Model) -> Iterator[Image]:
+def modes(model: Model) -> Iterator[Image]:
     """Zernike polynomials up to DEGREE on the field's disc, the even field first; computed only where the disc is."""
     top, bottom, left, right = model.box
     v = (np.arange(top, bottom)[:, None] - model.grid.centre[0]) / model.grid.radius_samples

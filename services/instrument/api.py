@@ -49,6 +49,7 @@ from device.errors import (
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
 from services.instrument.exam import Exam
+from services.instrument.fitness import shown as shown_findings
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
@@ -248,12 +249,17 @@ def _state(app: FastAPI, exam: Exam) -> None:
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
             "swept": exam.store.swept, "space_left": exam.store.space_left(),
             "problem": words(problem) if problem else None,
+            "notices": [one.remedy for one in exam.fitness.findings if not one.ok],
         }  # fmt: skip
 
     @app.get("/api/health")
     def health() -> dict[str, Any]:
-        """Whether it can take pictures now."""
-        return {"ok": exam.problem is None, "state": exam.state, "space_left": exam.store.space_left()}
+        """Whether it can take pictures now, and what was found about the calibration."""
+        findings = exam.fitness.findings
+        return {
+            "ok": exam.problem is None and not any(one.fails for one in findings), "state": exam.state,
+            "space_left": exam.store.space_left(), "calibration": shown_findings(findings),
+        }  # fmt: skip
 
 
 def _live(app: FastAPI, exam: Exam) -> None:

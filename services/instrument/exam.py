@@ -28,6 +28,7 @@ from device.sequence import lit
 from device.values import EYES, Calibration, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
+from services.instrument.fitness import Fitness
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.store import Store
@@ -99,6 +100,7 @@ class Exam:
         self._preview = Preview(0, b"", 0.0)
         self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
+        self.fitness = Fitness(head, store, bulletin, clock, lambda: self._press is not None or self._closing)
         self._owner = Thread(target=self._own_the_head, name="head", daemon=True)
         self._owner.start()
 
@@ -119,6 +121,8 @@ class Exam:
     def press(self, eye: Eye, key: str | None = None) -> Future[Capture]:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
+        Raises CalibrationOld or CalibrationStale where no picture should rest on the calibration.
+
         The same `key` again gives the same picture, however often the network repeats the request.
         """
         with self._turn:
@@ -128,6 +132,7 @@ class Exam:
                 raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
             if self._is_busy():
                 raise Busy("a picture is being taken")
+            self.fitness.refuse()
             self._press = _Press(Future(), eye)
             future = self._press.answer
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
@@ -190,6 +195,7 @@ class Exam:
         self._reconstructor = self._live = Reconstructor(calibration, shape, planner, self.clock, recipes, index)
         if live.psfs[0] is not calibration.psfs[0]:  # aiming has a colour, and that colour a PSF, of its own
             self._live = Reconstructor(live, shape, planner, self.clock, recipes[:1], refract=False)
+        self.fitness.begin(self._reconstructor.refractor)
 
     def _best_psf(self, calibration: Calibration, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
@@ -216,6 +222,8 @@ class Exam:
                     return self._answer
                 if self._exposed:
                     return self._develop
+                if self.fitness.due and not self._closing:
+                    return self.fitness.step
                 if self.clock.now_s() < self._wanted_until_s:
                     return self._look
                 self._turn.wait(BEAT_S)
@@ -283,6 +291,7 @@ class Exam:
         self._tell_stage(shot.id, "keep", 0.9)
         kept = self.store.keep(capture, self._files(shot, capture, made))
         self.bulletin.tell("kept", id=shot.id)
+        self.fitness.kept(kept)
         return kept
 
     def _expose(self, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:

@@ -1,7 +1,7 @@
 """`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
 
 Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration` or `scaling`.
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness` or `scaling`.
 """
 
 import os
@@ -13,11 +13,11 @@ from pathlib import Path
 from device.recon.plan import Planner, processor
 from device.sim.staged import staged
 from device.spec import load_head
-from tests.bench import calibration, camera, deadline, peers, scaling, simulator, speed
+from tests.bench import calibration, camera, deadline, fitness, peers, scaling, simulator, speed
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "scaling")
+PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling")
 
 
 def main(parts: list[str]) -> None:
@@ -28,25 +28,30 @@ def main(parts: list[str]) -> None:
     print(f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {platform.platform()}")
     planner = Planner(PLANS)
     if {"speed", "deadline", "peers"} & set(wanted):
-        scene = staged(load_head(SCENE))
-        if "speed" in wanted:
-            speed.closed_forms(scene, planner)
-            speed.rounds(scene, planner)
-            speed.refraction(scene, planner)
-            speed.libraries()
-        if "deadline" in wanted:
-            deadline.deadlines(scene, planner)
-        if "peers" in wanted:
-            peers.peers(scene, planner)
+        _on_one_scene(wanted, planner)
     if "camera" in wanted:
         camera.camera()
     if "simulator" in wanted:
         simulator.simulator()
-    if "calibration" in wanted:
-        calibration.calibration(planner)
+    for name, part in {"calibration": calibration.calibration, "fitness": fitness.fitness}.items():
+        if name in wanted:
+            part(planner)
     if "scaling" in wanted:
         scaling.scaling(PLANS)
     print(f"\npeak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+
+
+def _on_one_scene(wanted: list[str], planner: Planner) -> None:
+    scene = staged(load_head(SCENE))
+    if "speed" in wanted:
+        speed.closed_forms(scene, planner)
+        speed.rounds(scene, planner)
+        speed.refraction(scene, planner)
+        speed.libraries()
+    if "deadline" in wanted:
+        deadline.deadlines(scene, planner)
+    if "peers" in wanted:
+        peers.peers(scene, planner)
 
 
 if __name__ == "__main__":

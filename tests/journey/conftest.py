@@ -153,7 +153,7 @@ MakeRig = Callable[..., Rig]
 
 @pytest.fixture(scope="session")
 def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
-    """Build an instrument: `camera` wraps the simulated one, `store` gives its options, `max_on_s` is the guard's."""
+    """Build an instrument: `camera` wraps the simulated one, `max_on_s` is the guard's, `head` changes it."""
     dark_world, calibration = template
 
     def built(
@@ -167,6 +167,7 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         psfs: int = 1,
         tinted: tuple[Colour, ...] = (),
         watchdog: str | None = None,
+        head: Callable[[Head], Head] = lambda head: head,
     ) -> Rig:
         clock, died = GateClock(), Event()
         scene = copy(dark_world)
@@ -179,9 +180,9 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         if tinted:
             own = tuple(Psf(fitted(scene.psf(colour), scene.shape), colour, colour) for colour in tinted)
             stack = replace(calibration, psfs=own)
-        head = Head(scene.spec, camera(SimCamera(scene)), light, stack)
+        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack))
         bulletin = bulletin or Bulletin()
-        exam = Exam(head, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
+        exam = Exam(opened, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)

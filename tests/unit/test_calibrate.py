@@ -9,7 +9,14 @@ import pytest
 from device.calibration.archive import Archive
 from device.calibration.procedure import Job, Operator, Procedure, Stand
 from device.clock import VirtualClock
-from device.errors import CalibrationMissing, CalibrationRefused, CameraStalled, HeadMismatch, SpecError
+from device.errors import (
+    CalibrationMissing,
+    CalibrationOtherMode,
+    CalibrationRefused,
+    CameraStalled,
+    HeadMismatch,
+    SpecError,
+)
 from device.head import Head, Opening, is_simulated, open_head
 from device.ledger import MemoryLedger
 from device.sim import stage
@@ -216,7 +223,7 @@ def test_a_real_head_needs_no_simulated_calibration_and_refuses_one(quick: Table
     archive = quick.archive
     made = archive.load(quick.run())
     with Opening(spec, VirtualClock()) as opening:
-        with pytest.raises(HeadMismatch, match="shape"):
+        with pytest.raises(CalibrationOtherMode, match="pixels"):
             opening.calibration()
         psf = Psf(np.ones((spec.camera.rows, spec.camera.cols), np.float32))
         archive.keep(Calibration((psf,), Sensor(), simulated=True), made.provenance)
