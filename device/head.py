@@ -58,10 +58,8 @@ class Head:
 
     @property
     def kind(self) -> str:
-        """`simulated`, `recording` or `real`: what the page must say about every picture."""
-        if self.spec.camera.backend == "replay":
-            return "recording"
-        return "simulated" if is_simulated(self.spec) else "real"
+        """What the page must say about every picture."""
+        return kind_of(self.spec)
 
     def check(self) -> None:
         """Before every picture: TooHot or PowerLow if the head had better rest, BusFault if it cannot say."""
@@ -79,6 +77,13 @@ class Head:
             self.light.off()
         finally:
             self.held.close()
+
+
+def kind_of(spec: InstrumentSpec) -> str:
+    """`simulated`, `recording` or `real`."""
+    if spec.camera.backend == "replay":
+        return "recording"
+    return "simulated" if is_simulated(spec) else "real"
 
 
 def is_simulated(spec: InstrumentSpec) -> bool:

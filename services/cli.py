@@ -126,6 +126,9 @@ def calibrate_head(
     source_deg: Annotated[
         float | None, typer.Option(min=0, max=5, help="Width of the point source; 275 um behind a 25 mm lens: 0.63.")
     ] = None,
+    mishap: Annotated[
+        list[str] | None, typer.Option(help="Let a step of a simulated head go wrong, such as point=moving.")
+    ] = None,
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
@@ -133,7 +136,9 @@ def calibrate_head(
     def ask(said: str) -> None:
         typer.prompt(f"{said} Then press Enter", default="", show_default=False)
 
-    kept = calibrate(load_head(head), Wish(archive, serial, by, source_deg), SystemClock(), ask, typer.echo)
+    mishaps = {stand: name for stand, _, name in (said.partition("=") for said in mishap or ())}
+    wish = Wish(archive, serial, by, source_deg, mishaps)
+    kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
     sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
     typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")
     typer.echo(f"read noise {sensor.read_noise_e:.2f} e-, " + ", ".join(f"{k} {v:.3g}" for k, v in known.items()))
