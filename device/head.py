@@ -226,10 +226,15 @@ class Bench:
         self.held.close()
 
 
-def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
-    """Open a head that has no calibration yet; SpecError for a recording, which nobody can put a cap on."""
+def refuse_recording(spec: InstrumentSpec) -> None:
+    """SpecError for a recording, which nobody can put a cap on."""
     if spec.camera.backend == "replay":
-        raise SpecError(f"{spec.name} is a recording", "Give the file of a head with --head.")
+        raise SpecError(f"{spec.name} is a recording: it cannot be calibrated", "Give the file of a head with --head.")
+
+
+def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
+    """Open a head that has no calibration yet; SpecError for a recording."""
+    refuse_recording(spec)
     with Opening(spec, clock, allocator) as opening:
         lamp = opening.lamp()
         lamp.off()

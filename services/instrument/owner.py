@@ -10,7 +10,7 @@ from threading import Lock
 from device.calibration.archive import Archive
 from device.clock import Clock
 from device.errors import Busy, CalibrationError, DiffuscopeError, HeadMismatch
-from device.head import Bench, Head
+from device.head import Bench, Head, refuse_recording
 from device.spec import CalibrationTable, InstrumentSpec
 from services.instrument.bulletin import Bulletin
 from services.instrument.calibrating import Wish
@@ -103,6 +103,7 @@ class Owner:
 
     def calibrate(self, wish: Wish | Back) -> None:
         """Begin a calibration: the exam finishes what is under way and hands over the head. Busy if one is going on."""
+        refuse_recording(self.house.spec)
         with self._lock:
             if self._closing:
                 raise Busy("the instrument is being switched off", "Wait until it is back.")
@@ -154,10 +155,9 @@ class Owner:
         )
 
     def _wizard_ended(self, wizard: Wizard) -> None:
-        """The exam has the head again, perhaps with another calibration."""
+        """The exam has the head again, perhaps with another calibration; until then the wizard is said to have it."""
         with self._lock:
-            self.wizard = None
-            if wizard.result is not None:
+            if wizard.result is not None and wizard.made:
                 self.made = wizard.result.calibration.id
             if self._closing:
                 return
@@ -176,7 +176,7 @@ class Owner:
 
     def _begin(self) -> None:
         try:
-            self._exam, self.needed = self._open_exam(), None
+            self._exam, self.needed, self.wizard = self._open_exam(), None, None
         except (CalibrationError, HeadMismatch) as error:
             log.warning("the wizard is needed: %s", error)
             self.needed = error

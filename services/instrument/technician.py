@@ -85,6 +85,14 @@ class Door:
         with self._lock:
             self._refuse_strangers(token)
 
+    def knows(self, token: str | None) -> bool:
+        """Whether this is the token of who is inside."""
+        try:
+            self.refuse_strangers(token)
+        except TechnicianLocked:
+            return False
+        return True
+
     def touch(self, token: str | None) -> None:
         """The technician does something: the door stays open for another while. Looking on is not enough."""
         with self._lock:

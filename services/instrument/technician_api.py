@@ -9,7 +9,7 @@ from fastapi import APIRouter, Cookie, Depends, FastAPI, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from device.calibration.archive import Archive, Kept
-from device.errors import CalibrationError, DiffuscopeError, HeadMismatch
+from device.errors import Busy, CalibrationError, DiffuscopeError, HeadMismatch
 from device.head import kind_of
 from device.sim.mishaps import MISHAPS
 from services.instrument.calibrating import Wish
@@ -78,9 +78,9 @@ def _door(door: Door, acting: Any) -> APIRouter:
         return {"open": True}
 
     @router.get("")
-    def door_state() -> dict[str, Any]:
-        """Whether a PIN was ever set, and how long the next try has to wait."""
-        return {"has_pin": door.has_pin, "wait_s": round(door.wait_s, 1), "idle_s": IDLE_S}
+    def door_state(token: Token = None) -> dict[str, Any]:
+        """Whether it is open for who asks, whether a PIN was ever set, and how long the next try has to wait."""
+        return {"open": door.knows(token), "has_pin": door.has_pin, "wait_s": round(door.wait_s, 1), "idle_s": IDLE_S}
 
     @router.post("/pin")
     def set_pin(pin: Pin, response: Response, token: Token = None) -> dict[str, Any]:
@@ -123,8 +123,10 @@ def _calibration(owner: Owner, inside: Any, acting: Any) -> APIRouter:
     @router.post("/ready", dependencies=[acting])
     def ready(ready: Ready) -> dict[str, Any]:
         """What was asked for stands there: measure it."""
-        if owner.wizard is not None:
-            owner.wizard.ready(ready.stand, ready.mishap)
+        wizard = owner.wizard
+        if wizard is None:
+            raise Busy("nothing is being calibrated", "Start the calibration first.")
+        wizard.ready(ready.stand, ready.mishap)
         return told(owner)
 
     @router.post("/cancel", dependencies=[acting])
@@ -142,7 +144,8 @@ def _calibration(owner: Owner, inside: Any, acting: Any) -> APIRouter:
     @router.get("/preview", dependencies=[inside])
     def preview(after: int = Query(0, ge=0)) -> Response:
         """The next raw picture after number `after`, with its levels; 204 when none comes in 2 s."""
-        sight = owner.wizard.look(after) if owner.wizard is not None else None
+        wizard = owner.wizard
+        sight = wizard.look(after) if wizard is not None else None
         if sight is None:
             return Response(status_code=204)
         age_ms = max(0, round((owner.house.clock.now_s() - sight.seen_s) * 1000))
@@ -158,7 +161,8 @@ def _calibration(owner: Owner, inside: Any, acting: Any) -> APIRouter:
 def told(owner: Owner) -> dict[str, Any]:
     """The wizard's state as JSON."""
     spec, archive, problem = owner.house.spec, owner.house.archive, owner.problem
-    now = owner.wizard.told() if owner.wizard is not None else _IDLE | {"state": owner.idle_state}
+    wizard = owner.wizard
+    now = wizard.told() if wizard is not None else _IDLE | {"state": owner.idle_state}
     kept = _listed(archive)
     in_force = next((one for one in kept if one["in_force"]), None)
     needed = problem if isinstance(problem, CalibrationError | HeadMismatch) else None

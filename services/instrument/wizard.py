@@ -15,7 +15,7 @@ from typing import Any, get_args
 from device.calibration.archive import Archive, Kept
 from device.calibration.procedure import BRACKETS, FRAMES, LEVELS, MANY, Job, Operator, Procedure, Stand
 from device.clock import Clock
-from device.errors import Busy, CalibrationStopped, DiffuscopeError, SettingError
+from device.errors import Busy, CalibrationStopped, DiffuscopeError, SettingError, StoreFull
 from device.head import Bench
 from device.sim.mishaps import MISHAPS, mend, spoil
 from device.spec import InstrumentSpec
@@ -55,8 +55,9 @@ class _Now:
 class Wizard:
     """One calibration, from opening the bench to the new one in force; `ended` is called once the head is free again.
 
-    `result` is what was kept; `failure` why it ended otherwise, None if the technician stopped it; `broken` says that
-    nobody foresaw that failure.
+    Without a wish it is there because no picture can be taken, and waits until somebody starts it.
+    `result` is what is in force now, `made` whether it was measured for that; `failure` why it ended otherwise, None if
+    the technician stopped it; `broken` says that nobody foresaw that failure.
     """
 
     def __init__(
@@ -65,9 +66,11 @@ class Wizard:
     ) -> None:  # fmt: skip
         self.spec, self.archive, self.clock = spec, archive, clock
         self.result: Kept | None = None
+        self.made = False
         self.failure: DiffuscopeError | None = None
         self.broken = False
         self._bench, self._watchdog, self._wish, self._ended = bench, watchdog, wish, ended
+        self._needed = wish is None
         self._turn = Condition()
         self._now = _Now()
         self._ready = self._stopping = self._asked_since = False
@@ -148,11 +151,14 @@ class Wizard:
         wish = self._await_wish()
         self._asked_since = False
         try:
+            self.made = isinstance(wish, Wish)
             self.result = self._measured(bench, wish) if isinstance(wish, Wish) else self._back(bench, wish)
         except CalibrationStopped:
             raise
         except DiffuscopeError as error:
             log.warning("calibration: %s", error)
+            if not self._asked_since and not self._needed:
+                raise  # the exam can have the head back
             with self._turn:
                 self._now.error = error
                 if not self._asked_since:  # it would only happen again: let the technician begin anew
@@ -164,7 +170,12 @@ class Wizard:
         operator = Operator(lambda stand: self._put(bench, stand), log.info, self._note)
         work = self.archive.root / WORK
         procedure = Procedure(job, self._peephole, operator, self.clock, work, bench.chips.thermometer)
-        kept = self.archive.load(procedure.run(self.archive))
+        try:
+            kept = self.archive.load(procedure.run(self.archive))
+        except DiffuscopeError:
+            raise
+        except OSError as error:
+            raise StoreFull(f"what was measured cannot be kept: {error}") from error
         note_in_head(bench, kept)
         return kept
 
