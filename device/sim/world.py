@@ -28,7 +28,7 @@ class World:
     `eye` is that of the procedural retina; `choose` decides which effects each colour of light calls for;
     `ambient_e_per_s` is light that comes without the lamp, beside what the scene says. `stage` is the light of what
     stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it, and it
-    moves by `shake_px` columns from one frame to the next.
+    moves by `shake_px` columns and back from one frame to the next.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "camera.mode" (it gives every other pixel),
     "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent".
     """
@@ -130,7 +130,7 @@ class World:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
         if self.stage is not None:
             dark_e_per_s = np.float32(self.setup(self.spec.light.colour).dark_e_per_s)
-            there = np.roll(self.stage, self.shake_px * self.frames, axis=1) if self.shake_px else self.stage
+            there = np.roll(self.stage, self.shake_px, axis=1) if self.frames % 2 else self.stage
             return (there + dark_e_per_s) * np.float32(exposure_s)
         always_e = np.asarray((self._always_e_per_s + self.ambient_e_per_s) * exposure_s, np.float32)
         glow = self.glow  # once: a guard may darken the lamp at any moment

@@ -95,11 +95,12 @@ class Wizard:
         if mishap is not None and (self.spec.camera.backend != "sim" or mishap not in MISHAPS):
             raise SettingError(f"{mishap!r} cannot go wrong on this head", "Leave it out.")
         with self._turn:
-            if self._now.state != "asking" or self._ready:
+            if self._now.state != "asking":
                 raise Busy("nothing is asked for now", "Wait until the page asks for something.")
             if stand != self._now.stand:
                 raise Busy(f"this step wants the {self._now.stand}, not the {stand}", "Read the page again.")
             self._ready, self._mishap = True, mishap
+            self._now.state, self._now.error, self._now.frames = "measuring", None, 0
             self._turn.notify_all()
 
     def stop(self) -> None:
@@ -201,8 +202,6 @@ class Wizard:
             self._ready, self._asked_since = False, True
             self._now.state, self._now.stand, self._now.frames = "asking", stand, 0
         self._show_until_ready()
-        with self._turn:
-            self._now.state, self._now.error, self._now.frames = "measuring", None, 0
         if bench.world is not None and self._mishap is not None:
             spoil(bench.world, self._mishap)
 

@@ -80,9 +80,14 @@ class Shop:
 
     def asked(self) -> str:
         """Wait until something is asked for, or the wizard has ended; what."""
-        until(lambda: self.state()["state"] not in ("measuring", "begin"), 60)
-        said = self.state()
-        return said["stand"] if said["state"] == "asking" else str(said["state"])
+        said: list[dict[str, Any]] = []
+
+        def settled() -> bool:
+            said.append(self.state())
+            return said[-1]["state"] not in ("measuring", "begin")
+
+        until(settled, 60)
+        return str(said[-1]["stand"] if said[-1]["state"] == "asking" else said[-1]["state"])
 
     def ready(self, stand: str, **more: str) -> None:
         self.post("/api/calibration/ready", {"stand": stand} | more)
@@ -270,6 +275,7 @@ def test_back_to_an_earlier_one_and_forward_again(make_shop: MakeShop) -> None:
     assert first != second
     assert [one["id"] for one in shop.state()["kept"]] == [second, first]
     for id in (first, second):
+        until(lambda: shop.state()["state"] == "idle")
         said = shop.post("/api/calibration/use", {"id": id})
         assert said["in_force"]["id"] == id
         memory = shop.benches[-1].chips.memory
