@@ -26,7 +26,12 @@ DiffuscopeError
 │   ├── CalibrationOtherMode     it was measured in another sensor mode than the head's file says
 │   ├── CalibrationFormat        it was kept by another version of this software
 │   ├── CalibrationUntrusted     nobody whom we trust has signed it as it is
-│   └── CalibrationRefused       what stands before the head is not what this step measures
+│   ├── CalibrationRefused       what stands before the head is not what this step measures
+│   └── CalibrationStopped       the technician stopped it
+├── TechnicianError              the technician's door
+│   ├── TechnicianLocked         nobody has said the PIN, or too long ago
+│   ├── PinWrong                 that is not the PIN, or cannot be one
+│   └── PinTooSoon               wrong ones came too often: wait
 ├── Busy                         the instrument is doing something else
 └── StoreError                   the shelf
     ├── StoreFull                no room left
@@ -233,6 +238,41 @@ class CalibrationRefused(CalibrationError):
 
     code = "calibration.refused"
     default_remedy = "Put right what stands before the head, then start `diffuscope calibrate` again: it goes on here."
+
+
+class CalibrationStopped(CalibrationError):
+    """The technician stopped a calibration; what was measured is kept, and the old one stays in force."""
+
+    code = "calibration.stopped"
+    default_remedy = "Start the calibration again when you are ready: it goes on where it was."
+
+
+class TechnicianError(DiffuscopeError):
+    """The technician's door stays shut."""
+
+    code = "technician"
+    default_remedy = "Go back to the pictures, or call the technician."
+
+
+class TechnicianLocked(TechnicianError):
+    """Nobody has said the PIN, or nobody has touched the page for too long."""
+
+    code = "technician.locked"
+    default_remedy = "Give the technician's PIN."
+
+
+class PinWrong(TechnicianError):
+    """That is not the PIN, or it cannot be one."""
+
+    code = "technician.pin"
+    default_remedy = "Give the PIN that was set on this device: 4 to 12 digits."
+
+
+class PinTooSoon(TechnicianError):
+    """Too many wrong PINs: the next try has to wait."""
+
+    code = "technician.wait"
+    default_remedy = "Wait until the time is over, then try again."
 
 
 class Busy(DiffuscopeError):

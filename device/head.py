@@ -65,10 +65,8 @@ class Head:
 
     @property
     def kind(self) -> str:
-        """`simulated`, `recording` or `real`: what the page must say about every picture."""
-        if self.spec.camera.backend == "replay":
-            return "recording"
-        return "simulated" if is_simulated(self.spec) else "real"
+        """What the page must say about every picture."""
+        return kind_of(self.spec)
 
     def check(self) -> None:
         """Before every picture: TooHot or PowerLow if the head had better rest, BusFault if it cannot say."""
@@ -86,6 +84,13 @@ class Head:
             self.light.off()
         finally:
             self.held.close()
+
+
+def kind_of(spec: InstrumentSpec) -> str:
+    """`simulated`, `recording` or `real`."""
+    if spec.camera.backend == "replay":
+        return "recording"
+    return "simulated" if is_simulated(spec) else "real"
 
 
 def is_simulated(spec: InstrumentSpec) -> bool:
@@ -251,10 +256,15 @@ class Bench:
         self.held.close()
 
 
-def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
-    """Open a head that has no calibration yet; SpecError for a recording, which nobody can put a cap on."""
+def refuse_recording(spec: InstrumentSpec) -> None:
+    """SpecError for a recording, which nobody can put a cap on."""
     if spec.camera.backend == "replay":
-        raise SpecError(f"{spec.name} is a recording", "Give the file of a head with --head.")
+        raise SpecError(f"{spec.name} is a recording: it cannot be calibrated", "Give the file of a head with --head.")
+
+
+def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
+    """Open a head that has no calibration yet; SpecError for a recording."""
+    refuse_recording(spec)
     with Opening(spec, clock, allocator) as opening:
         lamp = opening.lamp()
         lamp.off()

@@ -153,6 +153,9 @@ def calibrate_head(
     leds: Annotated[
         Path | None, typer.Option(help="TOML with what a meter said of each LED; trims the ring, tells the guard.")
     ] = None,
+    mishap: Annotated[
+        list[str] | None, typer.Option(help="Let a step of a simulated head go wrong, such as point=moving.")
+    ] = None,
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
@@ -160,7 +163,8 @@ def calibrate_head(
     def ask(said: str) -> None:
         typer.prompt(f"{said} Then press Enter", default="", show_default=False)
 
-    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds)
+    mishaps = {stand: name for stand, _, name in (said.partition("=") for said in mishap or ())}
+    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps)
     kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
     sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
     typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")

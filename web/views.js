@@ -309,6 +309,7 @@ function menu({ theme, letters, status }, act) {
           (key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`,
         )}
       </dl>
+      <p><a href="/technician">${t("menu.technician")}</a></p>
       <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
       <button class="primary" type="button" @click=${act.closeMenu}>${t("menu.close")}</button>
     </dialog>

@@ -112,6 +112,7 @@ const ENGLISH = {
   "key.zero.what": "Show all",
   "key.rn": "R and N",
   "key.rn.what": "Take again, next",
+  "menu.technician": "For the technician: calibration",
   "menu.version": "Version {version}",
 };
 

@@ -48,10 +48,14 @@ MOVED_BRACKETS = BRACKETS[:2]  # a scale needs no tails
 
 @dataclass(frozen=True)
 class Operator:
-    """Whoever changes what stands before the head: `put` returns when it is there, `tell` says how it goes."""
+    """Whoever changes what stands before the head: `put` returns when it is there, `tell` says how it goes.
+
+    `found` hears the figures of each step, measured now or before; of a map of pixels how many are marked.
+    """
 
     put: Callable[[Stand], None]
     tell: Callable[[str], None]
+    found: Callable[[Stand, dict[str, float]], None] = lambda stand, figures: None
 
 
 @dataclass(frozen=True)
@@ -140,6 +144,7 @@ class Procedure:
         found = self.steps.taken_up(name, kind)
         if found is not None:
             self.operator.tell(f"{name}: measured before, taken up again")
+            self.operator.found(stand, numbers_of(found))
             return found
         self.operator.put(stand)
         if self.raws is not None:
@@ -147,6 +152,7 @@ class Procedure:
         measured = measure()
         self.steps.keep(name, measured)
         self.operator.tell(f"{name}: done")
+        self.operator.found(stand, numbers_of(measured))
         return measured
 
     def _dioptres(self, darks: Darks, flats: Flats, point: Point, geometry: Geometry) -> Dioptres:
@@ -253,8 +259,8 @@ class Procedure:
         good, top_dn = ~darks.hot, self.job.spec.camera.white_dn - darks.black_dn
         exposure_s = min(self.job.spec.camera.exposure_s, longest_s)
         for _ in range(10):
-            (frame,) = self._frames(exposure_s, 1)
-            signal_dn = float(np.percentile((frame.counts - darks.at(exposure_s))[good], percentile))
+            seen = self._moments(exposure_s, 1)  # which refuses a frame of another mode, or in the lamp's light
+            signal_dn = float(np.percentile((seen.mean_dn - darks.at(exposure_s))[good], percentile))
             share = signal_dn / top_dn
             if 0.9 * filled < share < 1.1 * filled:
                 break
@@ -294,6 +300,17 @@ def _read_noise_e(darks: Darks, gain_e_per_dn: float) -> float:
     """Without the shot noise of what warmth brought in the shortest exposure; electrons."""
     warmth_e = darks.dark_dn_per_s * darks.shortest_s * gain_e_per_dn
     return sqrt(max((darks.read_noise_dn * gain_e_per_dn) ** 2 - max(warmth_e, 0.0), 0.0))
+
+
+def numbers_of(step: Darks | Flats | Point) -> dict[str, float]:
+    """The single numbers of a step, and of each map of marked pixels their count."""
+    found: dict[str, float] = {}
+    for key, value in vars(step).items():
+        if isinstance(value, float):
+            found[key] = value
+        elif isinstance(value, np.ndarray) and value.dtype == bool:
+            found[key] = float(value.sum())
+    return found
 
 
 def _figures(darks: Darks, flats: Flats, point: Point) -> dict[str, float]:

@@ -18,7 +18,7 @@ from device.spec import InstrumentSpec, OpticsSpec
 from device.values import Charge, Colour, Eye, Geometry, Glow, Identity, Image
 
 REFERENCE_C = 25.0  # where a scene's dark current is that of its file
-FAULTS = frozenset({"camera.missing", "camera.stalled", "light.fault", "light.silent", "bus.silent"})
+FAULTS = frozenset({"camera.missing", "camera.stalled", "camera.mode", "light.fault", "light.silent", "bus.silent"})
 
 Choice = Callable[[Scene], tuple[Decision, ...]]
 
@@ -28,9 +28,10 @@ class World:
 
     `eye` is that of the procedural retina; `choose` decides which effects each colour of light calls for;
     `ambient_e_per_s` is light that comes without the lamp, beside what the scene says. `stage` is the light of what
-    stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it.
-    `faults` holds what is broken now: "camera.missing", "camera.stalled", "light.fault", "light.silent"
-    (nothing reaches the LEDs, which keep what they show), "bus.silent".
+    stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it, and it
+    moves by `shake_px` columns and back from one frame to the next.
+    `faults` holds what is broken now: "camera.missing", "camera.stalled", "camera.mode" (it gives every other pixel),
+    "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent".
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class World:
         self.ambient_e_per_s = ambient_e_per_s
         self.glow: Glow | None = None
         self.stage: Image | None = None
+        self.shake_px = 0
         self.faults: set[str] = set()
         self.frames = 0
         self.celsius, self.charge = REFERENCE_C, Charge(0.775, 3.88)
@@ -128,7 +130,8 @@ class World:
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""
         if self.stage is not None:
-            return (self.stage + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
+            there = np.roll(self.stage, self.shake_px, axis=1) if self.frames % 2 else self.stage
+            return (there + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
         always_e_per_s = self.dark_e_per_s + self._room_e_per_s + self.ambient_e_per_s
         always_e = np.asarray(always_e_per_s * exposure_s, np.float32)
         glow = self.glow  # once: a guard may darken the lamp at any moment

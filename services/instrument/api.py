@@ -29,6 +29,7 @@ from device.errors import (
     CalibrationOtherMode,
     CalibrationRefused,
     CalibrationStale,
+    CalibrationStopped,
     CalibrationUntrusted,
     CameraMissing,
     CameraPacked,
@@ -40,16 +41,23 @@ from device.errors import (
     LightFault,
     LightLimit,
     NotKept,
+    PinTooSoon,
+    PinWrong,
     PowerLow,
     StoreDamaged,
     StoreError,
     StoreFull,
+    TechnicianLocked,
     TooHot,
 )  # fmt: skip
+from device.head import kind_of
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
-from services.instrument.exam import Exam
 from services.instrument.fitness import shown as shown_findings
+from services.instrument.owner import Owner
+from services.instrument.technician import Door
+from services.instrument.technician_api import technician_routes
+from services.records.store import Store
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
@@ -72,7 +80,11 @@ STATUS: dict[type[DiffuscopeError], int] = {
     CalibrationUntrusted: 423,
     CalibrationOld: 423,
     CalibrationStale: 423,
+    CalibrationStopped: 423,
     CalibrationOtherMode: 423,
+    TechnicianLocked: 401,
+    PinWrong: 403,
+    PinTooSoon: 429,
     StoreFull: 507,
     StoreDamaged: 500,
     DiffuscopeError: 500,
@@ -107,13 +119,13 @@ class Press(BaseModel):
     key: str | None = Field(default=None, pattern="^[0-9a-f]{16}$")
 
 
-def create_app(exam: Exam) -> FastAPI:
-    """The application around one exam."""
+def create_app(owner: Owner, door: Door) -> FastAPI:
+    """The application around whoever has the head."""
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         yield
-        exam.bulletin.close()
+        owner.house.bulletin.close()
 
     app = FastAPI(
         title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
@@ -121,9 +133,10 @@ def create_app(exam: Exam) -> FastAPI:
     )  # fmt: skip
     _words_for_errors(app)
     app.add_middleware(SafeHeaders)
-    _captures(app, exam)
-    _state(app, exam)
-    _live(app, exam)
+    _captures(app, owner)
+    _state(app, owner)
+    _live(app, owner)
+    technician_routes(app, owner, door)
     _page(app)
     return app
 
@@ -212,13 +225,13 @@ def shown(capture: Capture) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _captures(app: FastAPI, exam: Exam) -> None:
-    store = exam.store
+def _captures(app: FastAPI, owner: Owner) -> None:
+    store = owner.house.store
 
     @app.post("/api/captures", status_code=201)
     async def press(press: Press) -> dict[str, Any]:
         """Take one picture and keep it."""
-        return shown(await asyncio.wrap_future(exam.press(press.eye, press.key)))
+        return shown(await asyncio.wrap_future(owner.exam.press(press.eye, press.key)))
 
     @app.get("/api/captures")
     def captures(limit: int = Query(50, ge=1, le=500), before: str | None = None) -> dict[str, Any]:
@@ -233,43 +246,46 @@ def _captures(app: FastAPI, exam: Exam) -> None:
     @app.get("/api/captures/{id}/{name}")
     def file(id: str, name: str = InPath(pattern="^[a-z]+[.](png|jpg|tiff|json)$")) -> Response:
         """One file of a capture, or the quick look of the one that is being made."""
-        quick = exam.quick(id) if name == "quick.jpg" else None
+        quick = owner.quick(id) if name == "quick.jpg" else None
         content = quick if quick is not None else store.read(id, name)
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _state(app: FastAPI, exam: Exam) -> None:
+def _state(app: FastAPI, owner: Owner) -> None:
+    store = owner.house.store
+
     @app.get("/api/status")
     def status() -> dict[str, Any]:
         """What this instrument is and does now."""
-        head, problem = exam.head, exam.problem
-        radius_px = field_radius_px(head.calibration)
+        spec, head, problem = owner.house.spec, owner.head, owner.problem
+        radius_px = field_radius_px(head.calibration) if head is not None else float("inf")
         return {
-            "name": head.spec.name, "kind": head.kind, "state": exam.state, "shape": head.camera.shape,
+            "name": spec.name, "kind": kind_of(spec), "state": owner.state,
+            "shape": head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
-            "swept": exam.store.swept, "space_left": exam.store.space_left(),
+            "swept": store.swept, "space_left": store.space_left(),
             "problem": words(problem) if problem else None,
-            "notices": [one.remedy for one in exam.fitness.findings if not one.ok],
+            "notices": [one.remedy for one in owner.findings if not one.ok],
         }  # fmt: skip
 
     @app.get("/api/health")
     def health() -> dict[str, Any]:
         """Whether it can take pictures now, and what was found about the calibration."""
-        findings = exam.fitness.findings
+        findings = owner.findings
         return {
-            "ok": exam.problem is None and not any(one.fails for one in findings), "state": exam.state,
-            "space_left": exam.store.space_left(), "calibration": shown_findings(findings),
+            "ok": owner.problem is None and not any(one.fails for one in findings), "state": owner.state,
+            "space_left": store.space_left(), "calibration": shown_findings(findings),
         }  # fmt: skip
 
 
-def _live(app: FastAPI, exam: Exam) -> None:
+def _live(app: FastAPI, owner: Owner) -> None:
     @app.get("/api/preview")
     def preview(after: int = Query(0, ge=0)) -> Response:
         """The next live picture after number `after`; 204 when none comes in 2 s."""
-        live = exam.preview(after)
+        live = owner.preview(after)
         if live is None:
             return Response(status_code=204)
-        age_ms = max(0, round((exam.clock.now_s() - live.exposed_s) * 1000))
+        age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
         return Response(
             live.jpeg, media_type="image/jpeg", headers={"X-Frame": str(live.number), "X-Age-Ms": str(age_ms)}
         )
@@ -279,9 +295,9 @@ def _live(app: FastAPI, exam: Exam) -> None:
         """What happens, as server-sent events, with a heartbeat every second."""
 
         async def lines() -> AsyncIterator[str]:
-            async for event in exam.bulletin.follow(last_event_id):
+            async for event in owner.house.bulletin.follow(last_event_id):
                 if event.kind == "kept":
-                    if (capture := _still_kept(exam, event.data["id"])) is None:
+                    if (capture := _still_kept(owner.house.store, event.data["id"])) is None:
                         continue
                     event = replace(event, data=shown(capture))
                 yield event.as_sse()
@@ -289,10 +305,10 @@ def _live(app: FastAPI, exam: Exam) -> None:
         return StreamingResponse(lines(), media_type="text/event-stream")
 
 
-def _still_kept(exam: Exam, id: str) -> Capture | None:
+def _still_kept(store: Store, id: str) -> Capture | None:
     """A kept capture; None if it has been damaged since, because the news after it must arrive all the same."""
     try:
-        return exam.store.get(id)
+        return store.get(id)
     except StoreError:
         return None
 
@@ -303,5 +319,9 @@ def _page(app: FastAPI) -> None:
     @app.get("/", include_in_schema=False)
     def index() -> FileResponse:
         return FileResponse(folder / "index.html")
+
+    @app.get("/technician", include_in_schema=False)
+    def technician() -> FileResponse:
+        return FileResponse(folder / "technician.html")
 
     app.mount("/web", StaticFiles(directory=folder))

@@ -1,8 +1,8 @@
 """`diffuscope calibrate`: whoever stands at the bench, a technician or the simulator, and a procedure between them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from math import degrees
 from pathlib import Path
@@ -14,10 +14,12 @@ from device.clock import Clock
 from device.errors import MemoryDamaged, SettingError
 from device.head import Bench, open_bench
 from device.sim import stage
+from device.sim.mishaps import mend, spoil
 from device.sim.world import World
 from device.spec import InstrumentSpec
 from device.values import Colour, Identity
 
+WORK = ".steps"  # in the archive: what was measured of a calibration that is not whole yet
 EYE_MM = 25.0  # the paper's model eye
 LONGEST_SERIAL = 64  # of characters: what a head's memory keeps
 ASKED: dict[Stand, str] = {
@@ -40,12 +42,13 @@ class Wish:
     archive: Path
     serial: str | None
     made_by: str
-    source_deg: float | None
+    source_deg: float | None = None
     eye_mm: float | None = None
     dioptres: bool = False
     colours: tuple[Colour, ...] = ()
     keep_raw: bool = False
     leds: Path | None = None
+    mishaps: Mapping[str, str] = field(default_factory=dict)  # of a simulated head: what goes wrong at which stand
 
 
 def calibrate(
@@ -56,7 +59,9 @@ def calibrate(
     `ask` says to a person what to put before the head, and returns when it is there.
     """
     with closing(open_bench(spec, clock)) as bench:
-        put = (lambda stand: ask(ASKED[stand])) if bench.world is None else staging(bench.world)
+        if wish.mishaps and bench.world is None:
+            raise SettingError("nothing goes wrong on purpose on a real head", "Leave out --mishap.")
+        put = (lambda stand: ask(ASKED[stand])) if bench.world is None else with_mishaps(bench.world, wish.mishaps)
         return calibrate_on(bench, spec, wish, clock, Operator(put, tell))
 
 
@@ -65,23 +70,42 @@ def calibrate_on(bench: Bench, spec: InstrumentSpec, wish: Wish, clock: Clock, o
 
     A power cut before that leaves a head that refuses to start, and says how its memory is written.
     """
-    leds = led_readings(wish.leds, spec) if wish.leds is not None else None
-    for line in unknown(leds, spec) if leds is not None else ():
-        operator.tell(line)
-    who = serial_of(bench, wish), wish.made_by, version("diffuscope")
-    source = _source_deg(spec, wish), _eye_mm(spec, wish)
-    job = Job(spec, *who, *source, wish.dioptres, wish.colours, wish.keep_raw, leds)
-    procedure = Procedure(job, bench.camera, operator, clock, wish.archive / ".steps", bench.chips.thermometer)
+    job, work = job_of(bench, spec, wish, operator.tell), wish.archive / WORK
+    procedure = Procedure(job, bench.camera, operator, clock, work, bench.chips.thermometer)
     archive = Archive(wish.archive)
     kept = archive.load(procedure.run(archive))
     note_in_head(bench, kept)
     return kept
 
 
+def job_of(bench: Bench, spec: InstrumentSpec, wish: Wish, tell: Callable[[str], None]) -> Job:
+    """What is to be measured of whom; what nobody measured about its LEDs is said."""
+    leds = led_readings(wish.leds, spec) if wish.leds is not None else None
+    for line in unknown(leds, spec) if leds is not None else ():
+        tell(line)
+    who = serial_of(bench, wish), wish.made_by, version("diffuscope")
+    return Job(spec, *who, source_of(spec, wish), _eye_mm(spec, wish), wish.dioptres, wish.colours, wish.keep_raw, leds)
+
+
 def note_in_head(bench: Bench, kept: Kept) -> None:
     """The head's memory, where it has one, says from now on who it is and which calibration is its own."""
     if bench.chips.memory is not None:
         bench.chips.memory.write(Identity(kept.provenance.serial, kept.calibration.id))
+
+
+def with_mishaps(world: World, mishaps: Mapping[str, str]) -> Callable[[Stand], None]:
+    """Puts things before a simulated head, and lets go wrong what the wish names for that stand."""
+    put = staging(world)
+    if strange := set(mishaps) - set(ASKED):
+        raise SettingError(f"no step wants {sorted(strange)[0]!r}", f"Choose from {', '.join(ASKED)}.")
+
+    def put_and_spoil(stand: Stand) -> None:
+        mend(world)
+        put(stand)
+        if stand in mishaps:
+            spoil(world, mishaps[stand])
+
+    return put_and_spoil
 
 
 def staging(world: World) -> Callable[[Stand], None]:
@@ -123,7 +147,8 @@ def serial_of(bench: Bench, wish: Wish) -> str:
     raise SettingError("this head does not say who it is", "Give its serial number with --serial.")
 
 
-def _source_deg(spec: InstrumentSpec, wish: Wish) -> float:
+def source_of(spec: InstrumentSpec, wish: Wish) -> float:
+    """How wide the point source is as the head sees it, degrees; 0 where nobody says."""
     if wish.source_deg is not None or spec.sim is None:
         return wish.source_deg or 0.0
     return degrees(spec.sim.calibration.source_um / spec.sim.eye.focal_length_um)

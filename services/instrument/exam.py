@@ -157,8 +157,12 @@ class Exam:
         return self._quick.get(id)
 
     def close(self) -> None:
-        """Finish what is under way, then let the head go, dark."""
+        """Say that the instrument ends, and end."""
         self._watchdog.stopping()
+        self.hand_over()
+
+    def hand_over(self) -> None:
+        """Finish what is under way, then let the head go, dark: somebody else may take it."""
         with self._turn:
             self._closing = True
             self._turn.notify_all()

@@ -10,14 +10,17 @@ from pathlib import Path
 
 import uvicorn
 
+from device.calibration.archive import Archive
 from device.clock import SystemClock
 from device.dose import light_limits
 from device.errors import InputError
-from device.head import open_head
+from device.head import open_bench, open_head
 from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.owner import House, Owner, archive_of, calibrated
+from services.instrument.technician import Door
 from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
 from services.records.store import Store
@@ -71,28 +74,36 @@ def serve(
     """
     clock = SystemClock()
     with address, Store(data) as store:
-        head = open_head(spec, clock, LightBook(store.engine, clock, light_limits().window_s))
-        exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process, watchdog)
-        config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
+        book = LightBook(store.engine, clock, light_limits().window_s)
+        archive = Archive(archive_of(spec, data))
+        house = House(spec, archive, store, Bulletin(), clock, watchdog, _stop_the_process)
+
+        def exam() -> Exam:
+            head = open_head(calibrated(spec, archive.root), clock, book)
+            return Exam(head, store, house.bulletin, clock, data / "plans", house.died, watchdog)
+
+        owner = Owner(house, exam, lambda: open_bench(spec, clock))
+        app = create_app(owner, Door(data / "technician.json", clock))
+        config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()
-            _Server(config, exam).run(sockets=[address])
+            _Server(config, house.bulletin).run(sockets=[address])
         finally:
-            exam.close()
-        if exam.failure is not None:
-            raise exam.failure
+            owner.close()
+        if owner.failure is not None:
+            raise owner.failure
 
 
 class _Server(uvicorn.Server):
     """A server that tells its event streams to end before it waits for them."""
 
-    def __init__(self, config: uvicorn.Config, exam: Exam) -> None:
+    def __init__(self, config: uvicorn.Config, bulletin: Bulletin) -> None:
         super().__init__(config)
-        self._exam = exam
+        self._bulletin = bulletin
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End the streams, then what uvicorn does."""
-        self._exam.bulletin.close()
+        self._bulletin.close()
         await super().shutdown(sockets)
 
 

@@ -30,6 +30,7 @@ _BROKEN_TIFF = (tifffile.TiffFileError, struct.error, zlib.error)  # what tifffi
 _LOW, _HIGH = 0.5, 99.8  # percent of the lit pixels: what lies outside is noise below and reflections above
 _SAMPLES = 40_000  # enough to know those percentiles to a grey level, and a hundredth of the time for all of them
 _DARKEST = 1e-30  # a picture that nowhere exceeds this is black, and dividing by its range would overflow
+_MANY_FULL = 0.05  # of a block of pixels: then it is shown as full
 _STEPS = 4096  # in linear light, finer than 8 bits of sRGB anywhere (its slope is at most 12.92)
 _LETTER_RATIO = 1 / 18  # size of the mark's letters over the height of the picture: read at arm's length on a telephone
 _LETTER_LEAST_PX = 12.0  # below this the letters run into each other
@@ -70,6 +71,18 @@ def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int 
     out = BytesIO()
     comment = f"simulated={'true' if simulated else 'false'}"
     Pillow.fromarray(_marked(np.asarray(image), simulated)).save(out, "JPEG", quality=quality, comment=comment)
+    return out.getvalue()
+
+
+def counts_jpeg(counts: Counts, black_dn: float, white_dn: float, longest_side_px: int, simulated: bool) -> bytes:
+    """What the sensor sees, uint16 (rows, cols): black at `black_dn`, white at `white_dn`, full pixels are red."""
+    smaller = max(counts.shape) // longest_side_px
+    share = (_block_mean(counts.astype(np.float32), smaller) - black_dn) / (white_dn - black_dn)
+    grey = _srgb_curve().take((np.clip(share, 0, 1) * (_STEPS - 1)).astype(np.uint16))
+    full = _block_mean((counts >= white_dn).astype(np.float32), smaller) > _MANY_FULL
+    pixels = np.stack([np.where(full, 255, grey), *[np.where(full, 0, grey)] * 2], -1).astype(np.uint8)
+    out = BytesIO()
+    Pillow.fromarray(_marked(pixels, simulated)).save(out, "JPEG", quality=80)
     return out.getvalue()
 
 

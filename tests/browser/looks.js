@@ -64,10 +64,11 @@
     if (!el.contains(top)) faults.push(`covered: ${selector} by ${name(top)}`);
   }
 
-  const stage = document.querySelector(".stage").getBoundingClientRect();
+  const stage = document.querySelector(".stage")?.getBoundingClientRect();
   const prompt = document.querySelector(".prompt").getBoundingClientRect();
-  if (prompt.top < stage.bottom) faults.push("the words under the picture cover it");
-  if (stage.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  const apart = !stage || prompt.top >= stage.bottom || prompt.bottom <= stage.top || prompt.left >= stage.right;
+  if (!apart) faults.push("the words beside the picture cover it");
+  if (stage?.height < 140) faults.push(`the picture is only ${stage.height} high`);
 
   for (const role of ["main", "header", "h1", "[role=status]"]) {
     if (document.querySelectorAll(role).length !== 1) faults.push(`not exactly one ${role}`);

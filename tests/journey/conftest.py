@@ -19,9 +19,10 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from device.calibration.archive import Archive
 from device.clock import VirtualClock
 from device.guard import GuardedLight
-from device.head import Head, hazard_of
+from device.head import Head, hazard_of, open_bench
 from device.ports import Camera
 from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
@@ -33,6 +34,8 @@ from device.values import Calibration, Colour, Psf
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.owner import House, Owner
+from services.instrument.technician import Door
 from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
 from services.records.store import Store
@@ -186,7 +189,10 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)
-        return Rig(scene, clock, shelf, bulletin, exam, create_app(exam), died)
+        house = House(scene.spec, Archive(folder / "archive"), shelf, bulletin, clock, Watchdog(watchdog), died.set)
+        owner = Owner(house, lambda: exam, lambda: open_bench(scene.spec, clock))
+        app = create_app(owner, Door(folder / "technician.json", clock))
+        return Rig(scene, clock, shelf, bulletin, exam, app, died)
 
     return built
 
