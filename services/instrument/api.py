@@ -1,19 +1,19 @@
 """The HTTP face of the instrument: what DESIGN.md fixes, errors in one table, and the page itself."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
-from fastapi import FastAPI, Header, Query, Request, Response
+from fastapi import Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -33,24 +33,41 @@ from device.errors import (
     CameraStalled,
     CameraWrong,
     DiffuscopeError,
+    Forged,
     HeadMismatch,
     InputError,
     LightFault,
     LightLimit,
     NotKept,
+    OtherScreen,
     PowerLow,
+    Refused,
+    StickFull,
+    StickGone,
     StoreDamaged,
     StoreError,
     StoreFull,
     TooHot,
+    VisitFinished,
+    WrongHost,
 )  # fmt: skip
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
 from services.instrument.exam import Exam
+from services.instrument.forgery import SAFE, OwnPageOnly, own_names
+from services.instrument.lease import Lease
+from services.instrument.visits_api import NAME, visits_router
+from services.records.people import People
+from services.records.protocol import Protocol, load_protocol
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
     Busy: 409,
+    Refused: 409,
+    OtherScreen: 409,
+    VisitFinished: 409,
+    Forged: 403,
+    WrongHost: 400,
     InputError: 422,
     LightLimit: 423,
     LightFault: 423,
@@ -69,6 +86,8 @@ STATUS: dict[type[DiffuscopeError], int] = {
     CalibrationStale: 423,
     CalibrationOtherMode: 423,
     StoreFull: 507,
+    StickFull: 507,
+    StickGone: 503,
     StoreDamaged: 500,
     DiffuscopeError: 500,
 }
@@ -95,15 +114,25 @@ class Refusal(BaseModel):
 
 
 class Press(BaseModel):
-    """What the button sends: which eye, and a key that makes a repeated request the same press."""
+    """What the button sends: which eye, for which slot, and a key that makes a repeated request the same press."""
 
     model_config = ConfigDict(extra="forbid")
     eye: Eye
     key: str | None = Field(default=None, pattern="^[0-9a-f]{16}$")
+    visit: str | None = Field(default=None, pattern=NAME)
+    slot: str | None = Field(default=None, min_length=1, max_length=40)
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> Self:
+        if (self.visit is None) != (self.slot is None):
+            raise ValueError("give both the visit and the slot, or neither")
+        return self
 
 
-def create_app(exam: Exam) -> FastAPI:
-    """The application around one exam."""
+def create_app(exam: Exam, protocol: Protocol | None = None, names: tuple[str, ...] | None = None) -> FastAPI:
+    """The application around one exam; it answers to these `names`, and to addresses and local ones."""
+    people = People(exam.store.engine, protocol or load_protocol(), exam.clock)
+    lease = Lease(exam.clock)
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -115,12 +144,27 @@ def create_app(exam: Exam) -> FastAPI:
         docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
     _words_for_errors(app)
+    app.add_middleware(OwnPageOnly, names=own_names() if names is None else names, answer=refusal)
     app.add_middleware(SafeHeaders)
-    _captures(app, exam)
-    _state(app, exam)
+    only_one = Depends(one_screen(lease))
+    _captures(app, exam, people, only_one)
+    app.include_router(visits_router(people, lease), dependencies=[only_one])
+    _state(app, exam, people, lease)
     _live(app, exam)
     _page(app)
     return app
+
+
+def one_screen(lease: Lease) -> Callable[..., None]:
+    """What every changing address asks first: whether another screen holds the camera; any request renews a lease."""
+
+    def check(request: Request, x_controller: Annotated[str | None, Header(max_length=64)] = None) -> None:
+        if request.method in SAFE or request.url.path == "/api/controller":
+            lease.touch(x_controller or "")
+        else:
+            lease.check(x_controller)
+
+    return check
 
 
 def refusal(error: DiffuscopeError) -> JSONResponse:
@@ -142,8 +186,9 @@ def _words_for_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        return refusal(InputError(f"{where}: {first['msg']}", "Reload the page and try again."))
+        said = f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+        plain = said.encode("utf-8", "replace").decode()  # half a character cannot be sent back
+        return refusal(InputError(plain, "Reload the page and try again."))
 
     @app.exception_handler(HTTPException)
     async def _(request: Request, error: HTTPException) -> JSONResponse:
@@ -199,6 +244,8 @@ def shown(capture: Capture) -> dict[str, Any]:
     return {
         "id": capture.id, "eye": capture.eye, "taken_at": capture.taken_at.isoformat(),
         "simulated": capture.simulated, "calibration_id": capture.calibration_id, "report": capture.report,
+        "visit": capture.report.get("visit"), "slot": capture.report.get("slot"),
+        "verdict": capture.report.get("verdict"),
         "files": capture.files,
         "links": {
             "picture": f"{at}/picture.png", "raw": f"{at}/raw.tiff", "report": f"{at}/report.json",
@@ -207,13 +254,17 @@ def shown(capture: Capture) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _captures(app: FastAPI, exam: Exam) -> None:
+def _captures(app: FastAPI, exam: Exam, people: People, only_one: Any) -> None:
     store = exam.store
 
-    @app.post("/api/captures", status_code=201)
+    @app.post("/api/captures", status_code=201, dependencies=[only_one])
     async def press(press: Press) -> dict[str, Any]:
-        """Take one picture and keep it."""
-        return shown(await asyncio.wrap_future(exam.press(press.eye, press.key)))
+        """Take one picture and keep it; of a slot of a visit, if they are given."""
+        kept = people.answered(press.key) if press.key else None
+        if kept is not None:  # by an instrument that was started anew since then
+            return shown(store.get(kept))
+        errand = people.errand(press.eye, press.key, press.visit, press.slot)
+        return shown(await asyncio.wrap_future(exam.press(press.eye, press.key, errand)))
 
     @app.get("/api/captures")
     def captures(limit: int = Query(50, ge=1, le=500), before: str | None = None) -> dict[str, Any]:
@@ -233,7 +284,7 @@ def _captures(app: FastAPI, exam: Exam) -> None:
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _state(app: FastAPI, exam: Exam) -> None:
+def _state(app: FastAPI, exam: Exam, people: People, lease: Lease) -> None:
     @app.get("/api/status")
     def status() -> dict[str, Any]:
         """What this instrument is and does now."""
@@ -243,6 +294,7 @@ def _state(app: FastAPI, exam: Exam) -> None:
             "name": head.spec.name, "kind": head.kind, "state": exam.state, "shape": head.camera.shape,
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
             "swept": exam.store.swept, "space_left": exam.store.space_left(),
+            "people_left": exam.store.people_left(len(people.protocol.slots)), "controller": lease.holder,
             "problem": words(problem) if problem else None,
         }  # fmt: skip
 

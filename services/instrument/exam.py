@@ -30,6 +30,7 @@ from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
+from services.records.errand import NO_ERRAND, Errand
 from services.records.store import Store
 
 log = logging.getLogger(__name__)
@@ -58,6 +59,7 @@ class _Press:
 
     answer: Future[Capture]
     eye: Eye
+    errand: Errand
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class Exam:
     def _is_busy(self) -> bool:
         return self._press is not None or self._exposing or self._in_the_making == SEATS
 
-    def press(self, eye: Eye, key: str | None = None) -> Future[Capture]:
+    def press(self, eye: Eye, key: str | None = None, errand: Errand = NO_ERRAND) -> Future[Capture]:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         The same `key` again gives the same picture, however often the network repeats the request.
@@ -128,7 +130,7 @@ class Exam:
                 raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
             if self._is_busy():
                 raise Busy("a picture is being taken")
-            self._press = _Press(Future(), eye)
+            self._press = _Press(Future(), eye, errand)
             future = self._press.answer
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
             self._in_the_making += 1
@@ -273,13 +275,13 @@ class Exam:
     def _make(self, shot: _Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
         made = self._reconstruct(shot)
-        report = asdict(made.report) | shot.light
+        report = asdict(made.report) | shot.light | shot.press.errand.facts
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
         self._tell_stage(shot.id, "keep", 0.9)
-        kept = self.store.keep(capture, self._files(shot, capture, made))
+        kept = self.store.keep(capture, self._files(shot, capture, made), shot.press.errand.beside)
         self.bulletin.tell("kept", id=shot.id)
         return kept
 

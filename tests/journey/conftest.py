@@ -110,7 +110,7 @@ class Rig:
 
         async def told() -> Any:
             transport = httpx.ASGITransport(app=self.app, **options)
-            async with httpx.AsyncClient(transport=transport, base_url="http://eye", timeout=30) as client:
+            async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as client:
                 return await story(client)
 
         return asyncio.run(told())
