@@ -1,9 +1,10 @@
 """The HTTP face of the instrument: what DESIGN.md fixes, errors in one table, and the page itself."""
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -312,9 +313,8 @@ def _live(app: FastAPI, exam: Exam) -> None:
         if live is None:
             return Response(status_code=204)
         age_ms = max(0, round((exam.clock.now_s() - live.exposed_s) * 1000))
-        return Response(
-            live.jpeg, media_type="image/jpeg", headers={"X-Frame": str(live.number), "X-Age-Ms": str(age_ms)}
-        )
+        told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
+        return Response(live.jpeg, media_type="image/jpeg", headers=told)
 
     @app.get("/api/events")
     async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:

@@ -20,14 +20,17 @@ from threading import Condition, Event, Thread
 from device.clock import Clock, Deadline
 from device.errors import Busy, DiffuscopeError, LightFault
 from device.head import Head
+from device.recon.aim import Aim
 from device.recon.focus import sharpest
 from device.recon.model import field_box
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
+from device.recon.verdict import Verdict
 from device.sequence import lit
 from device.values import EYES, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
+from services.instrument.judging import NOWHERE, Watch
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.errand import NO_ERRAND, Errand
@@ -46,11 +49,12 @@ SEATS = 2  # pictures in the making at once: one that is refined, and one more t
 
 @dataclass(frozen=True)
 class Preview:
-    """One live picture: its number, its JPEG, and when it was exposed."""
+    """One live picture: its number, its JPEG, when it was exposed, and what to do so that one can be taken."""
 
     number: int
     jpeg: bytes
     exposed_s: float
+    aim: Aim
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class _Exposed:
     dark: Frame
     expose_s: float
     light: dict[str, object]
+    verdict: Verdict
 
 
 class Exam:
@@ -98,7 +103,7 @@ class Exam:
         self._exposed: deque[_Exposed] = deque()
         self._in_the_making = 0
         self._wanted_until_s = 0.0
-        self._preview = Preview(0, b"", 0.0)
+        self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
         self._owner = Thread(target=self._own_the_head, name="head", daemon=True)
@@ -190,6 +195,7 @@ class Exam:
         calibration, shape = self.head.calibration, self.head.camera.shape
         recipes = ladder(calibration, shape, index)
         self._reconstructor = Reconstructor(calibration, shape, planner, self.clock, recipes, index)
+        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera.exposure_s, self.bulletin)
 
     def _best_psf(self, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
@@ -234,7 +240,8 @@ class Exam:
             begin_s = self.clock.now_s()
             frame, dark = self._expose((press.eye,))
             exposed = press, id, taken_at, frame, dark, self.clock.now_s() - begin_s
-            self._exposed.append(_Exposed(*exposed, light=self.head.light.account()))
+            verdict = self._eyes.judge(id, frame.counts, dark.counts, begin_s)
+            self._exposed.append(_Exposed(*exposed, light=self.head.light.account(), verdict=verdict))
         self._exposing = False
         self._tell_state()
 
@@ -275,7 +282,8 @@ class Exam:
     def _make(self, shot: _Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
         made = self._reconstruct(shot)
-        report = asdict(made.report) | shot.light | shot.press.errand.facts
+        verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
+        report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
@@ -335,7 +343,7 @@ class Exam:
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""
         try:
-            jpeg, exposed_s, dark_s = self._live_picture()
+            jpeg, exposed_s, dark_s, aim = self._live_picture()
         except DiffuscopeError as error:
             self.head.light.off()
             self._report_problem(error)
@@ -343,7 +351,7 @@ class Exam:
             return
         self._report_problem(None)
         with self._turn:
-            self._preview = Preview(self._preview.number + 1, jpeg, exposed_s)
+            self._preview = Preview(self._preview.number + 1, jpeg, exposed_s, aim)
             self._turn.notify_all()
         self._pause(2 * dark_s - exposed_s - self.clock.now_s())  # as much darkness as there was light
 
@@ -353,8 +361,8 @@ class Exam:
         while self._press is None and not self._closing and (left_s := until_s - self.clock.now_s()) > 0:
             self.clock.sleep(min(left_s, 0.02))
 
-    def _live_picture(self) -> tuple[bytes, float, float]:
-        """A JPEG, and the moments at which its light went on and off: aiming must not use up the picture's light."""
+    def _live_picture(self) -> tuple[bytes, float, float, Aim]:
+        """A JPEG, when its light went on and off (aiming must not use up the picture's light), and what to do."""
         spec = self.head.spec
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
@@ -366,7 +374,8 @@ class Exam:
             dark_s = self.clock.now_s()
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
         made = self._reconstructor(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
-        return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s, dark_s
+        jpeg = picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated)
+        return jpeg, exposed_s, dark_s, self._eyes.aim(frame.counts, exposed_s)
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:
         before = self.problem.code if self.problem else None

@@ -13,11 +13,12 @@ Beside = Callable[[Session, Capture], None]
 
 @dataclass(frozen=True)
 class Errand:
-    """A slot of a visit, how many pictures were taken of it before, and what `beside` writes with this one."""
+    """A slot of a visit, how often it was tried before and may be tried again, and what `beside` writes with it."""
 
     visit: str | None = None
     slot: str | None = None
     tries: int = 0
+    retakes: int = 2
     beside: Beside | None = None
 
     @property

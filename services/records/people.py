@@ -95,7 +95,8 @@ class People:
             raise InputError(f"{slot} is a picture of {wanted.eye}, not of {eye}", CHOOSE)
         if visit.finished_at is not None:
             raise VisitFinished(f"the visit {id} is finished")
-        return Errand(id, slot, len(visit.slots[slot].taken), self._beside(key))
+        tries = len(visit.slots[slot].taken)
+        return Errand(id, slot, tries, self.protocol.retakes, self._beside(key))
 
     def _beside(self, key: str | None) -> Beside:
         """What is kept with a capture: the key of the press that made it, and its place."""
