@@ -55,9 +55,10 @@ from device.errors import (
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
 from services.instrument.exam import Exam
+from services.instrument.exporting import Sticks
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
-from services.instrument.visits_api import NAME, visits_router
+from services.instrument.visits_api import NAME, exports_router, visits_router
 from services.records.people import People
 from services.records.protocol import Protocol, load_protocol
 
@@ -130,7 +131,9 @@ class Press(BaseModel):
         return self
 
 
-def create_app(exam: Exam, protocol: Protocol | None = None, names: tuple[str, ...] | None = None) -> FastAPI:
+def create_app(
+    exam: Exam, protocol: Protocol | None = None, names: tuple[str, ...] | None = None, sticks: Sticks | None = None
+) -> FastAPI:
     """The application around one exam; it answers to these `names`, and to addresses and local ones."""
     people = People(exam.store.engine, protocol or load_protocol(), exam.clock)
     lease = Lease(exam.clock)
@@ -150,6 +153,7 @@ def create_app(exam: Exam, protocol: Protocol | None = None, names: tuple[str, .
     only_one = Depends(one_screen(lease))
     _captures(app, exam, people, only_one)
     app.include_router(visits_router(people, lease), dependencies=[only_one])
+    app.include_router(exports_router(people, exam.store, sticks or Sticks()), dependencies=[only_one])
     _state(app, exam, people, lease)
     _live(app, exam)
     _page(app)

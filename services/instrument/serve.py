@@ -18,8 +18,10 @@ from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.forgery import own_names
 from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
+from services.records.protocol import Protocol
 from services.records.store import Store
 
 BACKLOG = 128
@@ -63,17 +65,21 @@ def _remedy(error: OSError, port: int) -> str:
 
 
 def serve(
-    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog
-) -> None:
+    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
+    protocol: Protocol, names: tuple[str, ...] = (),
+) -> None:  # fmt: skip
     """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
-    The page is there while the exam still makes its plans; raises what keeps it from making them.
+    The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
+    `names`, beside the computer's own, its addresses, and local ones.
     """
     clock = SystemClock()
     with address, Store(data) as store:
         head = open_head(spec, clock, LightBook(store.engine, clock, light_limits().window_s))
         exam = Exam(head, store, Bulletin(), clock, data / "plans", _stop_the_process, watchdog)
-        config = uvicorn.Config(create_app(exam), log_level="warning", timeout_graceful_shutdown=1)
+        config = uvicorn.Config(
+            create_app(exam, protocol, own_names() + names), log_level="warning", timeout_graceful_shutdown=1
+        )
         try:
             ready()
             _Server(config, exam).run(sockets=[address])

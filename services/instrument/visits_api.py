@@ -3,11 +3,13 @@
 from datetime import date, timedelta
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from services.instrument.exporting import Sticks, copied, exported, folder_name, zipped
 from services.instrument.lease import Lease
 from services.records.people import UNDO_S, People
+from services.records.store import Store
 from services.records.visit import SlotState, Visit
 
 KEY = "^[0-9a-f]{16}$"
@@ -49,6 +51,12 @@ class Chosen(Order):
 
     slot: SlotName
     capture: CaptureName | None
+
+
+class Away(Order):
+    """A stick to copy a visit to."""
+
+    folder: str = Field(min_length=1, max_length=1000)
 
 
 class Asking(Order):
@@ -133,6 +141,44 @@ def _changing(router: APIRouter, people: People) -> None:
     def reopen(id: str, order: Order) -> dict[str, Any]:
         """Undo a finish, within ten seconds."""
         return shown_visit(people.reopen(order.key, id), people)
+
+
+def exports_router(people: People, store: Store, sticks: Sticks) -> APIRouter:
+    """Ways to take a visit away."""
+    router = APIRouter()
+
+    @router.get("/api/exports")
+    def exports() -> dict[str, Any]:
+        """The USB sticks that are there now."""
+        return {
+            "folders": [
+                {"folder": str(stick.folder), "name": stick.folder.name, "free_bytes": stick.free_bytes}
+                for stick in sticks.present()
+            ]
+        }
+
+    @router.get("/api/visits/{id}/export.zip", response_class=Response)
+    def download(id: str) -> Response:
+        """A visit as one file."""
+        visit = people.get(id)
+        name = folder_name(visit)
+        content = zipped(name, exported(store, visit, shown_visit(visit, people)))
+        return Response(
+            content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}.zip"'}
+        )
+
+    @router.post("/api/visits/{id}/export")
+    def copy(id: str, order: Away) -> dict[str, str]:
+        """Copy a visit to a stick; the answer names the new folder."""
+        visit = people.get(id)
+
+        def act() -> str:
+            files = exported(store, visit, shown_visit(visit, people))
+            return str(copied(sticks.chosen(order.folder), folder_name(visit), files))
+
+        return {"folder": people.once(order.key, f"export {id} {order.folder}", act)}
+
+    return router
 
 
 def shown_visit(visit: Visit, people: People) -> dict[str, Any]:

@@ -181,6 +181,18 @@ class People:
 
         return self.get(self._once(key, f"reopen {id}", act))
 
+    def once(self, key: str, request: str, act: Callable[[], str]) -> str:
+        """Do something that is none of ours, and remember its answer; a repetition is only answered.
+
+        It is not done inside a transaction: it may take long, and others want to write.
+        """
+        with told(), Session(self.engine) as session:
+            before = session.get(KeyRow, key)
+        if before is not None:
+            return _same(before, request)
+        answer = act()
+        return self._once(key, request, lambda _: answer)
+
     def can_undo(self, finished_at: datetime) -> bool:
         """Whether what was finished then can still be undone."""
         return self.clock.wall() - finished_at <= timedelta(seconds=UNDO_S)
@@ -193,9 +205,7 @@ class People:
                 answer = act(session)
                 self._remember(session, key, request, answer)
                 return answer
-            if before.request != _digest(request):
-                raise InputError("key: it belongs to another request", "Reload the page and try again.")
-            return before.answer
+            return _same(before, request)
 
     def _person(self, session: Session, number: str | None) -> str:
         """The person of a number, or a new one; of digits alone, who has them after the programme's prefix."""
@@ -250,6 +260,13 @@ def _decide(session: Session, visit: str, slot: str, decided: Decided | None) ->
         session.merge(SlotRow(visit=visit, slot=slot, capture=decided.capture, reason=decided.reason))
     elif (row := session.get(SlotRow, (visit, slot))) is not None:
         session.delete(row)
+
+
+def _same(before: KeyRow, request: str) -> str:
+    """What this very request was answered; InputError if the key was another's."""
+    if before.request != _digest(request):
+        raise InputError("key: it belongs to another request", "Reload the page and try again.")
+    return before.answer
 
 
 def _digest(request: str) -> str:
