@@ -36,7 +36,6 @@ LEAST_COVERAGE = 0.9  # good fields have 0.975 and more
 LEAST_WIDE, MOST_WIDE = 0.93, 1.025  # good fields have 0.97 to 1.005
 ONE_SIDED = 0.1
 MOST_SMEAR = 0.22
-MOST_RESIDUAL = 1.5  # good pictures have 0.9 to 1.2, with the eye's own PSF
 HOPELESS = 0.25  # share of saturated pixels beyond which nothing else can be told
 FIELD_SAMPLES = 64  # across the field, at the least
 SMEAR_CYCLES = (12, 40)  # across the field: finer is noise, coarser is the eye's own shape
@@ -79,18 +78,12 @@ def judge(reading: Reading, eye_before: bool = False) -> Verdict:
 def after(first: Verdict, residual: float | None, coverage: float | None, tries: int, retakes: int) -> Verdict:
     """The verdict once the picture is made with the eye's own PSF; after `retakes` a bad one is simply not clear.
 
-    A frame that the picture does not explain has light in it that took another way: a reflex.
+    The residual is told and decides nothing: stray light and worn pixels double it in pictures that are good.
     """
-    numbers = first.numbers | {
-        key: float(f"{value:.4g}")
-        for key, value in {"residual": residual, "lit": coverage}.items()
-        if value is not None
-    }
+    numbers = first.numbers | _rounded({"residual": residual, "lit": coverage})
     code = first.code
     if code is None and coverage is not None and coverage < LEAST_COVERAGE:
         code = "shot.edge"
-    if code is None and residual is not None and residual > MOST_RESIDUAL:
-        code = "shot.halo"
     if code is not None and tries >= retakes:
         code = "shot.poor"
     return Verdict("good" if code is None else "again", code, numbers)
@@ -98,11 +91,8 @@ def after(first: Verdict, residual: float | None, coverage: float | None, tries:
 
 def _cause(seen: Reading, eye_before: bool) -> Code | None:
     if seen.saturated > MOST_SATURATED:
-        return (
-            "shot.halo"
-            if seen.wide is not None and seen.wide < SPOT + SPOT_PER_SHARE * seen.saturated
-            else "shot.saturated"
-        )
+        narrow = seen.wide is not None and seen.wide < SPOT + SPOT_PER_SHARE * seen.saturated
+        return "shot.halo" if narrow and seen.saturated < LARGEST_SPOT else "shot.saturated"
     if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < LEAST_E_PER_UM2:
         return "shot.dark"
     if seen.through is not None and seen.through < LEAST_THROUGH:

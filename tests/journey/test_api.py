@@ -279,6 +279,7 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
         "/api/captures/{id}/keep": {"post"}, "/api/controller": {"post"}, "/api/protocol": {"get"},
         "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
         "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
+        "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
     }  # fmt: skip
     assert {path: set(verbs) for path, verbs in book["paths"].items()} == fixed
     press = book["paths"]["/api/captures"]["post"]["responses"]
