@@ -33,9 +33,16 @@ DiffuscopeError
 │   ├── PinWrong                 that is not the PIN, or cannot be one
 │   └── PinTooSoon               wrong ones came too often: wait
 ├── Busy                         the instrument is doing something else
+├── Refused                      who asks may not, or not now
+│   ├── OtherScreen              another screen is taking pictures
+│   ├── Forged                   the request comes from a page that is not ours
+│   ├── WrongHost                the instrument was asked by a name that is not its own
+│   └── VisitFinished            the visit is finished
 └── StoreError                   the shelf
     ├── StoreFull                no room left
     ├── StoreDamaged             a kept file is not what was kept
+    ├── StickFull                the USB stick has no room
+    ├── StickGone                the USB stick is not there, or cannot be written
     └── NotKept (LookupError)    no such capture
 """
 
@@ -282,6 +289,41 @@ class Busy(DiffuscopeError):
     default_remedy = "A picture is being taken. Wait until it is done, then press again."
 
 
+class Refused(DiffuscopeError):
+    """Who asks may not do this, or not now."""
+
+    code = "refused"
+    default_remedy = "Reload the page and try again."
+
+
+class OtherScreen(Refused):
+    """Another screen holds the instrument."""
+
+    code = "link.other"
+    default_remedy = "Another screen is taking pictures."
+
+
+class Forged(Refused):
+    """A request that changes something comes from a page that this instrument did not serve."""
+
+    code = "link.forged"
+    default_remedy = "Close the other page, and open the camera's own page again."
+
+
+class WrongHost(Refused):
+    """The instrument was asked by a name that is not its own."""
+
+    code = "link.host"
+    default_remedy = "Open the page by the camera's address, as it is written on the device."
+
+
+class VisitFinished(Refused):
+    """The visit is finished, and nothing can be changed in it."""
+
+    code = "visit.finished"
+    default_remedy = "This visit is finished. Begin a new visit for this person."
+
+
 class StoreError(DiffuscopeError):
     """The shelf cannot do what was asked."""
 
@@ -301,6 +343,20 @@ class StoreDamaged(StoreError):
 
     code = "store.damaged"
     default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+
+
+class StickFull(StoreError):
+    """The USB stick has no room for what should be copied."""
+
+    code = "stick.full"
+    default_remedy = "The USB stick is full. Nothing was lost. Use another stick, or make room on this one."
+
+
+class StickGone(StoreError):
+    """The USB stick is not there any more, or cannot be written."""
+
+    code = "stick.gone"
+    default_remedy = "The USB stick cannot be written. Nothing was lost. Put it in again, and copy once more."
 
 
 class NotKept(StoreError, LookupError):

@@ -42,18 +42,21 @@ def run(
     host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
+    protocol: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
+    name: Annotated[list[str] | None, typer.Option(help="A name of this computer in the network.")] = None,
 ) -> None:
     """Serve the page: one button, one true picture."""
     from services.instrument.serve import bound, handed_over, serve  # opens the web stack; others do not need it
     from services.instrument.watchdog import Watchdog
+    from services.records.protocol import STANDARD, load_protocol
 
-    spec = _chosen(head, replay, tuple(raw or ()), tuple(psf or ()))
+    spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or STANDARD)
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
     address = handed_over(os.environ) or bound(host, port)
     served, at = address.getsockname()[:2]
     serve(
         spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
-        Watchdog(os.environ.get("NOTIFY_SOCKET")),
+        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()),
     )  # fmt: skip
 
 

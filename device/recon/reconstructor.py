@@ -267,7 +267,7 @@ class _Climb:
     def brightest(self) -> tuple[Pixels, Pixels | None]:
         """The channel with the most light, and its dark frame."""
         c = 0 if self.channels == 1 else int(np.argmax(np.nanmean(self.counts, axis=(0, 1))))
-        return _plane(self.counts, c), None if self.dark is None else _plane(self.dark, c)
+        return plane(self.counts, c), None if self.dark is None else plane(self.dark, c)
 
     def up(self, rung: _Rung) -> bool:
         """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""
@@ -285,7 +285,7 @@ class _Climb:
 
     def _channel(self, rung: _Rung, c: int) -> None:
         begin_s = self.clock.now_s()
-        frame = rung.preparer(_plane(self.counts, c), None if self.dark is None else _plane(self.dark, c))
+        frame = rung.preparer(plane(self.counts, c), None if self.dark is None else plane(self.dark, c))
         rung.solver.start(frame)
         now_s = self.clock.now_s()
         rung.start_cost.add(now_s - begin_s)
@@ -323,7 +323,7 @@ class _Climb:
         return self.deadline.fits(rung.round_cost.seconds + others_s + rung.finish_cost.seconds)
 
 
-def _plane(image: Pixels, c: int) -> Pixels:
+def plane(image: Pixels, c: int) -> Pixels:
     """One channel, read-only: to compiled code that is part of the type, and only one of the two is compiled early."""
     image = image if image.ndim == 2 else image[..., c]
     plane: Pixels

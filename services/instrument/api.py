@@ -1,19 +1,20 @@
 """The HTTP face of the instrument: what DESIGN.md fixes, errors in one table, and the page itself."""
 
 import asyncio
-from collections.abc import AsyncIterator
+import json
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
 
-from fastapi import FastAPI, Header, Query, Request, Response
+from fastapi import Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -36,32 +37,50 @@ from device.errors import (
     CameraStalled,
     CameraWrong,
     DiffuscopeError,
+    Forged,
     HeadMismatch,
     InputError,
     LightFault,
     LightLimit,
     NotKept,
+    OtherScreen,
     PinTooSoon,
     PinWrong,
     PowerLow,
+    Refused,
+    StickFull,
+    StickGone,
     StoreDamaged,
     StoreError,
     StoreFull,
     TechnicianLocked,
     TooHot,
+    VisitFinished,
+    WrongHost,
 )  # fmt: skip
 from device.head import kind_of
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
+from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
+from services.instrument.forgery import SAFE, OwnPageOnly, own_names
+from services.instrument.lease import Lease
 from services.instrument.owner import Owner
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
+from services.instrument.visits_api import NAME, exports_router, visits_router
+from services.records.people import People
+from services.records.protocol import Protocol, load_protocol
 from services.records.store import Store
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
     Busy: 409,
+    Refused: 409,
+    OtherScreen: 409,
+    VisitFinished: 409,
+    Forged: 403,
+    WrongHost: 400,
     InputError: 422,
     LightLimit: 423,
     LightFault: 423,
@@ -86,6 +105,8 @@ STATUS: dict[type[DiffuscopeError], int] = {
     PinWrong: 403,
     PinTooSoon: 429,
     StoreFull: 507,
+    StickFull: 507,
+    StickGone: 503,
     StoreDamaged: 500,
     DiffuscopeError: 500,
 }
@@ -112,15 +133,29 @@ class Refusal(BaseModel):
 
 
 class Press(BaseModel):
-    """What the button sends: which eye, and a key that makes a repeated request the same press."""
+    """What the button sends: which eye, for which slot, and a key that makes a repeated request the same press."""
 
     model_config = ConfigDict(extra="forbid")
     eye: Eye
     key: str | None = Field(default=None, pattern="^[0-9a-f]{16}$")
+    visit: str | None = Field(default=None, pattern=NAME)
+    slot: str | None = Field(default=None, min_length=1, max_length=40)
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> Self:
+        if (self.visit is None) != (self.slot is None):
+            raise ValueError("give both the visit and the slot, or neither")
+        return self
 
 
-def create_app(owner: Owner, door: Door) -> FastAPI:
-    """The application around whoever has the head."""
+def create_app(
+    owner: Owner, door: Door, protocol: Protocol | None = None, names: tuple[str, ...] | None = None,
+    sticks: Sticks | None = None,
+) -> FastAPI:  # fmt: skip
+    """The application around whoever has the head; it answers to these `names`, and to addresses and local ones."""
+    store, clock = owner.house.store, owner.house.clock
+    people = People(store.engine, protocol or load_protocol(), clock)
+    lease = Lease(clock)
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -132,13 +167,29 @@ def create_app(owner: Owner, door: Door) -> FastAPI:
         docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
     _words_for_errors(app)
+    app.add_middleware(OwnPageOnly, names=own_names() if names is None else names, answer=refusal)
     app.add_middleware(SafeHeaders)
-    _captures(app, owner)
-    _state(app, owner)
+    only_one = Depends(one_screen(lease))
+    _captures(app, owner, people, only_one)
+    app.include_router(visits_router(people, lease), dependencies=[only_one])
+    app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
+    _state(app, owner, people, lease)
     _live(app, owner)
     technician_routes(app, owner, door)
     _page(app)
     return app
+
+
+def one_screen(lease: Lease) -> Callable[..., None]:
+    """What every changing address asks first: whether another screen holds the camera; any request renews a lease."""
+
+    def check(request: Request, x_controller: Annotated[str | None, Header(max_length=64)] = None) -> None:
+        if request.method in SAFE or request.url.path == "/api/controller":
+            lease.touch(x_controller or "")
+        else:
+            lease.check(x_controller)
+
+    return check
 
 
 def refusal(error: DiffuscopeError) -> JSONResponse:
@@ -160,8 +211,9 @@ def _words_for_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _(_: Request, error: RequestValidationError) -> JSONResponse:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        return refusal(InputError(f"{where}: {first['msg']}", "Reload the page and try again."))
+        said = f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+        plain = said.encode("utf-8", "replace").decode()  # half a character cannot be sent back
+        return refusal(InputError(plain, "Reload the page and try again."))
 
     @app.exception_handler(HTTPException)
     async def _(request: Request, error: HTTPException) -> JSONResponse:
@@ -217,6 +269,8 @@ def shown(capture: Capture) -> dict[str, Any]:
     return {
         "id": capture.id, "eye": capture.eye, "taken_at": capture.taken_at.isoformat(),
         "simulated": capture.simulated, "calibration_id": capture.calibration_id, "report": capture.report,
+        "visit": capture.report.get("visit"), "slot": capture.report.get("slot"),
+        "verdict": capture.report.get("verdict"),
         "files": capture.files,
         "links": {
             "picture": f"{at}/picture.png", "raw": f"{at}/raw.tiff", "report": f"{at}/report.json",
@@ -225,13 +279,17 @@ def shown(capture: Capture) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _captures(app: FastAPI, owner: Owner) -> None:
+def _captures(app: FastAPI, owner: Owner, people: People, only_one: Any) -> None:
     store = owner.house.store
 
-    @app.post("/api/captures", status_code=201)
+    @app.post("/api/captures", status_code=201, dependencies=[only_one])
     async def press(press: Press) -> dict[str, Any]:
-        """Take one picture and keep it."""
-        return shown(await asyncio.wrap_future(owner.exam.press(press.eye, press.key)))
+        """Take one picture and keep it; of a slot of a visit, if they are given."""
+        kept = people.answered(press.key) if press.key else None
+        if kept is not None:  # by an instrument that was started anew since then
+            return shown(store.get(kept))
+        errand = people.errand(press.eye, press.key, press.visit, press.slot)
+        return shown(await asyncio.wrap_future(owner.exam.press(press.eye, press.key, errand)))
 
     @app.get("/api/captures")
     def captures(limit: int = Query(50, ge=1, le=500), before: str | None = None) -> dict[str, Any]:
@@ -251,7 +309,7 @@ def _captures(app: FastAPI, owner: Owner) -> None:
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _state(app: FastAPI, owner: Owner) -> None:
+def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
     store = owner.house.store
 
     @app.get("/api/status")
@@ -264,6 +322,7 @@ def _state(app: FastAPI, owner: Owner) -> None:
             "shape": head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
             "swept": store.swept, "space_left": store.space_left(),
+            "people_left": store.people_left(len(people.protocol.slots)), "controller": lease.holder,
             "problem": words(problem) if problem else None,
             "notices": [one.remedy for one in owner.findings if not one.ok],
         }  # fmt: skip
@@ -286,9 +345,8 @@ def _live(app: FastAPI, owner: Owner) -> None:
         if live is None:
             return Response(status_code=204)
         age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
-        return Response(
-            live.jpeg, media_type="image/jpeg", headers={"X-Frame": str(live.number), "X-Age-Ms": str(age_ms)}
-        )
+        told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
+        return Response(live.jpeg, media_type="image/jpeg", headers=told)
 
     @app.get("/api/events")
     async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:

@@ -12,14 +12,14 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from dataclasses import asdict
 from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
 from device.errors import Busy, DiffuscopeError, LightFault
 from device.head import Head
+from device.recon.aim import Aim
 from device.recon.focus import sharpest
 from device.recon.model import field_box
 from device.recon.plan import Planner
@@ -29,8 +29,11 @@ from device.values import EYES, Calibration, Capture, Eye, Frame, Glow, Image, R
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.instrument.fitness import Fitness
+from services.instrument.judging import NOWHERE, Watch
+from services.instrument.press import Exposed, Press, Preview
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
+from services.records.errand import NO_ERRAND, Errand
 from services.records.store import Store
 
 log = logging.getLogger(__name__)
@@ -42,36 +45,6 @@ RETRY_S = 1.0
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 SEATS = 2  # pictures in the making at once: one that is refined, and one more that is exposed
-
-
-@dataclass(frozen=True)
-class Preview:
-    """One live picture: its number, its JPEG, and when it was exposed."""
-
-    number: int
-    jpeg: bytes
-    exposed_s: float
-
-
-@dataclass(frozen=True)
-class _Press:
-    """Who waits for a picture, and of which eye."""
-
-    answer: Future[Capture]
-    eye: Eye
-
-
-@dataclass(frozen=True)
-class _Exposed:
-    """A press whose light is done: what is left needs no eye."""
-
-    press: _Press
-    id: str
-    taken_at: datetime
-    frame: Frame
-    dark: Frame
-    expose_s: float
-    light: dict[str, object]
 
 
 class Exam:
@@ -92,12 +65,12 @@ class Exam:
         self._died, self._plans, self._watchdog = died, plans, watchdog
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
-        self._press: _Press | None = None
+        self._press: Press | None = None
         self._exposing = self._closing = self._ended = False
-        self._exposed: deque[_Exposed] = deque()
+        self._exposed: deque[Exposed] = deque()
         self._in_the_making = 0
         self._wanted_until_s = 0.0
-        self._preview = Preview(0, b"", 0.0)
+        self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
         self.fitness = Fitness(head, store, bulletin, clock, lambda: self._press is not None or self._closing)
@@ -118,7 +91,7 @@ class Exam:
     def _is_busy(self) -> bool:
         return self._press is not None or self._exposing or self._in_the_making == SEATS
 
-    def press(self, eye: Eye, key: str | None = None) -> Future[Capture]:
+    def press(self, eye: Eye, key: str | None = None, errand: Errand = NO_ERRAND) -> Future[Capture]:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         Raises CalibrationOld or CalibrationStale where no picture should rest on the calibration.
@@ -133,7 +106,7 @@ class Exam:
             if self._is_busy():
                 raise Busy("a picture is being taken")
             self.fitness.refuse()
-            self._press = _Press(Future(), eye)
+            self._press = Press(Future(), eye, errand)
             future = self._press.answer
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
             self._in_the_making += 1
@@ -200,6 +173,7 @@ class Exam:
         if live.psfs[0] is not calibration.psfs[0]:  # aiming has a colour, and that colour a PSF, of its own
             self._live = Reconstructor(live, shape, planner, self.clock, recipes[:1], refract=False)
         self.fitness.begin(self._reconstructor.refractor)
+        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera.exposure_s, self.bulletin)
 
     def _best_psf(self, calibration: Calibration, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
@@ -246,7 +220,8 @@ class Exam:
             begin_s = self.clock.now_s()
             frame, dark = self._expose((press.eye,))
             exposed = press, id, taken_at, frame, dark, self.clock.now_s() - begin_s
-            self._exposed.append(_Exposed(*exposed, light=self.head.light.account()))
+            verdict = self._eyes.judge(id, frame.counts, dark.counts, begin_s)
+            self._exposed.append(Exposed(*exposed, light=self.head.light.account(), verdict=verdict))
         self._exposing = False
         self._tell_state()
 
@@ -261,7 +236,7 @@ class Exam:
         self._quick.pop(shot.id, None)
 
     @contextmanager
-    def _answering(self, press: _Press) -> Iterator[None]:
+    def _answering(self, press: Press) -> Iterator[None]:
         """Whatever happens to a press, the lamp is dark after it, and whoever waits for it hears."""
         try:
             yield
@@ -277,23 +252,24 @@ class Exam:
         finally:
             self.head.light.off()
 
-    def _leave(self, press: _Press) -> None:
+    def _leave(self, press: Press) -> None:
         """The press gives its seat to another."""
         with self._turn:
             self._exposing = False
             self._in_the_making -= 1
         self._tell_state()
 
-    def _make(self, shot: _Exposed) -> Capture:
+    def _make(self, shot: Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
         made = self._reconstruct(shot)
-        report = asdict(made.report) | shot.light
+        verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
+        report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
         self._tell_stage(shot.id, "keep", 0.9)
-        kept = self.store.keep(capture, self._files(shot, capture, made))
+        kept = self.store.keep(capture, self._files(shot, capture, made), shot.press.errand.beside)
         self.bulletin.tell("kept", id=shot.id)
         self.fitness.kept(kept)
         return kept
@@ -310,7 +286,7 @@ class Exam:
         finally:
             light.off()
 
-    def _reconstruct(self, shot: _Exposed) -> Reconstruction:
+    def _reconstruct(self, shot: Exposed) -> Reconstruction:
         def show(stage: Stage) -> None:
             if not stage.last:
                 self._show_quick(shot, stage.picture)
@@ -333,11 +309,11 @@ class Exam:
                 self._show_quick(shot, self._eye(quick.picture))
                 self._exposed.append(shot)
 
-    def _show_quick(self, shot: _Exposed, image: Image) -> None:
+    def _show_quick(self, shot: Exposed, image: Image) -> None:
         self._quick[shot.id] = picture.to_jpeg(image, QUICK_PX, shot.frame.simulated)
         self._tell_stage(shot.id, "quick", 0.4, f"/api/captures/{shot.id}/quick.jpg")
 
-    def _files(self, shot: _Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
+    def _files(self, shot: Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
         shown = self._eye(made.picture)
         return capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, self._quick.get(capture.id))
 
@@ -348,7 +324,7 @@ class Exam:
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""
         try:
-            jpeg, exposed_s, dark_s = self._live_picture()
+            jpeg, exposed_s, dark_s, aim = self._live_picture()
         except DiffuscopeError as error:
             self.head.light.off()
             self._report_problem(error)
@@ -356,7 +332,7 @@ class Exam:
             return
         self._report_problem(None)
         with self._turn:
-            self._preview = Preview(self._preview.number + 1, jpeg, exposed_s)
+            self._preview = Preview(self._preview.number + 1, jpeg, exposed_s, aim)
             self._turn.notify_all()
         self._pause(2 * dark_s - exposed_s - self.clock.now_s())  # as much darkness as there was light
 
@@ -366,8 +342,8 @@ class Exam:
         while self._press is None and not self._closing and (left_s := until_s - self.clock.now_s()) > 0:
             self.clock.sleep(min(left_s, 0.02))
 
-    def _live_picture(self) -> tuple[bytes, float, float]:
-        """A JPEG, and the moments at which its light went on and off: aiming must not use up the picture's light."""
+    def _live_picture(self) -> tuple[bytes, float, float, Aim]:
+        """A JPEG, when its light went on and off (aiming must not use up the picture's light), and what to do."""
         spec = self.head.spec
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
@@ -379,7 +355,8 @@ class Exam:
             dark_s = self.clock.now_s()
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
         made = self._live(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
-        return picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated), exposed_s, dark_s
+        jpeg = picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated)
+        return jpeg, exposed_s, dark_s, self._eyes.aim(frame.counts, exposed_s)
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:
         before = self.problem.code if self.problem else None

@@ -15,7 +15,8 @@ from device.head import Bench, Head, refuse_recording
 from device.spec import CalibrationTable, InstrumentSpec
 from services.instrument.bulletin import Bulletin
 from services.instrument.calibrating import Wish
-from services.instrument.exam import Exam, Preview
+from services.instrument.exam import Exam
+from services.instrument.press import Preview
 from services.instrument.watchdog import Watchdog
 from services.instrument.wizard import Back, Wizard
 from services.records.store import Store

@@ -19,10 +19,12 @@ from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.exam import Exam
+from services.instrument.forgery import own_names
 from services.instrument.owner import House, Owner, archive_of, calibrated
 from services.instrument.technician import Door
 from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
+from services.records.protocol import Protocol
 from services.records.store import Store
 
 BACKLOG = 128
@@ -66,11 +68,13 @@ def _remedy(error: OSError, port: int) -> str:
 
 
 def serve(
-    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog
-) -> None:
+    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
+    protocol: Protocol, names: tuple[str, ...] = (),
+) -> None:  # fmt: skip
     """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
-    The page is there while the exam still makes its plans; raises what keeps it from making them.
+    The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
+    `names`, beside the computer's own, its addresses, and local ones.
     """
     clock = SystemClock()
     with address, Store(data) as store:
@@ -83,7 +87,7 @@ def serve(
             return Exam(head, store, house.bulletin, clock, data / "plans", house.died, watchdog)
 
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
-        app = create_app(owner, Door(data / "technician.json", clock))
+        app = create_app(owner, Door(data / "technician.json", clock), protocol, own_names() + names)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()

@@ -102,6 +102,130 @@ class SeenRow(Shelf):
     __table_args__ = (CheckConstraint("id = 1", name="time_is_one"), {"sqlite_strict": True})
 
 
+class PersonRow(Shelf):
+    """Somebody who was here, known by a number alone."""
+
+    __tablename__ = "persons"
+
+    number: Mapped[str] = mapped_column(Text, primary_key=True)
+    made_at: Mapped[str] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("length(number) BETWEEN 1 AND 20", name="number_is_short"),
+        {"sqlite_strict": True},
+    )
+
+
+class IdentifierRow(Shelf):
+    """What tells who a number is, apart from everything else: a name, a phone, a village; `value` is JSON."""
+
+    __tablename__ = "identifiers"
+
+    person: Mapped[str] = mapped_column(Text, ForeignKey("persons.number"), primary_key=True)
+    name: Mapped[str] = mapped_column(Text, primary_key=True)
+    value: Mapped[str] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("json_valid(value)", name="identifier_is_json"),
+        CheckConstraint("length(value) <= 2000", name="identifier_is_short"),
+        {"sqlite_strict": True},
+    )
+
+
+class VisitRow(Shelf):
+    """One visit; `day` is the calendar's where the instrument stands, moments are UTC; `outcome` is JSON."""
+
+    __tablename__ = "visits"
+
+    id: Mapped[str] = mapped_column(Text, primary_key=True)
+    person: Mapped[str] = mapped_column(Text, ForeignKey("persons.number"))
+    day: Mapped[str] = mapped_column(Text)
+    begun_at: Mapped[str] = mapped_column(Text)
+    finished_at: Mapped[str | None] = mapped_column(Text)
+    outcome: Mapped[str | None] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="what_is_finished_has_an_outcome"),
+        CheckConstraint("outcome IS NULL OR json_valid(outcome)", name="outcome_is_json"),
+        Index("visits_by_time", "begun_at", "id"),
+        Index("visits_by_day", "day"),
+        {"sqlite_strict": True},
+    )
+
+
+class FieldRow(Shelf):
+    """One answer of a visit, written as soon as it was given; `value` is JSON."""
+
+    __tablename__ = "fields"
+
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
+    name: Mapped[str] = mapped_column(Text, primary_key=True)
+    value: Mapped[str] = mapped_column(Text)
+    set_at: Mapped[str] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("json_valid(value)", name="field_is_json"),
+        CheckConstraint("length(value) <= 2000", name="field_is_short"),
+        {"sqlite_strict": True},
+    )
+
+
+class ShotRow(Shelf):
+    """To which slot of which visit a capture belongs."""
+
+    __tablename__ = "shots"
+
+    capture: Mapped[str] = mapped_column(Text, ForeignKey("captures.id"), primary_key=True)
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"))
+    slot: Mapped[str] = mapped_column(Text)
+
+    __table_args__ = (Index("shots_by_visit", "visit"), {"sqlite_strict": True})
+
+
+class SlotRow(Shelf):
+    """What somebody decided about a slot: this capture, or could not and why, or neither: it is empty again."""
+
+    __tablename__ = "slots"
+
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
+    slot: Mapped[str] = mapped_column(Text, primary_key=True)
+    capture: Mapped[str | None] = mapped_column(Text, ForeignKey("captures.id"))
+    reason: Mapped[str | None] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("capture IS NULL OR reason IS NULL", name="taken_or_could_not"),
+        {"sqlite_strict": True},
+    )
+
+
+class CounterRow(Shelf):
+    """The last automatic number that was given under a prefix."""
+
+    __tablename__ = "counters"
+
+    prefix: Mapped[str] = mapped_column(Text, primary_key=True)
+    last: Mapped[int]
+
+    __table_args__ = (CheckConstraint("last >= 0", name="counters_count"), {"sqlite_strict": True})
+
+
+class KeyRow(Shelf):
+    """A request that was done, and its answer, so that its repetition does nothing."""
+
+    __tablename__ = "keys"
+
+    key: Mapped[str] = mapped_column(Text, primary_key=True)
+    request: Mapped[str] = mapped_column(Text)
+    answer: Mapped[str] = mapped_column(Text)
+    done_at: Mapped[str] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("length(key) = 16", name="key_is_whole"),
+        Index("keys_by_time", "done_at"),
+        {"sqlite_strict": True},
+    )
+
+
 def open_engine(path: Path) -> Engine:
     """Connections to one SQLite file, safe to use from any thread; a connection that asks for `writing` waits its turn.
 

@@ -24,7 +24,8 @@ from sqlalchemy.orm import Session
 from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
 from device.values import Capture
 from services.records import disk, schema
-from services.records.schema import CaptureRow, FileRow
+from services.records.errand import Beside
+from services.records.schema import CaptureRow, FileRow, ShotRow
 
 RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
@@ -70,9 +71,10 @@ class Store:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
 
-    def keep(self, capture: Capture, files: Mapping[str, bytes]) -> Capture:
+    def keep(self, capture: Capture, files: Mapping[str, bytes], beside: Beside | None = None) -> Capture:
         """Keep a capture and its files by name, and return it with their SHA-256 once no power cut can undo it.
 
+        What `beside` writes is kept with it, or not at all.
         Errors: StoreFull (nothing is left of it), StoreError (what was written goes to `torn/` at the next opening),
         SettingError (a name or report that cannot be kept).
         """
@@ -89,6 +91,9 @@ class Store:
                 disk.settle(self._captures)
                 with Session(schema.for_writing(self.engine)) as session, session.begin():
                     session.add(row)
+                    if beside is not None:
+                        session.flush()
+                        beside(session, capture)
         return capture
 
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
@@ -126,6 +131,19 @@ class Store:
             raise StoreDamaged(f"{file.name} of {id} is not what was kept: its SHA-256 differs")
         return content
 
+    def people_left(self, pictures: int) -> int:
+        """How many more visits will fit, judged by the mean size of those so far, or by `pictures` captures each."""
+        with self._reading() as session:
+            total_bytes, number = session.execute(
+                select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(ShotRow.visit))).join(
+                    ShotRow, ShotRow.capture == FileRow.capture_id
+                )
+            ).one()
+        return self._room_bytes() * number // max(1, total_bytes) if number else self.space_left() // pictures
+
+    def _room_bytes(self) -> int:
+        return max(0, self._free_bytes(self.folder) - self._reserve_bytes)
+
     def space_left(self) -> int:
         """How many more captures will fit, judged by the mean size so far."""
         with self._reading() as session:
@@ -133,7 +151,7 @@ class Store:
                 select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(FileRow.capture_id)))
             ).one()
             mean_bytes = max(1, total_bytes // number) if number else ESTIMATE_BYTES
-            return max(0, self._free_bytes(self.folder) - self._reserve_bytes) // mean_bytes
+            return self._room_bytes() // mean_bytes
 
     @contextmanager
     def _reading(self) -> Iterator[Session]:

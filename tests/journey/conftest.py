@@ -94,6 +94,8 @@ class Rig:
     store: Store
     bulletin: Bulletin
     exam: Exam
+    owner: Owner
+    door: Door
     app: FastAPI
     died: Event = field(default_factory=Event)
 
@@ -114,7 +116,7 @@ class Rig:
 
         async def told() -> Any:
             transport = httpx.ASGITransport(app=self.app, **options)
-            async with httpx.AsyncClient(transport=transport, base_url="http://eye", timeout=30) as client:
+            async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as client:
                 return await story(client)
 
         return asyncio.run(told())
@@ -191,8 +193,8 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         assert not wait or exam.ready.wait(60)
         house = House(scene.spec, Archive(folder / "archive"), shelf, bulletin, clock, Watchdog(watchdog), died.set)
         owner = Owner(house, lambda: exam, lambda: open_bench(scene.spec, clock))
-        app = create_app(owner, Door(folder / "technician.json", clock))
-        return Rig(scene, clock, shelf, bulletin, exam, app, died)
+        door = Door(folder / "technician.json", clock)
+        return Rig(scene, clock, shelf, bulletin, exam, owner, door, create_app(owner, door), died)
 
     return built
 

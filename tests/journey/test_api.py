@@ -278,6 +278,10 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
     fixed = {
         "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
         "/api/events": {"get"}, "/api/preview": {"get"}, "/api/health": {"get"}, "/api/status": {"get"},
+        "/api/captures/{id}/keep": {"post"}, "/api/controller": {"post"}, "/api/protocol": {"get"},
+        "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
+        "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
+        "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
     }  # fmt: skip
     served = {path: set(verbs) for path, verbs in book["paths"].items()}
     behind_the_pin = ("/api/technician", "/api/calibration")
@@ -324,44 +328,47 @@ def test_a_press_is_told_in_order_and_its_links_lead_to_it(old_rig: Any, read_ev
     heard = read_events(old_rig.app, enough, begin=lambda: old_rig.exam.press("OS"))
     assert heard[0][:2] == (None, "beat")
     news = [event for event in heard if event[1] != "beat"]
-    told = [(kind, data.get("state") or data.get("stage")) for _, kind, data in news]
+    told = [(kind, data.get("state") or data.get("stage") or data.get("word")) for _, kind, data in news]
     assert told == [
-        ("state", "busy"), ("stage", "expose"), ("state", "making"), ("stage", "quick"), ("stage", "keep"),
-        ("kept", None), ("state", "aim"),
+        ("state", "busy"), ("stage", "expose"), ("verdict", "good"), ("state", "making"), ("stage", "quick"),
+        ("stage", "keep"), ("kept", None), ("state", "aim"),
     ]  # fmt: skip
     numbers = [number for number, _, _ in news]
-    assert numbers == list(range(numbers[0], numbers[0] + 7))
+    assert numbers == list(range(numbers[0], numbers[0] + 8))
     fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
     assert fractions == sorted(fractions)
-    kept = news[5][2]
+    kept = news[6][2]
     assert kept == old_rig.request("GET", f"/api/captures/{kept['id']}").json()
     assert {data["id"] for _, kind, data in news if kind == "stage"} == {kept["id"]}
-    assert old_rig.request("GET", news[3][2]["url"]).status_code == 200
+    first, last = news[2][2], kept["verdict"]
+    assert (first["id"], first["word"], first["code"]) == (kept["id"], last["word"], last["code"])
+    assert first["numbers"].items() < last["numbers"].items()  # what only the picture tells came later
+    assert old_rig.request("GET", news[4][2]["url"]).status_code == 200
 
 
 def test_a_page_that_was_away_hears_what_it_missed_and_nothing_twice(rig: Any, read_events: Any) -> None:
     kept = rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda heard: len(heard) == 9, {"Last-Event-ID": "0"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert news[6][2]["id"] == kept.id
-    later = read_events(rig.app, lambda heard: len(heard) == 3, {"Last-Event-ID": "6"})[1:]
-    assert [number for number, _, _ in later] == [7, 8]
+    news = read_events(rig.app, lambda heard: len(heard) == 10, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert news[7][2]["id"] == kept.id
+    later = read_events(rig.app, lambda heard: len(heard) == 3, {"Last-Event-ID": "7"})[1:]
+    assert [number for number, _, _ in later] == [8, 9]
     fresh = read_events(rig.app, lambda heard: len(heard) == 1)
-    assert fresh[0][1:] == ("beat", {"number": 8})
+    assert fresh[0][1:] == ("beat", {"number": 9})
     refused(rig.request("GET", "/api/events", headers={"Last-Event-ID": "yesterday"}), 422, "input")
 
 
 def test_a_page_that_remembers_more_than_was_told_was_here_before_a_restart(rig: Any, read_events: Any) -> None:
     rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda heard: len(heard) == 9, {"Last-Event-ID": "500"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8]
+    news = read_events(rig.app, lambda heard: len(heard) == 10, {"Last-Event-ID": "500"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
 
 
 def test_a_capture_that_was_damaged_does_not_stop_the_news_after_it(rig: Any, read_events: Any) -> None:
     kept = rig.exam.press("OD").result(30)
     (rig.store.folder / "captures" / kept.id).rename(rig.store.folder / "gone")
-    news = read_events(rig.app, lambda heard: heard[-1][0] == 8, {"Last-Event-ID": "0"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 8]
+    news = read_events(rig.app, lambda heard: heard[-1][0] == 9, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 9]
 
 
 def test_the_heart_beats_every_second_while_nothing_happens(old_rig: Any, read_events: Any) -> None:

@@ -273,7 +273,7 @@ def test_every_connection_is_durable_and_the_tables_are_strict(store: Store) -> 
             assert connection.exec_driver_sql("PRAGMA busy_timeout").scalar() >= 1000
         strict = {name: flag for name, flag in one.exec_driver_sql("SELECT name, strict FROM pragma_table_list")}  # noqa: C416
     engine.dispose()
-    assert strict["captures"] == strict["files"] == strict["light_doses"] == strict["light_time"] == 1
+    assert {strict[table.name] for table in schema.Shelf.metadata.sorted_tables} == {1}
 
 
 def test_the_migrations_make_what_the_models_say(store: Store) -> None:
@@ -282,7 +282,7 @@ def test_the_migrations_make_what_the_models_say(store: Store) -> None:
         assert compare_metadata(MigrationContext.configure(connection), schema.Shelf.metadata) == []
         made = set(
             connection.exec_driver_sql(
-                "SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files', 'light_doses', 'light_time')"
+                "SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL AND name != 'alembic_version'"
             ).scalars()
         )
     engine.dispose()
@@ -291,7 +291,7 @@ def test_the_migrations_make_what_the_models_say(store: Store) -> None:
         schema.Shelf.metadata.create_all(connection)
         said = set(
             connection.exec_driver_sql(
-                "SELECT sql FROM sqlite_schema WHERE name IN ('captures', 'files', 'light_doses', 'light_time')"
+                "SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL AND name != 'alembic_version'"
             ).scalars()
         )
     fresh.dispose()

@@ -1,0 +1,227 @@
+"""Whether a picture can be made of a frame, told from its raw counts while the eye is still there.
+
+A coarse, linear solution of the frame answers what can be asked of one frame: is it too bright or too dark, did the
+light come through the field or from everywhere, is a part of the field dark, does anything shine that is not the
+retina, is there less detail along one direction. What one frame cannot tell is not guessed: a smear of more than some
+degrees leaves nothing that points anywhere, and a lid looks like a wall.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from math import hypot, isfinite
+from typing import Any, Literal
+
+import numpy as np
+
+from device.recon.kernels import Pixels
+from device.recon.model import Model, field_radius_px, tight_model
+from device.recon.plan import Planner
+from device.recon.prepare import Preparer
+from device.recon.reconstructor import plane
+from device.recon.variation import EvidenceWiener
+from device.values import Calibration, Image
+
+Word = Literal["good", "again"]
+Code = Literal[
+    "shot.saturated", "shot.dark", "shot.moved", "shot.noeye", "shot.pupil", "shot.blink", "shot.edge", "shot.halo",
+    "shot.poor",
+]  # fmt: skip
+
+# Limits. How often they hit and how often they cry wolf is measured in tests/hard/test_verdict.py.
+MOST_SATURATED = 0.001  # share of pixels, as in `quality.complaints`
+# `wide` of a saturated frame: too much light flattens its middle, a reflex, which is small, does not.
+LARGEST_SPOT, SPOT, SPOT_PER_SHARE = 0.15, 0.975, 0.6
+LEAST_E_PER_UM2 = 0.5  # a human eye's photon budget gives 3.0, and a PCC of 0.91; 0.3 gives 0.81, 0.1 gives 0.67
+LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
+LEAST_COVERAGE = 0.9  # good fields have 0.975 and more
+LEAST_WIDE, MOST_WIDE = 0.93, 1.025  # good fields have 0.97 to 1.005
+ONE_SIDED = 0.1
+MOST_SMEAR = 0.22
+HOPELESS = 0.25  # share of saturated pixels beyond which nothing else can be told
+FIELD_SAMPLES = 64  # across the field, at the least
+SMEAR_CYCLES = (12, 40)  # across the field: finer is noise, coarser is the eye's own shape
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What one raw frame tells; None where it cannot be told (no field known, no gain known, too much light).
+
+    `light_e_per_um2` is the mean on the sensor, `through` the share of it that came through the field; `coverage` the
+    lit share of the field, `off_x` and `off_y` where the middle of its light is, in radii, right and down; `smear` how
+    much the detail depends on its direction; `wide` the rms radius of the light on the sensor over an even field's.
+    """
+
+    saturated: float
+    light_e_per_um2: float | None = None
+    through: float | None = None
+    coverage: float | None = None
+    off_x: float | None = None
+    off_y: float | None = None
+    smear: float | None = None
+    wide: float | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One word for whoever holds the camera, one cause, and the numbers behind it."""
+
+    word: Word
+    code: Code | None
+    numbers: dict[str, Any]
+
+
+def judge(reading: Reading, eye_before: bool = False) -> Verdict:
+    """The first thing that is wrong, the most useful first; `eye_before`: an eye was seen just before this frame."""
+    code = _cause(reading, eye_before)
+    return Verdict("good" if code is None else "again", code, _rounded(asdict(reading)))
+
+
+def after(first: Verdict, residual: float | None, coverage: float | None, tries: int, retakes: int) -> Verdict:
+    """The verdict once the picture is made with the eye's own PSF; after `retakes` a bad one is simply not clear.
+
+    The residual is told and decides nothing: stray light and worn pixels double it in pictures that are good.
+    """
+    numbers = first.numbers | _rounded({"residual": residual, "lit": coverage})
+    code = first.code
+    if code is None and coverage is not None and coverage < LEAST_COVERAGE:
+        code = "shot.edge"
+    if code is not None and tries >= retakes:
+        code = "shot.poor"
+    return Verdict("good" if code is None else "again", code, numbers)
+
+
+def _cause(seen: Reading, eye_before: bool) -> Code | None:
+    if seen.saturated > MOST_SATURATED:
+        narrow = seen.wide is not None and seen.wide < SPOT + SPOT_PER_SHARE * seen.saturated
+        return "shot.halo" if narrow and seen.saturated < LARGEST_SPOT else "shot.saturated"
+    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < LEAST_E_PER_UM2:
+        return "shot.dark"
+    if seen.through is not None and seen.through < LEAST_THROUGH:
+        return "shot.blink" if eye_before else "shot.noeye"
+    if _is_cut(seen):
+        return "shot.edge" if hypot(seen.off_x or 0.0, seen.off_y or 0.0) > ONE_SIDED else "shot.pupil"
+    return "shot.moved" if seen.smear is not None and seen.smear > MOST_SMEAR else None
+
+
+def _rounded(numbers: dict[str, float | None]) -> dict[str, Any]:
+    """What is known, with as many digits as mean something."""
+    return {key: float(f"{value:.4g}") for key, value in numbers.items() if value is not None}
+
+
+def _is_cut(seen: Reading) -> bool:
+    """Whether a part of the light that should come through the field is missing."""
+    narrow = seen.wide is not None and not LEAST_WIDE < seen.wide < MOST_WIDE
+    return narrow or (seen.coverage is not None and seen.coverage < LEAST_COVERAGE)
+
+
+class Gate:
+    """Planned once for a calibration and a sensor; then reads frames. One thread at a time.
+
+    Where no field is known only brightness is told, for then nothing says where light should be.
+    """
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int = 0) -> None:
+        self._sensor, self._geometry = calibration.sensor, calibration.geometry
+        radius_px = field_radius_px(calibration)
+        self._eye: _Eye | None = None
+        if isfinite(radius_px):
+            n = max(1, int(2 * radius_px // FIELD_SAMPLES))
+            self._eye = _Eye(calibration, tight_model(calibration, shape, n, planner, index))
+
+    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Reading:
+        """What a frame tells; `counts` and `dark` as for the Reconstructor."""
+        counts, dark = brightest(counts, dark)
+        saturated = float((counts >= self._sensor.white_dn).mean())
+        black_dn = self._sensor.black_dn if dark is None else float(dark.mean(dtype=np.float64))
+        light_dn = float(counts.mean(dtype=np.float64)) - black_dn
+        plain = Reading(saturated, light_e_per_um2=self._light(light_dn))
+        if self._eye is None or saturated > HOPELESS or light_dn <= 0:
+            return plain
+        return self._eye.read(plain, counts, dark)
+
+    @property
+    def picture(self) -> Image | None:
+        """The coarse picture of the frame that was read last: the field and what is around it; None without a field."""
+        return None if self._eye is None else self._eye.shown
+
+    @property
+    def deg_per_sample(self) -> float | None:
+        """How wide one sample of that picture is."""
+        return None if self._eye is None or self._geometry is None else self._eye.bin / self._geometry.px_per_deg
+
+    def _light(self, light_dn: float) -> float | None:
+        if self._sensor.gain_e_per_dn is None or self._geometry is None:
+            return None
+        return light_dn * self._sensor.gain_e_per_dn / self._geometry.pitch_um**2
+
+
+class _Eye:
+    """The coarse solution of a frame, and what its field looks like."""
+
+    def __init__(self, calibration: Calibration, model: Model) -> None:
+        self._span_dn = calibration.sensor.white_dn - calibration.sensor.black_dn
+        self._solver = EvidenceWiener(model, calibration)
+        self._prepare = Preparer(calibration, model.grid)
+        self._even_radius = _rms_radius(model.flat)
+        self._picture: Image = np.zeros(model.grid.shape, np.float32)
+        self._shown, self.bin = model.grid.shown, model.grid.n
+        self.shown: Image = self._picture[self._shown]
+        radius = model.grid.radius_samples
+        rows, cols = (
+            (np.arange(span.start, span.stop) - middle) / radius
+            for span, middle in zip(self._shown, model.grid.centre, strict=True)
+        )
+        self._down, self._right = np.meshgrid(rows, cols, indexing="ij")
+        away = np.hypot(self._down, self._right)
+        self._inner = away < 0.9
+        self._window = 0.5 - 0.5 * np.cos(np.pi * np.clip((0.85 - away) / 0.25, 0, 1))
+        across, along = np.meshgrid(np.fft.fftfreq(rows.size), np.fft.rfftfreq(cols.size), indexing="ij")
+        cycles = 2 * radius * np.hypot(across, along)
+        self._band = (cycles > SMEAR_CYCLES[0]) & (cycles < SMEAR_CYCLES[1])
+        self._weight = cycles[self._band] ** 3  # a retina's power falls so: every ring has its say
+        self._turn = np.exp(2j * np.arctan2(across, along))[self._band]
+
+    def read(self, plain: Reading, counts: Pixels, dark: Pixels | None) -> Reading:
+        """The reading with what the field tells."""
+        frame, picture, solver = self._prepare(counts, dark), self._picture, self._solver
+        if plain.saturated > MOST_SATURATED:
+            full = (1 - frame.good) * np.float32(self._span_dn)
+            return replace(plain, wide=_rms_radius(frame.y + full) / self._even_radius)
+        solver.start(frame)
+        solver.finish(picture)
+        shown = self.shown
+        light = float(shown[self._inner].sum(dtype=np.float64))
+        off_x, off_y = (
+            float((shown * along)[self._inner].sum(dtype=np.float64)) / light if light > 0 else None
+            for along in (self._right, self._down)
+        )
+        return replace(
+            plain, through=1 - solver.stray / frame.mean_dn, coverage=solver.facts["quality"]["coverage"],
+            off_x=off_x, off_y=off_y, smear=self._smear(shown),
+            wide=_rms_radius(frame.y - solver.stray) / self._even_radius,
+        )  # fmt: skip
+
+    def _smear(self, shown: Image) -> float | None:
+        """How much the power of the detail depends on its direction: 0 for none, 1 where all is along one."""
+        window, mean = self._window, float((shown * self._window).sum(dtype=np.float64)) / float(self._window.sum())
+        if mean <= 0:
+            return None
+        power = np.abs(np.fft.rfft2((shown / mean - 1) * window))[self._band] ** 2 * self._weight
+        return float(np.abs((power * self._turn).sum()) / power.sum())
+
+
+def brightest(counts: Pixels, dark: Pixels | None) -> tuple[Pixels, Pixels | None]:
+    """The channel with the most light, and its dark frame."""
+    if counts.ndim == 2:
+        return counts, dark
+    c = int(np.argmax(counts.mean(axis=(0, 1))))
+    return plane(counts, c), None if dark is None else plane(dark, c)
+
+
+def _rms_radius(light: Image) -> float:
+    """How far from its middle the light is, root mean square, in samples."""
+    total, squared = max(float(light.sum(dtype=np.float64)), 1e-9), 0.0
+    for axis in (0, 1):
+        profile, place = light.sum(axis=1 - axis, dtype=np.float64), np.arange(light.shape[axis])
+        middle = float(profile @ place) / total
+        squared += float(profile @ (place - middle) ** 2) / total
+    return float(max(squared, 1e-9) ** 0.5)

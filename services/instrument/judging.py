@@ -1,0 +1,46 @@
+"""What the page hears about a frame: how to aim before it, and whether it is good, at once and after its making."""
+
+from dataclasses import asdict
+
+from device.recon.aim import Aim, Aimer
+from device.recon.kernels import Pixels
+from device.recon.plan import Planner
+from device.recon.verdict import Gate, Verdict, after, judge
+from device.values import Calibration, Report
+from services.instrument.bulletin import Bulletin
+from services.records.errand import Errand
+
+NOWHERE = Aim("noeye", 0.0)
+
+
+class Watch:
+    """Reads frames for whoever owns the head, and tells pages what it saw; one thread at a time."""
+
+    def __init__(
+        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, shot_s: float,
+        bulletin: Bulletin,
+    ) -> None:  # fmt: skip
+        self._gate = Gate(calibration, shape, planner, index)
+        self._aimer, self._bulletin = Aimer(shot_s, self._gate.deg_per_sample), bulletin
+        self._told: Aim | None = None
+
+    def aim(self, counts: Pixels, exposed_s: float) -> Aim:
+        """What to do after one more live frame; pages are told when the word changes."""
+        aim = self._aimer(self._gate(counts), self._gate.picture, exposed_s)
+        if self._told is None or self._told.code != aim.code:
+            self._told = aim
+            self._bulletin.tell("aim", **asdict(aim))
+        return aim
+
+    def judge(self, id: str, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
+        """Whether a frame is good, from its raw counts, told to pages before anything is made of it."""
+        return self._say(id, judge(self._gate(counts, dark), self._aimer.saw_an_eye(begin_s)))
+
+    def judge_again(self, id: str, first: Verdict, report: Report, errand: Errand) -> Verdict:
+        """The last word, when the picture is made; pages are told if it is another."""
+        again = after(first, report.residual, report.quality.get("coverage"), errand.tries, errand.retakes)
+        return again if (again.word, again.code) == (first.word, first.code) else self._say(id, again)
+
+    def _say(self, id: str, verdict: Verdict) -> Verdict:
+        self._bulletin.tell("verdict", id=id, **asdict(verdict))
+        return verdict

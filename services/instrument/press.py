@@ -1,0 +1,43 @@
+"""What travels through the exam: a live picture, a press, and a press whose light is done."""
+
+from concurrent.futures import Future
+from dataclasses import dataclass
+from datetime import datetime
+
+from device.recon.aim import Aim
+from device.recon.verdict import Verdict
+from device.values import Capture, Eye, Frame
+from services.records.errand import Errand
+
+
+@dataclass(frozen=True)
+class Preview:
+    """One live picture: its number, its JPEG, when it was exposed, and what to do so that one can be taken."""
+
+    number: int
+    jpeg: bytes
+    exposed_s: float
+    aim: Aim
+
+
+@dataclass(frozen=True)
+class Press:
+    """Who waits for a picture, of which eye, and what for."""
+
+    answer: Future[Capture]
+    eye: Eye
+    errand: Errand
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A press whose light is done: what is left needs no eye."""
+
+    press: Press
+    id: str
+    taken_at: datetime
+    frame: Frame
+    dark: Frame
+    expose_s: float
+    light: dict[str, object]
+    verdict: Verdict

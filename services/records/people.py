@@ -1,0 +1,274 @@
+"""Persons and their visits on the shelf: an answer is on the disk before it is acknowledged, a repeat is harmless."""
+
+import hashlib
+import json
+import secrets
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime, timedelta
+from typing import Any
+
+from sqlalchemy import Engine, delete
+from sqlalchemy.orm import Session
+
+from device.clock import Clock
+from device.errors import InputError, NotKept, VisitFinished
+from device.values import Capture, Eye
+from services.records import answers, numbering, schema, visits
+from services.records.errand import Beside, Errand
+from services.records.protocol import CHOOSE, Protocol
+from services.records.schema import CounterRow, FieldRow, IdentifierRow, KeyRow, PersonRow, ShotRow, SlotRow, VisitRow
+from services.records.store import told
+from services.records.visit import Decided, Taken, Visit, decided_after, outcome
+
+UNDO_S = 10.0
+REMEMBERED = timedelta(days=30)  # no network repeats a request for longer
+
+
+class People:
+    """Persons and visits in the shelf's database; any thread may ask, and those who write wait for each other."""
+
+    def __init__(self, engine: Engine, protocol: Protocol, clock: Clock) -> None:
+        self.engine, self.protocol, self.clock = engine, protocol, clock
+
+    def begin(self, key: str, number: str | None = None) -> Visit:
+        """A new visit: of the person of that number, or of somebody new; without a number the next automatic one.
+
+        Errors: InputError for what is no number, or for an automatic one with a wrong check digit.
+        """
+
+        number = None if number is None else numbering.tidy(number)
+
+        def act(session: Session) -> str:
+            now = self.clock.wall()
+            session.execute(delete(KeyRow).where(KeyRow.done_at < schema.utc_text(now - REMEMBERED)))
+            person = self._person(session, number)
+            id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+            day = now.astimezone().date().isoformat()
+            session.add(VisitRow(id=id, person=person, day=day, begun_at=schema.utc_text(now)))
+            return id
+
+        return self.get(self._once(key, f"begin {number}", act))
+
+    def get(self, id: str) -> Visit:
+        """One visit; NotKept if there is none."""
+        with told(), Session(self.engine) as session:
+            return visits.read(session, self.protocol, [visits.row(session, id)])[0]
+
+    def visits(
+        self, limit: int, day: str | None = None, open: bool | None = None, digits: str | None = None
+    ) -> list[Visit]:
+        """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number."""
+        with told(), Session(self.engine) as session:
+            return visits.read(session, self.protocol, visits.found(session, limit, day, open, digits))
+
+    def counts(self, day: str | None = None) -> dict[str, int]:
+        """How many visits of a day (None: of all) are done, are to be finished, and were referred."""
+        with told(), Session(self.engine) as session:
+            return visits.counts(session, day)
+
+    def answer(self, key: str, id: str, name: str, value: Any) -> Visit:
+        """Write one answer down, or take it back (None); InputError if it cannot be one, VisitFinished if too late."""
+        value = answers.checked(name, value)
+
+        def act(session: Session) -> str:
+            person, now = self._open(session, id).person, schema.utc_text(self.clock.wall())
+            row: IdentifierRow | FieldRow
+            if name in answers.IDENTIFIERS:
+                row = IdentifierRow(person=person, name=name, value=json.dumps(value))
+            else:
+                row = FieldRow(visit=id, name=name, value=json.dumps(value), set_at=now)
+            row = session.merge(row)
+            if value is None:
+                session.flush()
+                session.delete(row)
+            return id
+
+        return self.get(self._once(key, f"answer {id} {name} {json.dumps(value)}", act))
+
+    def errand(self, eye: Eye, key: str | None, id: str | None, slot: str | None) -> Errand:
+        """What is to be done with a picture of that eye; InputError if the slot is of the other one."""
+        if id is None or slot is None:
+            return Errand(beside=self._beside(key))
+        visit, wanted = self.get(id), self.protocol.slot(slot)
+        if wanted.eye != eye:
+            raise InputError(f"{slot} is a picture of {wanted.eye}, not of {eye}", CHOOSE)
+        if visit.finished_at is not None:
+            raise VisitFinished(f"the visit {id} is finished")
+        tries = len(visit.slots[slot].taken)
+        return Errand(id, slot, tries, self.protocol.retakes, self._beside(key))
+
+    def _beside(self, key: str | None) -> Beside:
+        """What is kept with a capture: the key of the press that made it, and its place."""
+
+        def write(session: Session, capture: Capture) -> None:
+            if key is not None:
+                self._remember(session, key, "press", capture.id)
+            if capture.report["visit"] is not None:
+                self._put(session, capture)
+
+        return write
+
+    def answered(self, key: str) -> str | None:
+        """What a press with this key was answered: the name of its capture; None if there was none."""
+        with told(), Session(self.engine) as session:
+            row = session.get(KeyRow, key)
+            return row.answer if row is not None and row.request == _digest("press") else None
+
+    def keep(self, key: str, capture: str) -> Visit:
+        """Make a capture the one that stands for its slot; NotKept if it belongs to no visit."""
+
+        def act(session: Session) -> str:
+            shot = session.get(ShotRow, capture)
+            if shot is None:
+                raise NotKept(f"the capture {capture[:60]!r} belongs to no visit")
+            self._open(session, shot.visit)
+            _decide(session, shot.visit, shot.slot, Decided(capture))
+            return shot.visit
+
+        return self.get(self._once(key, f"keep {capture}", act))
+
+    def choose(self, key: str, id: str, slot: str, capture: str | None) -> Visit:
+        """Make a capture of that very slot stand for it, or empty the slot (None); either ends a "could not"."""
+
+        def act(session: Session) -> str:
+            self._open(session, id)
+            shot = session.get(ShotRow, capture) if capture is not None else None
+            if capture is not None and (shot is None or (shot.visit, shot.slot) != (id, slot)):
+                raise NotKept(f"{capture[:60]!r} is not a picture of {slot} of this visit")
+            _decide(session, id, slot, Decided(capture))
+            return id
+
+        self.protocol.slot(slot)
+        return self.get(self._once(key, f"choose {id} {slot} {capture}", act))
+
+    def could_not(self, key: str, id: str, slot: str, reason: str) -> Visit:
+        """Write down that a picture could not be taken, and why; the pictures that were tried stay."""
+        self.protocol.slot(slot)
+        if reason not in self.protocol.reasons:
+            raise InputError(f"reason: {reason[:40]!r} is none", f"Choose one of: {', '.join(self.protocol.reasons)}.")
+
+        def act(session: Session) -> str:
+            self._open(session, id)
+            _decide(session, id, slot, Decided(reason=reason))
+            return id
+
+        return self.get(self._once(key, f"could not {id} {slot} {reason}", act))
+
+    def finish(self, key: str, id: str) -> Visit:
+        """Finish a visit with what there is; its outcome is told by the programme's rules. Finished ones stay."""
+
+        def act(session: Session) -> str:
+            row = visits.row(session, id)
+            if row.finished_at is None:
+                visit = visits.read(session, self.protocol, [row])[0]
+                told = outcome(self.protocol, visit.fields, visit.slots)
+                row.outcome = json.dumps({"code": told.code, "sentence": told.sentence})
+                row.finished_at = schema.utc_text(self.clock.wall())
+            return id
+
+        return self.get(self._once(key, f"finish {id}", act))
+
+    def reopen(self, key: str, id: str) -> Visit:
+        """Undo a finish, within ten seconds; then VisitFinished."""
+
+        def act(session: Session) -> str:
+            row = visits.row(session, id)
+            if row.finished_at is not None and not self.can_undo(datetime.fromisoformat(row.finished_at)):
+                raise VisitFinished(f"the visit {id} was finished more than {UNDO_S:.0f} s ago")
+            row.finished_at = row.outcome = None
+            return id
+
+        return self.get(self._once(key, f"reopen {id}", act))
+
+    def once(self, key: str, request: str, act: Callable[[], str]) -> str:
+        """Do something that is none of ours, and remember its answer; a repetition is only answered.
+
+        It is not done inside a transaction: it may take long, and others want to write.
+        """
+        with told(), Session(self.engine) as session:
+            before = session.get(KeyRow, key)
+        if before is not None:
+            return _same(before, request)
+        answer = act()
+        return self._once(key, request, lambda _: answer)
+
+    def can_undo(self, finished_at: datetime) -> bool:
+        """Whether what was finished then can still be undone."""
+        return self.clock.wall() - finished_at <= timedelta(seconds=UNDO_S)
+
+    def _once(self, key: str, request: str, act: Callable[[Session], str]) -> str:
+        """Do it, and remember the answer in the same transaction; a repetition is only answered."""
+        with self._writing() as session:
+            before = session.get(KeyRow, key)
+            if before is None:
+                answer = act(session)
+                self._remember(session, key, request, answer)
+                return answer
+            return _same(before, request)
+
+    def _person(self, session: Session, number: str | None) -> str:
+        """The person of a number, or a new one; of digits alone, who has them after the programme's prefix."""
+        prefix = self.protocol.programme.prefix
+        if number is None:
+            number = self._next_number(session, prefix)
+        elif session.get(PersonRow, number) is None and session.get(PersonRow, prefix + number) is not None:
+            number = prefix + number
+        elif numbering.looks_automatic(prefix, number) and not numbering.is_checked(prefix, number):
+            raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
+        if session.get(PersonRow, number) is None:
+            session.add(PersonRow(number=number, made_at=schema.utc_text(self.clock.wall())))
+            session.flush()
+        return number
+
+    def _next_number(self, session: Session, prefix: str) -> str:
+        """The next automatic number that nobody has."""
+        counter = session.get(CounterRow, prefix) or CounterRow(prefix=prefix, last=0)
+        session.add(counter)
+        while True:
+            counter.last += 1
+            if session.get(PersonRow, number := numbering.numbered(prefix, counter.last)) is None:
+                return number
+
+    def _open(self, session: Session, id: str) -> VisitRow:
+        """A visit in which something may still be changed."""
+        row = visits.row(session, id)
+        if row.finished_at is not None:
+            raise VisitFinished(f"the visit {id} is finished")
+        return row
+
+    def _put(self, session: Session, capture: Capture) -> None:
+        """Put a new capture into its slot; also of a visit that was finished meanwhile: no picture is lost."""
+        id, slot = capture.report["visit"], capture.report["slot"]
+        visit = visits.read(session, self.protocol, [visits.row(session, id)])[0]
+        session.add(ShotRow(capture=capture.id, visit=id, slot=slot))
+        _decide(session, id, slot, decided_after(visit.slots[slot], Taken(capture.id, capture.report.get("verdict"))))
+
+    @contextmanager
+    def _writing(self) -> Iterator[Session]:
+        with told(), Session(schema.for_writing(self.engine)) as session, session.begin():
+            yield session
+
+    def _remember(self, session: Session, key: str, request: str, answer: str) -> None:
+        now = schema.utc_text(self.clock.wall())
+        session.add(KeyRow(key=key, request=_digest(request), answer=answer, done_at=now))
+
+
+def _decide(session: Session, visit: str, slot: str, decided: Decided | None) -> None:
+    """Write a decision about a slot down, or take it back."""
+    if decided is not None:
+        session.merge(SlotRow(visit=visit, slot=slot, capture=decided.capture, reason=decided.reason))
+    elif (row := session.get(SlotRow, (visit, slot))) is not None:
+        session.delete(row)
+
+
+def _same(before: KeyRow, request: str) -> str:
+    """What this very request was answered; InputError if the key was another's."""
+    if before.request != _digest(request):
+        raise InputError("key: it belongs to another request", "Reload the page and try again.")
+    return before.answer
+
+
+def _digest(request: str) -> str:
+    """What a key remembers of its request: enough to know it again, nothing that could be read."""
+    return hashlib.sha256(request.encode("utf-8", "backslashreplace")).hexdigest()

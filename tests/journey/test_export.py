@@ -1,0 +1,150 @@
+"""A visit that is taken away: whole, checkable, without names; and a stick that is full, gone, or none."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from device.errors import StickFull, StickGone
+from services.instrument.api import create_app
+from services.instrument.exporting import Sticks, copied
+
+keys = (f"{number:016x}" for number in count(1))
+FILES = {"R-centre-1.png": b"p" * 5000, "visit.json": b"{}"}
+
+
+def mounted(table: Path, *folders: Path) -> None:
+    """What the kernel would list, with its way of writing blanks."""
+    lines = [f"/dev/sda1 {str(folder).replace(' ', chr(92) + '040')} vfat rw 0 0\n" for folder in folders]
+    table.write_text("proc /proc proc rw 0 0\n" + "".join(lines))
+
+
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    folder = tmp_path / "media" / "USB STICK"
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture
+def visit(rig: Any, tmp_path: Path, stick: Path) -> Any:
+    """A visit with a retake, of somebody with a name, on an instrument with one stick."""
+    mounted(tmp_path / "mounts", stick)
+    rig.app = create_app(rig.owner, rig.door, sticks=Sticks((tmp_path / "media",), tmp_path / "mounts"))
+    begun = rig.request("POST", "/api/visits", json={"key": next(keys)}).json()
+    at = f"/api/visits/{begun['id']}"
+    for field, value in {"name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}.items():
+        rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
+    for _ in range(2):
+        press = {"key": next(keys), "eye": "OD", "visit": begun["id"], "slot": "R-centre"}
+        assert rig.request("POST", "/api/captures", json=press).status_code == 201
+    return rig.request("GET", at).json()
+
+
+def check(folder: Path) -> None:
+    """As anybody with a computer would."""
+    subprocess.run(["sha256sum", "--check", "--quiet", "--strict", "SHA256SUMS"], cwd=folder, check=True)
+
+
+def test_the_zip_holds_pictures_reports_and_sums_that_hold_and_no_name(rig: Any, visit: Any, tmp_path: Path) -> None:
+    answer = rig.request("GET", f"/api/visits/{visit['id']}/export.zip")
+    assert answer.headers["content-type"] == "application/zip"
+    assert visit["number"] in answer.headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        archive.extractall(tmp_path / "out")
+    folder = tmp_path / "out" / f"{visit['number']}-{visit['id']}"
+    check(folder)
+    names = {path.name for path in folder.iterdir()}
+    pictures = {f"R-centre-{number}.{kind}" for number in (1, 2) for kind in ("png", "json")}
+    assert names == {"visit.json", "SHA256SUMS"} | pictures
+    for number, capture in enumerate(visit["slots"]["R-centre"]["captures"], 1):
+        assert (folder / f"R-centre-{number}.png").read_bytes() == rig.store.read(capture, "picture.png")
+    told = json.loads((folder / "visit.json").read_text())
+    assert told["fields"] == {"age": 54}
+    assert told["slots"] == visit["slots"]
+    for secret in (b"Meena", b"Nowhere", b"12345"):
+        assert secret not in answer.content
+
+
+def test_a_copy_on_a_stick_is_whole_and_an_earlier_one_stays(rig: Any, visit: Any, stick: Path) -> None:
+    listed = rig.request("GET", "/api/exports").json()["folders"]
+    assert [(one["folder"], one["name"]) for one in listed] == [(str(stick), "USB STICK")]
+    assert listed[0]["free_bytes"] > 0
+    order = {"key": next(keys), "folder": str(stick)}
+    at = f"/api/visits/{visit['id']}/export"
+    made = rig.request("POST", at, json=order).json()
+    assert rig.request("POST", at, json=order).json() == made
+    check(Path(made["folder"]))
+    other = rig.request("POST", at, json={**order, "key": next(keys)}).json()
+    check(Path(other["folder"]))
+    assert {path.name for path in stick.iterdir()} == {Path(one["folder"]).name for one in (made, other)}
+    assert len(list(stick.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "folder", ["/", "/etc", "{stick}/..", "{stick}/", "{stick}/../USB STICK", "..", "\x00", "{other}"]
+)
+def test_only_a_stick_that_is_there_is_written(rig: Any, visit: Any, stick: Path, folder: str) -> None:
+    other = stick.parent / "not mounted"
+    other.mkdir()
+    order = {"key": next(keys), "folder": folder.format(stick=stick, other=other)}
+    answer: httpx.Response = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
+    assert (answer.status_code, answer.json()["code"]) == (503, "stick.gone")
+    assert list(stick.iterdir()) == list(other.iterdir()) == []
+
+
+def test_a_stick_that_is_pulled_out_is_said_and_the_same_request_works_when_it_is_back(
+    rig: Any, visit: Any, stick: Path, tmp_path: Path
+) -> None:
+    order, at = {"key": next(keys), "folder": str(stick)}, f"/api/visits/{visit['id']}/export"
+    shutil.rmtree(stick)  # and the kernel still lists it
+    assert rig.request("GET", "/api/exports").json() == {"folders": []}
+    gone = rig.request("POST", at, json=order)
+    assert (gone.status_code, gone.json()["code"]) == (503, "stick.gone")
+    assert "Nothing was lost" in gone.json()["remedy"]
+    stick.mkdir()
+    assert rig.request("POST", at, json=order).status_code == 200
+
+
+def test_a_damaged_picture_stops_the_export_with_its_own_words(rig: Any, visit: Any) -> None:
+    capture = visit["slots"]["R-centre"]["captures"][0]
+    (rig.store.folder / "captures" / capture / "picture.png").write_bytes(b"x")
+    answer = rig.request("GET", f"/api/visits/{visit['id']}/export.zip")
+    assert (answer.status_code, answer.json()["code"]) == (500, "store.damaged")
+
+
+def test_of_an_interrupted_copy_nothing_is_taken_for_whole(stick: Path) -> None:
+    (stick / ".A.part").mkdir()
+    (stick / ".A.part" / "visit.json").write_bytes(b"half")
+    assert copied(stick, "A", FILES) == stick / "A"
+    assert {path.name for path in stick.iterdir()} == {"A"}
+    with pytest.raises(StickGone):
+        copied(stick / "gone", "A", FILES)
+
+
+def test_a_stick_that_is_full_is_said_and_nothing_half_copied_stays(tmp_path: Path) -> None:
+    """A limit on the length of a file stands for the full stick: it works for everyone, everywhere."""
+    said = subprocess.run(
+        [sys.executable, "-W", "error", __file__, str(tmp_path)], cwd=Path(__file__).parents[2], check=True,
+        capture_output=True, text=True, env={"PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    assert said.stdout.split() == ["StickFull", "[]"]
+
+
+if __name__ == "__main__":
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, resource.RLIM_INFINITY))
+    try:
+        copied(Path(sys.argv[1]), "A", FILES)
+    except StickFull as full:
+        print(type(full).__name__, [path.name for path in Path(sys.argv[1]).iterdir()])  # noqa: T201

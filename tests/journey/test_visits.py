@@ -1,0 +1,308 @@
+"""A visit over HTTP: from a number to an outcome, with everything that a page, a network or a stranger may do to it."""
+
+import asyncio
+import json
+from itertools import count
+from typing import Any
+
+import httpx
+import pytest
+
+SLOTS = ["R-centre", "R-nerve", "L-centre", "L-nerve"]
+EYES = {"R-centre": "OD", "R-nerve": "OD", "L-centre": "OS", "L-nerve": "OS"}
+JSON = {"Content-Type": "application/json"}
+keys = (f"{number:016x}" for number in count(1))
+HOSTILE = [
+    "<script>alert(1)</script>", "'; DROP TABLE persons; --", '"><img src=x onerror=alert(1)>', "../../etc/passwd",
+    "{{7*7}}", "\u202egnp.exe", "மீனாட்சி சுந்தரம்", "a\x00b", "\r\nSet-Cookie: a=b", "😀" * 60, "NULL", "%s%n",
+]  # fmt: skip
+
+
+def refused(answer: httpx.Response, status: int, code: str) -> dict[str, str]:
+    assert answer.status_code == status, answer.text
+    words: dict[str, str] = answer.json()
+    assert set(words) == {"code", "message", "remedy"}
+    assert words["code"] == code
+    assert all(words.values())
+    return words
+
+
+def post(rig: Any, path: str, **body: Any) -> Any:
+    answer = rig.request("POST", path, json={"key": next(keys), **body})
+    assert answer.status_code in (200, 201), answer.text
+    return answer.json()
+
+
+def begin(rig: Any, number: str | None = None) -> Any:
+    return post(rig, "/api/visits", **({} if number is None else {"number": number}))
+
+
+def patch(rig: Any, visit: Any, field: str, value: Any) -> httpx.Response:
+    body = json.dumps({"key": next(keys), "field": field, "value": value})  # escaped: half a character travels so
+    answer: httpx.Response = rig.request("PATCH", f"/api/visits/{visit['id']}", content=body, headers=JSON)
+    return answer
+
+
+def shoot(rig: Any, visit: Any, slot: str) -> Any:
+    return post(rig, "/api/captures", eye=EYES[slot], visit=visit["id"], slot=slot)
+
+
+def test_a_whole_visit_from_a_number_to_the_reader(old_rig: Any) -> None:
+    assert [slot["id"] for slot in old_rig.request("GET", "/api/protocol").json()["slots"]] == SLOTS
+    visit = begin(old_rig)
+    assert visit["number"].startswith("A")
+    assert visit["next_slot"] == "R-centre"
+    assert {slot["state"] for slot in visit["slots"].values()} == {"empty"}
+    for field, value in {"consent": "agreed", "age": 54, "sex": "woman", "vision_od": "6/12"}.items():
+        assert patch(old_rig, visit, field, value).json()["fields"][field] == value
+    for slot in SLOTS:
+        made = shoot(old_rig, visit, slot)
+        assert (made["visit"], made["slot"], made["eye"]) == (visit["id"], slot, EYES[slot])
+    now = old_rig.request("GET", f"/api/visits/{visit['id']}").json()
+    assert now["next_slot"] is None
+    assert {slot["tries"] for slot in now["slots"].values()} == {1}
+    ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
+    assert ended["outcome"]["code"] == "send"
+    assert ended["finished_at"]
+    assert ended["undo_until"] > ended["finished_at"]
+    listed = old_rig.request("GET", f"/api/visits?day={visit['day']}").json()
+    assert listed["visits"][0] == ended
+    assert listed["counts"]["done"] >= 1
+
+
+def test_a_retake_keeps_the_old_picture_and_the_operator_chooses(old_rig: Any) -> None:
+    visit = begin(old_rig)
+    first, second = shoot(old_rig, visit, "R-centre"), shoot(old_rig, visit, "R-centre")
+    slot = old_rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
+    assert slot["captures"] == [first["id"], second["id"]]
+    assert slot["capture"] == second["id"]  # the newest of two that are equally good
+    kept = post(old_rig, f"/api/captures/{first['id']}/keep")
+    assert kept["slots"]["R-centre"]["capture"] == first["id"]
+    emptied = post(old_rig, f"/api/visits/{visit['id']}/slots", slot="R-centre", capture=None)
+    assert emptied["slots"]["R-centre"]["state"] == "empty"
+    assert emptied["next_slot"] == "R-centre"
+    assert emptied["slots"]["R-centre"]["captures"] == [first["id"], second["id"]]
+    back = post(old_rig, f"/api/visits/{visit['id']}/slots", slot="R-centre", capture=second["id"])
+    assert back["slots"]["R-centre"]["capture"] == second["id"]
+
+
+def test_could_not_is_a_finished_outcome(old_rig: Any) -> None:
+    visit = begin(old_rig)
+    for slot, reason in zip(SLOTS, ["pupil", "cloudy", "still", "refused"], strict=True):
+        told = post(old_rig, f"/api/visits/{visit['id']}/could-not", slot=slot, reason=reason)
+        assert told["slots"][slot]["state"] == "could_not"
+        assert told["slots"][slot]["reason"] == reason
+    ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
+    assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
+    where = f"/api/visits/{visit['id']}/could-not"
+    refused(old_rig.request("POST", where, json={"key": next(keys), "slot": "R-centre", "reason": "pupil"}), 409,
+            "visit.finished")  # fmt: skip
+
+
+def test_a_finish_can_be_undone_for_ten_seconds_of_the_instruments_clock(old_rig: Any) -> None:
+    visit = begin(old_rig)
+    post(old_rig, f"/api/visits/{visit['id']}/finish")
+    refused(patch(old_rig, visit, "age", 5), 409, "visit.finished")
+    press = {"key": next(keys), "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
+    refused(old_rig.request("POST", "/api/captures", json=press), 409, "visit.finished")
+    opened = post(old_rig, f"/api/visits/{visit['id']}/reopen")
+    assert opened["finished_at"] is opened["outcome"] is opened["undo_until"] is None
+    assert patch(old_rig, visit, "age", 5).status_code == 200
+    assert post(old_rig, f"/api/visits/{visit['id']}/finish")["undo_until"]
+    old_rig.clock.elapsed_s += 11
+    assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["undo_until"] is None
+    late = old_rig.request("POST", f"/api/visits/{visit['id']}/reopen", json={"key": next(keys)})
+    refused(late, 409, "visit.finished")
+
+
+def test_a_known_number_is_the_same_person_with_or_without_the_prefix(old_rig: Any) -> None:
+    first = begin(old_rig)
+    assert patch(old_rig, first, "name", "Meena").json()["fields"]["name"] == "Meena"
+    again = begin(old_rig, first["number"])
+    assert again["id"] != first["id"]
+    assert again["fields"]["name"] == "Meena"  # of the person; what was answered belongs to the visit
+    assert begin(old_rig, first["number"][1:])["number"] == first["number"]
+    assert begin(old_rig, " camp-7 ")["number"] == "CAMP-7"
+    found = old_rig.request("GET", f"/api/visits?q={first['number'][1:]}").json()["visits"]
+    assert len(found) == 3
+    wrong = first["number"][:-1] + str((int(first["number"][-1]) + 1) % 10)
+    told = refused(old_rig.request("POST", "/api/visits", json={"key": next(keys), "number": wrong}), 422, "input")
+    assert "mistyped" in told["message"]
+
+
+def test_a_repeated_request_changes_nothing_even_after_a_restart(make_rig: Any) -> None:
+    rig = make_rig()
+    key, pressed = next(keys), next(keys)
+    visit = rig.request("POST", "/api/visits", json={"key": key}).json()
+    press = {"key": pressed, "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
+    made = rig.request("POST", "/api/captures", json=press).json()
+    rig.exam.close()
+    anew = make_rig()
+    assert anew.request("POST", "/api/visits", json={"key": key}).json()["id"] == visit["id"]
+    assert anew.request("POST", "/api/captures", json=press).json() == made
+    assert len(anew.request("GET", "/api/visits").json()["visits"]) == 1
+    assert len(anew.store.captures()) == 1
+    told = anew.request("POST", f"/api/visits/{visit['id']}/finish", json={"key": key})
+    assert "another request" in refused(told, 422, "input")["message"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_hostile_text_is_kept_as_text(old_rig: Any, text: str) -> None:
+    visit = begin(old_rig)
+    for field in ("name", "village"):
+        answer = patch(old_rig, visit, field, text[:120])
+        assert answer.json()["fields"][field] == text[:120]
+        assert answer.headers["content-type"] == "application/json"
+    assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"]["name"] == text[:120]
+    assert patch(old_rig, visit, "name", None).json()["fields"].get("name") is None
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("name", "x" * 121), ("phone", "1" * 41), ("village", "v" * 5000), ("name", "\ud800"), ("name", "  "),
+        ("name", 7), ("name", ["a"]), ("age", -1), ("age", 126), ("age", "54"), ("age", True), ("age", 10**30),
+        ("sex", "f"), ("consent", "yes"), ("diabetes", True), ("vision_od", "6/7"), ("vision_os", 6),
+        ("complaints", ["none", "pain"]), ("complaints", ["pain", "pain"]), ("complaints", []), ("complaints", "pain"),
+        ("drops_od", "noon"), ("drops_os", "٠٩:٤٠"), ("diabetes_years", "many"), ("id", "x"), ("outcome", "send"),
+        ("\ud800", 1),
+    ],
+)  # fmt: skip
+def test_an_answer_that_is_none_is_422_with_a_remedy_and_nothing_changes(old_rig: Any, field: str, value: Any) -> None:
+    visit = begin(old_rig)
+    refused(patch(old_rig, visit, field, value), 422, "input")
+    assert old_rig.request("GET", f"/api/visits/{visit['id']}").json() == visit
+
+
+@pytest.mark.parametrize("number", ["x" * 21, "../a", "a b", "", "\ud800", "<b>", "A00012", "٣٤"])
+def test_a_number_that_is_none_is_422(old_rig: Any, number: str) -> None:
+    before = old_rig.request("GET", "/api/visits").json()
+    body = json.dumps({"key": next(keys), "number": number})
+    refused(old_rig.request("POST", "/api/visits", content=body, headers=JSON), 422, "input")
+    assert old_rig.request("GET", "/api/visits").json() == before
+
+
+def test_what_does_not_belong_together_is_refused(old_rig: Any) -> None:
+    visit, other = begin(old_rig), begin(old_rig)
+    made = shoot(old_rig, visit, "R-centre")
+    alone = post(old_rig, "/api/captures", eye="OD")
+    assert alone["visit"] is alone["slot"] is None
+
+    def ask(status: int, code: str, path: str, **body: Any) -> None:
+        refused(old_rig.request("POST", path, json={"key": next(keys), **body}), status, code)
+
+    at = f"/api/visits/{visit['id']}"
+    ask(422, "input", "/api/captures", eye="OS", visit=visit["id"], slot="R-centre")
+    ask(422, "input", "/api/captures", eye="OD", visit=visit["id"])
+    ask(404, "store.unknown", "/api/captures", eye="OD", visit="nobody", slot="R-centre")
+    ask(404, "store.unknown", "/api/captures", eye="OD", visit=visit["id"], slot="R-corner")
+    ask(404, "store.unknown", f"/api/captures/{alone['id']}/keep")
+    ask(404, "store.unknown", f"/api/visits/{other['id']}/slots", slot="R-centre", capture=made["id"])
+    ask(404, "store.unknown", f"{at}/slots", slot="R-nerve", capture=made["id"])
+    ask(404, "store.unknown", f"{at}/could-not", slot="R-corner", reason="pupil")
+    ask(422, "input", f"{at}/could-not", slot="R-nerve", reason="lazy")
+    ask(404, "store.unknown", "/api/visits/nobody/finish")
+    ask(404, "store.unknown", "/api/visits/%00%ff/finish")
+    refused(old_rig.request("GET", "/api/visits?day=today"), 422, "input")
+    refused(old_rig.request("GET", "/api/visits?q=%25"), 422, "input")
+    refused(old_rig.request("GET", "/api/visits?limit=0"), 422, "input")
+
+
+def test_the_list_can_be_asked_for_a_day_for_open_ones_and_for_digits(make_rig: Any) -> None:
+    rig = make_rig()
+    first = begin(rig)
+    rig.clock.elapsed_s += 1
+    second = begin(rig)
+    rig.clock.elapsed_s += 86400
+    third = begin(rig)
+    post(rig, f"/api/visits/{first['id']}/finish")
+
+    def listed(query: str) -> list[str]:
+        return [visit["number"] for visit in rig.request("GET", f"/api/visits{query}").json()["visits"]]
+
+    assert listed("") == [third["number"], second["number"], first["number"]]
+    assert listed("?limit=1") == [third["number"]]
+    assert listed(f"?day={first['day']}") == [second["number"], first["number"]]
+    assert listed("?open=true") == [third["number"], second["number"]]
+    assert listed("?open=false") == [first["number"]]
+    assert listed(f"?q={third['number'][1:]}") == [third["number"]]
+    counts = rig.request("GET", f"/api/visits?day={first['day']}").json()["counts"]
+    assert counts == {"done": 1, "to_finish": 1, "referred": 1}  # of no eye there is a picture
+
+
+def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
+    mine, other = {"X-Controller": next(keys)}, {"X-Controller": next(keys)}
+    asked = post(old_rig, "/api/controller", key=mine["X-Controller"])
+    assert asked["mine"] is True
+    assert asked["lease"] == old_rig.request("GET", "/api/status").json()["controller"]
+    assert asked["lease"] not in mine.values()  # a name, not the key: everybody may see it
+    assert post(old_rig, "/api/controller", key=other["X-Controller"]) == {"lease": asked["lease"], "mine": False}
+    for path, body in {"/api/captures": {"eye": "OD"}, "/api/visits": {}}.items():
+        told = refused(
+            old_rig.request("POST", path, json={"key": next(keys), **body}, headers=other), 409, "link.other"
+        )
+        assert told["remedy"] == "Another screen is taking pictures."
+        assert old_rig.request("POST", path, json={"key": next(keys), **body}, headers=mine).status_code == 201
+    begin(old_rig)  # without the header: a script, or the device's own button
+    taken = post(old_rig, "/api/controller", key=other["X-Controller"], take=True)
+    assert taken["mine"] is True
+    body = {"key": next(keys)}
+    refused(old_rig.request("POST", "/api/visits", json=body, headers=mine), 409, "link.other")
+    old_rig.clock.elapsed_s += 9
+    old_rig.request("GET", "/api/visits", headers=other)  # its every request renews it
+    old_rig.clock.elapsed_s += 9
+    refused(old_rig.request("POST", "/api/visits", json=body, headers=mine), 409, "link.other")
+    old_rig.clock.elapsed_s += 10
+    assert old_rig.request("GET", "/api/status").json()["controller"] is None
+    assert old_rig.request("POST", "/api/visits", json=body, headers=mine).status_code == 201
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://eye.local:81", "https://[", "http://eye.localx"]
+)
+def test_a_change_that_a_foreign_page_asks_for_is_403(old_rig: Any, origin: str) -> None:
+    before = old_rig.request("GET", "/api/visits").json()
+    for method, path in {"POST": "/api/visits", "PATCH": "/api/visits/x", "DELETE": "/api/visits/x"}.items():
+        answer = old_rig.request(method, path, json={"key": next(keys)}, headers={"Origin": origin})
+        refused(answer, 403, "link.forged")
+        assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert old_rig.request("GET", "/api/visits").json() == before
+    own = {"Origin": "http://eye.local"}
+    assert old_rig.request("POST", "/api/visits", json={"key": next(keys)}, headers=own).status_code == 201
+
+
+def test_only_names_of_this_camera_are_answered(old_rig: Any) -> None:
+    def status(host: str) -> int:
+        return int(old_rig.request("GET", "/api/health", headers={"Host": host}).status_code)
+
+    own = ["10.42.0.1", "10.42.0.1:8000", "[::1]:8000", "localhost:8000", "eye.local", "EYE.LOCAL", "eye.local:80"]
+    assert {host: status(host) for host in own} == dict.fromkeys(own, 200)
+    foreign = [
+        "evil.example",
+        "eye.local.evil.example",
+        "localhost.evil.example",
+        "eye.local:x",
+        "[",
+        "10.42.0.1.evil",
+        "",
+    ]
+    assert {host: status(host) for host in foreign} == dict.fromkeys(foreign, 400)
+    refused(old_rig.request("GET", "/", headers={"Host": "evil.example"}), 400, "link.host")
+
+
+def test_many_tabs_at_once_get_different_numbers(old_rig: Any) -> None:
+    async def story(client: httpx.AsyncClient) -> list[httpx.Response]:
+        return await asyncio.gather(*(client.post("/api/visits", json={"key": next(keys)}) for _ in range(8)))
+
+    answers = old_rig.ask(story)
+    assert [answer.status_code for answer in answers] == [201] * 8
+    assert len({answer.json()["number"] for answer in answers}) == 8
+
+
+def test_the_room_left_is_told_in_people(make_rig: Any) -> None:
+    rig = make_rig(store={"free_bytes": lambda _: 40_000_000 * 12})
+    assert rig.request("GET", "/api/status").json()["people_left"] == 12  # four pictures each, of ten million bytes
+    visit = begin(rig)
+    used = sum(len(rig.store.read(made["id"], name)) for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
+               for name in made["files"])  # fmt: skip
+    assert rig.request("GET", "/api/status").json()["people_left"] == 480_000_000 // used
