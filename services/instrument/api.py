@@ -2,14 +2,14 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
@@ -150,9 +150,12 @@ class Press(BaseModel):
 
 def create_app(
     owner: Owner, door: Door, protocol: Protocol | None = None, names: tuple[str, ...] | None = None,
-    sticks: Sticks | None = None,
+    sticks: Sticks | None = None, rooms: Sequence[APIRouter] = (),
 ) -> FastAPI:  # fmt: skip
-    """The application around whoever has the head; it answers to these `names`, and to addresses and local ones."""
+    """The application around whoever has the head; it answers to these `names`, and to addresses and local ones.
+
+    `rooms` are for the technician only.
+    """
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
     lease = Lease(clock)
@@ -175,7 +178,7 @@ def create_app(
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
     _state(app, owner, people, lease)
     _live(app, owner)
-    technician_routes(app, owner, door)
+    technician_routes(app, owner, door, rooms)
     _page(app)
     return app
 

@@ -56,13 +56,13 @@ class Exam:
 
     def __init__(
         self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, plans: Path, died: Callable[[], None],
-        watchdog: Watchdog,
+        watchdog: Watchdog, budget_s: Callable[[], float] = lambda: BUDGET_S,
     ) -> None:  # fmt: skip
         self.head, self.store, self.bulletin, self.clock = head, store, bulletin, clock
         self.problem: DiffuscopeError | None = None
         self.failure: DiffuscopeError | None = None
         self.ready = Event()
-        self._died, self._plans, self._watchdog = died, plans, watchdog
+        self._died, self._plans, self._watchdog, self._budget_s = died, plans, watchdog, budget_s
         self._quick: dict[str, bytes] = {}
         self._turn = Condition()
         self._press: Press | None = None
@@ -139,7 +139,7 @@ class Exam:
         with self._turn:
             self._closing = True
             self._turn.notify_all()
-        self._owner.join(timeout=SEATS * 2 * BUDGET_S)
+        self._owner.join(timeout=SEATS * 2 * max(BUDGET_S, self._budget_s()))
         self.head.close()
 
     # What the owner does, alone
@@ -293,7 +293,7 @@ class Exam:
 
         return self._reconstructor(
             shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
-            deadline=Deadline.after(self.clock, BUDGET_S), watch=show, between=self._let_in,
+            deadline=Deadline.after(self.clock, self._budget_s()), watch=show, between=self._let_in,
         )  # fmt: skip
 
     def _let_in(self) -> None:

@@ -5,7 +5,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import uvicorn
@@ -18,7 +18,10 @@ from device.head import open_bench, open_head
 from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
+from services.instrument.diary import Diary
 from services.instrument.exam import Exam
+from services.instrument.explorer import Explorer
+from services.instrument.explorer_api import explorer_routes
 from services.instrument.forgery import own_names
 from services.instrument.owner import House, Owner, archive_of, calibrated
 from services.instrument.technician import Door
@@ -77,17 +80,24 @@ def serve(
     `names`, beside the computer's own, its addresses, and local ones.
     """
     clock = SystemClock()
-    with address, Store(data) as store:
+    with address, Store(data) as store, ExitStack() as undo:
         book = LightBook(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_of(spec, data))
+        diary = undo.enter_context(closing(Diary(data / "diary")))
         house = House(spec, archive, store, Bulletin(), clock, watchdog, _stop_the_process)
+
+        explorer = Explorer(data / "explorer", data / "plans", clock, spec, house.bulletin.tell)
 
         def exam() -> Exam:
             head = open_head(calibrated(spec, archive.root), clock, book)
-            return Exam(head, store, house.bulletin, clock, data / "plans", house.died, watchdog)
+            return Exam(
+                head, store, house.bulletin, clock, data / "plans", house.died, watchdog, lambda: explorer.budget_s
+            )
 
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
-        app = create_app(owner, Door(data / "technician.json", clock), protocol, own_names() + names)
+        rooms = (explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration),)
+        door = Door(data / "technician.json", clock)
+        app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         try:
             ready()

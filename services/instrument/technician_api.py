@@ -1,5 +1,6 @@
 """The technician's addresses: the door with its PIN, and the calibration wizard behind it."""
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Annotated, Any
@@ -57,8 +58,8 @@ class Use(Body):
     id: str = Field(pattern="^[0-9a-f]{16}$")
 
 
-def technician_routes(app: FastAPI, owner: Owner, door: Door) -> None:
-    """Put the technician's addresses on the application."""
+def technician_routes(app: FastAPI, owner: Owner, door: Door, rooms: Sequence[APIRouter] = ()) -> None:
+    """Put the technician's addresses on the application, and `rooms` behind the same door."""
 
     def inside(token: Token = None) -> None:
         door.refuse_strangers(token)
@@ -68,6 +69,8 @@ def technician_routes(app: FastAPI, owner: Owner, door: Door) -> None:
 
     app.include_router(_door(door, Depends(acting)))
     app.include_router(_calibration(owner, Depends(inside), Depends(acting)))
+    for room in rooms:
+        app.include_router(room, dependencies=[Depends(inside)])
 
 
 def _door(door: Door, acting: Any) -> APIRouter:
