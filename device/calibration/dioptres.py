@@ -67,7 +67,7 @@ def stretch(of: Psf, into: Psf, pitch_um: float) -> Stretch:
 
     def miss(unknown: Floats) -> Floats:
         stretched = _warped(splines, 1 + unknown[0] / edge, (unknown[1], unknown[2]))
-        return np.ravel(stretched * (np.vdot(stretched, seen) / np.vdot(stretched, stretched)) - seen)
+        return np.ravel(stretched * (_dot(stretched, seen) / _dot(stretched, stretched)) - seen)
 
     found = optimize.least_squares(miss, (edge * (start[0] - 1), *start[1:]), method="lm", diff_step=[1e-3] * 3).x
     scale = float(1 + found[0] / edge)
@@ -134,6 +134,10 @@ def _cut(psf: Psf, radius_px: float, n: int) -> Floats:
     return np.asarray(part.reshape(rows, n, cols, n).sum((1, 3)))
 
 
+def _dot(a: Floats, b: Floats) -> float:
+    return float(np.einsum("ij,ij->", a, b))  # np.vdot would wake a thread for every core, and wait for it
+
+
 def _warped(splines: Floats, scale: float, moved: tuple[float, float]) -> Floats:
     """Stretched about its middle, then moved (rows, cols), in samples."""
     middle = np.array([size // 2 for size in splines.shape])
@@ -150,7 +154,7 @@ def _coarse(splines: Floats, seen: Floats) -> tuple[float, float, float]:
     for scale in np.linspace(1 - MOST_STRETCH, 1 + MOST_STRETCH, RUNGS):
         tried = _warped(splines, float(scale), (0.0, 0.0))
         tried -= tried.mean()
-        alike = fft.irfft2(spectrum * np.conj(fft.rfft2(tried)), seen.shape) / sqrt(float(np.vdot(tried, tried)))
+        alike = fft.irfft2(spectrum * np.conj(fft.rfft2(tried)), seen.shape) / sqrt(_dot(tried, tried))
         at = np.unravel_index(int(np.argmax(alike)), alike.shape)
         row, col = ((int(i) + size // 2) % size - size // 2 for i, size in zip(at, seen.shape, strict=True))
         best = max(best, (float(alike[at]), float(scale), float(row), float(col)))

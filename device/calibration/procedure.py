@@ -15,7 +15,7 @@ import numpy as np
 from device.calibration.archive import Archive, Provenance
 from device.calibration.colours import SAME, differs, refuse_other_source
 from device.calibration.darks import Darks, measured_darks
-from device.calibration.dioptres import Dioptres, between, measured_dioptres, refuse_other_place
+from device.calibration.dioptres import Dioptres, Stretch, between, measured_dioptres, refuse_other_place
 from device.calibration.flats import Flats, measured_flats
 from device.calibration.leds import LedReadings
 from device.calibration.moments import Moments
@@ -107,7 +107,6 @@ class Procedure:
         whose = repr((job.serial, job.spec.name, job.spec.camera, job.source_deg, job.eye_mm))
         self.steps = Steps(work, whose, clock)
         self.raws = Raws(work / "raw", operator.tell) if job.keep_raw else None
-        self.simulated = False
         self._counts: Counts = np.empty(camera.shape, np.uint16)
 
     def run(self, archive: Archive) -> str:
@@ -158,19 +157,21 @@ class Procedure:
     def _dioptres(self, darks: Darks, flats: Flats, point: Point, geometry: Geometry) -> Dioptres:
         """The source moved along the axis, place by place; the factor of their line."""
         pitch_um, eye_mm = self.job.spec.camera.pitch_um, self.job.eye_mm
-        scales: dict[float, float] = {}
+        seen: dict[float, Stretch] = {}
         for stand, moved_mm in MOVES.items():
 
             def measure(moved_mm: float = moved_mm) -> Point:
                 disc_px = self._disc_px() * eye_mm / (eye_mm + moved_mm)
                 there = self._point(darks, flats, MOVED_BRACKETS, disc_px)
-                refuse_other_place(between(point, there, pitch_um), moved_mm, eye_mm, geometry)
+                seen[moved_mm] = between(point, there, pitch_um)
+                refuse_other_place(seen[moved_mm], moved_mm, eye_mm, geometry)
                 return there
 
             there = self._step(stand.replace(" ", ""), Point, stand, measure)
-            scales[moved_mm] = between(point, there, pitch_um).scale
+            if moved_mm not in seen:  # it was measured before
+                seen[moved_mm] = between(point, there, pitch_um)
         try:
-            found = measured_dioptres(scales, eye_mm)
+            found = measured_dioptres({moved_mm: one.scale for moved_mm, one in seen.items()}, eye_mm)
         except CalibrationRefused:
             self.steps.forget(*(stand.replace(" ", "") for stand in MOVES))
             raise
@@ -249,7 +250,7 @@ class Procedure:
         self.camera.prepare(Shot(exposure_s))
         for _ in range(count):
             frame = self.camera.expose(Shot(exposure_s), self._counts)
-            self.simulated |= frame.simulated
+            self.steps.simulated |= frame.simulated
             if self.raws is not None:
                 self.raws.keep(frame)
             yield frame
@@ -284,7 +285,7 @@ class Procedure:
             dark_dn=darks.map_dn,
             flat=flats.response,
             bad=darks.hot | flats.dead,
-            simulated=self.simulated,
+            simulated=self.steps.simulated,
         )
 
     def _provenance(self, figures: dict[str, float]) -> Provenance:

@@ -4,6 +4,7 @@ FOLDER/<step>/00001_0.1s.npy    uint16 counts (rows, cols)
 FOLDER/<step>/SHA256SUMS        for `sha256sum --check`
 """
 
+import errno
 import hashlib
 import io
 import shutil
@@ -16,13 +17,17 @@ import numpy as np
 from device.values import Frame
 
 SUMS = "SHA256SUMS"
+RESERVE_BYTES = 300_000_000  # a calibration of two megapixels and its steps take 100 MB
 
 
 class Raws:
-    """A folder for raw frames. A full disk ends the keeping, in words, and never the calibration."""
+    """A folder for raw frames. A full disk ends the keeping, in words, and never the calibration.
 
-    def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
-        self.folder, self.tell = folder, tell
+    `reserve_bytes` of the disk are left for that.
+    """
+
+    def __init__(self, folder: Path, tell: Callable[[str], None], reserve_bytes: int = RESERVE_BYTES) -> None:
+        self.folder, self.tell, self.reserve_bytes = folder, tell, reserve_bytes
         self.kept, self.failed = 0, False
         self._step = folder
 
@@ -42,6 +47,8 @@ class Raws:
         content = out.getvalue()
         try:
             self._step.mkdir(parents=True, exist_ok=True)
+            if shutil.disk_usage(self._step).free < self.reserve_bytes + len(content):
+                raise OSError(errno.ENOSPC, f"less than {self.reserve_bytes / 1e6:.0f} MB are left")
             path.write_bytes(content)
             with (self._step / SUMS).open("a", encoding="ascii") as sums:
                 sums.write(f"{hashlib.sha256(content).hexdigest()}  {path.name}\n")

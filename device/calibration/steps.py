@@ -1,6 +1,7 @@
 """Steps of a calibration that are done: each in a file of its own, taken up again for half a day after a power cut."""
 
 import io
+import shutil
 from dataclasses import fields
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -20,15 +21,20 @@ Step = TypeVar("Step", Darks, Flats, Point)
 
 
 class Steps:
-    """The files of one head's steps in one folder; those of another head, of yesterday, or damaged are not there."""
+    """The files of one head's steps in one folder; those of another head, of yesterday, or damaged are not there.
+
+    `simulated` is whether any of them was: it must not get lost where all of them are taken up again.
+    """
 
     def __init__(self, folder: Path, whose: str, clock: Clock) -> None:
         self.folder, self.whose, self.clock = folder, whose, clock
+        self.simulated = False
 
     def keep(self, name: str, measured: Darks | Flats | Point) -> None:
         """Write a step; it is on the disk when this returns."""
         out = io.BytesIO()
-        np.savez(out, whose=self.whose, made_at=self.clock.wall().isoformat(), **vars(measured))
+        made_at = self.clock.wall().isoformat()
+        np.savez(out, whose=self.whose, made_at=made_at, simulated=self.simulated, **vars(measured))
         self.folder.mkdir(parents=True, exist_ok=True)
         part = self.folder / f".{name}"
         write_synced(part, out.getvalue())
@@ -42,7 +48,9 @@ class Steps:
                 age = self.clock.wall() - datetime.fromisoformat(held["made_at"].item())
                 if held["whose"].item() != self.whose or not timedelta(0) <= age < KEPT_FOR:
                     return None
-                return kind(**{field.name: _plain(held[field.name]) for field in fields(kind)})
+                found = kind(**{field.name: _plain(held[field.name]) for field in fields(kind)})
+                self.simulated |= held["simulated"].item()
+                return found
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             return None  # not there, or damaged: it is measured again
 
@@ -53,11 +61,7 @@ class Steps:
 
     def clear(self) -> None:
         """The calibration is kept; its steps are not needed any more."""
-        if self.folder.is_dir():
-            for path in (*self.folder.glob("*.npz"), *self.folder.glob(".*")):
-                path.unlink()
-            if not any(self.folder.iterdir()):
-                self.folder.rmdir()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"

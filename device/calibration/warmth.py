@@ -16,6 +16,7 @@ from device.values import Image
 
 REFERENCE_C = 25.0
 LEAST_APART_C = 3.0
+LEAST_E_PER_S = 0.5  # three times what a dark step of a sensor without any would seem to have
 FASTEST_C, SLOWEST_C = 4.0, 12.0  # per doubling; beyond, something else than warmth has changed
 
 
@@ -53,7 +54,7 @@ class Warmth:
 
 def fitted_warmth(darks: Iterable[Dark]) -> Warmth | None:
     """The line through these steps; None where they are too few, or too near each other in temperature."""
-    known = [dark for dark in darks if isfinite(dark.warm_c) and dark.e_per_s > 0]
+    known = [dark for dark in darks if isfinite(dark.warm_c) and dark.e_per_s > LEAST_E_PER_S]
     if len(known) < 2 or np.ptp([dark.warm_c for dark in known]) < LEAST_APART_C:
         return None
     warmer_c = np.array([dark.warm_c - REFERENCE_C for dark in known])

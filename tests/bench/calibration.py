@@ -19,10 +19,11 @@ from device.sim.world import World
 from device.spec import load_head
 from device.values import Calibration, Glow, Psf, Sensor, Shot
 from services.instrument.calibrating import Wish, calibrate
+from tests.bench.dioptres import MOST_RMS_DPT, factors, refracted
 from tests.simulated import having
 
 HEAD = Path("hardware/heads/sim.toml")
-FLAWS = {"prnu": 0.01, "dsnu_e": 2.0, "dark_e_per_s": 50.0, "hot_pixels": 1e-4}
+FLAWS = {"prnu": 0.01, "dsnu_e": 2.0, "dark_e_per_s": 50.0, "hot_pixels": 1e-4, "nonlinearity": -0.01}
 
 
 def calibration(planner: Planner) -> None:
@@ -30,7 +31,7 @@ def calibration(planner: Planner) -> None:
     spec, clock = having(load_head(HEAD), sensor=FLAWS), SystemClock()
     begin_s = clock.now_s()
     with tempfile.TemporaryDirectory() as folder:
-        wish = Wish(Path(folder), "D-1", "bench", None)
+        wish = Wish(Path(folder), "D-1", "bench", None, dioptres=True)
         found = calibrate(spec, wish, VirtualClock(), print, lambda line: None).calibration
     print(f"\ncalibration of {found.psfs[0].shape}: {clock.now_s() - begin_s:.1f} s of work beside the exposures")
     world, camera = World(spec, VirtualClock()), spec.camera
@@ -42,6 +43,7 @@ def calibration(planner: Planner) -> None:
     assert hot is not None
     assert sensor.gain_e_per_dn is not None
     assert sensor.read_noise_e is not None
+    assert found.geometry is not None
     psf, light = found.psfs[0].pixels, truth.psfs[0].pixels
     beyond = light < 1e-6 * light.max()
     by_found, by_truth = pictures(world, found, truth, planner)
@@ -55,6 +57,9 @@ def calibration(planner: Planner) -> None:
         ("PSF, 1 - correlation", 1 - np.corrcoef(psf.ravel(), light.ravel())[0, 1], 1e-3),
         ("pedestal left, of the mass", abs(float(psf[beyond].sum(dtype=np.float64))), 0.005),
         (f"loss of PSNR, dB (of {by_truth:.2f})", by_truth - by_found, 0.2),
+        ("factor: the paper's", abs(found.geometry.scale_per_dpt / world.geometry.nominal_scale_per_dpt - 1), 0.01),
+        ("refraction with it, dpt RMS", refracted(spec, found, planner), MOST_RMS_DPT),
+        *factors(spec, planner),
     ]
     for name, value, limit in figures:
         print(f"{name:<34} {value:>10.2g}   limit {limit:g}")
@@ -64,7 +69,9 @@ def calibration(planner: Planner) -> None:
 def true_calibration(world: World) -> Calibration:
     """What a perfect calibration of this head would be."""
     camera = world.spec.camera
-    sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, camera.white_dn)
+    range_dn = camera.white_dn - camera.black_dn
+    bend_per_dn = FLAWS["nonlinearity"] / range_dn
+    sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, camera.white_dn, bend_per_dn)
     psf = Psf(fitted(world.psf(world.spec.light.colour), world.shape))
     dark_dn = camera.black_dn + FLAWS["dark_e_per_s"] * camera.exposure_s / camera.gain_e_per_dn
     dark = np.full(world.shape, dark_dn, np.float32)

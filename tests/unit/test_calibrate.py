@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from device.calibration.archive import Archive
+from device.calibration.archive import Archive, Provenance
 from device.calibration.procedure import Job, Operator, Procedure, Stand
 from device.clock import VirtualClock
 from device.errors import (
@@ -153,6 +153,24 @@ def test_a_fault_keeps_the_steps_before_it_and_the_old_calibration(
     new = quick.run()
     assert quick.asked == again
     assert quick.archive.current() == new != old  # noise is never the same twice
+
+
+class Interrupted(Archive):
+    """An archive that loses its power when it is asked to keep something."""
+
+    def keep(self, calibration: Calibration, provenance: Provenance) -> str:
+        raise KeyboardInterrupt
+
+
+def test_a_power_cut_at_the_very_end_costs_no_step_and_what_was_simulated_stays_so(quick: Table) -> None:
+    archive, quick.archive = quick.archive, Interrupted(quick.archive.root)
+    with pytest.raises(KeyboardInterrupt):
+        quick.run()
+    quick.archive = archive
+    id = quick.run()
+    assert quick.asked == []
+    assert archive.load(id).calibration.simulated
+    assert not quick.work.exists()
 
 
 def test_steps_of_another_head_of_yesterday_or_damaged_are_measured_again(quick: Table) -> None:

@@ -7,6 +7,7 @@ import pytest
 from device.calibration.archive import Archive, Kept
 from device.calibration.colours import SAME
 from device.calibration.procedure import Job, Operator, Procedure, Stand
+from device.clock import VirtualClock
 from device.errors import CalibrationRefused
 from device.sim import stage
 from device.sim.camera import SimCamera
@@ -14,6 +15,15 @@ from device.sim.world import World
 from device.values import Colour
 from services.instrument.calibrating import staging
 from tests.unit.test_measure import E_PER_S, small_world
+
+
+def narrow_world() -> World:
+    """Half of the paper's iris and a sensor to match, with pixels of 10 um: fine enough to tell colours apart."""
+    spec = small_world(coarser=2).spec
+    assert spec.optics is not None
+    camera = spec.camera.model_copy(update={"rows": 270, "cols": 270})
+    optics = spec.optics.model_copy(update={"iris_um": 1600.0, "field_deg": 15.0})
+    return World(spec.model_copy(update={"camera": camera, "optics": optics}), VirtualClock())
 
 
 def calibrated(
@@ -35,7 +45,7 @@ def calibrated(
 
 
 def test_a_psf_that_differs_by_its_colour_is_kept_beside_the_pictures(tmp_path: Path) -> None:
-    world = small_world(coarser=2)
+    world = narrow_world()
     kept, asked = calibrated(world, tmp_path, ("green", "red"))
     assert asked[-1] == "point red"
     assert [psf.colour for psf in kept.calibration.psfs] == ["green", "red"]

@@ -68,9 +68,9 @@ def power_cut(world: World) -> None:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("built", [{}, OTHER_OPTICS])
-def test_the_factor_of_a_head_is_found_within_one_percent(tmp_path: Path, built: dict[str, float]) -> None:
-    rail = Rail(tmp_path, built, **FLAWS)
+def test_the_factor_of_a_head_is_found_within_one_percent(tmp_path: Path) -> None:
+    """Of the paper's geometry: `python -m tests.bench calibration`."""
+    rail = Rail(tmp_path, OTHER_OPTICS, **FLAWS)
     rail.spec = rail.world.spec
     kept = rail.archive.load(rail.run())
     assert rail.asked == ["cap", "screen", "point", *MOVES]

@@ -71,3 +71,12 @@ def test_what_was_cut_off_by_a_full_disk_is_not_left_behind(tmp_path: Path) -> N
     assert [path.name for path in (tmp_path / "raw" / "darks").glob("*.npy")] == ["00001_0.1s.npy"]
     assert len(said) == 1
     assert "frame 2 of darks" in said[0]
+
+
+def test_what_the_calibration_itself_needs_is_left_on_the_disk(tmp_path: Path) -> None:
+    said: list[str] = []
+    raws = Raws(tmp_path / "raw", said.append, reserve_bytes=10**18)
+    raws.begin("darks")
+    raws.keep(Frame(np.ones((8, 8), np.uint16), 0.1, 1, None, True))
+    assert raws.kept == 0
+    assert "less than 1000000000000 MB are left" in said[0]

@@ -170,6 +170,13 @@ def test_the_papers_numbers() -> None:
     assert geometry.scale_per_dpt == pytest.approx(0.003375)
 
 
+def test_what_was_measured_of_a_dioptre_comes_before_the_drawings() -> None:
+    geometry = Geometry(5.04, 6000, 0.75, measured_scale_per_dpt=0.0035)
+    assert geometry.scale_per_dpt == 0.0035
+    assert geometry.nominal_scale_per_dpt == pytest.approx(0.003375)
+    assert Geometry(5.04, 6000, 0.75).scale_per_dpt == geometry.nominal_scale_per_dpt
+
+
 def test_the_names_of_captures_sort_by_time_and_say_the_eye() -> None:
     names = [Capture.named(datetime(2026, 1, day, 9, 5, tzinfo=UTC), "OS", "ff") for day in (2, 10, 21)]
     assert names == sorted(names)

@@ -62,7 +62,7 @@ def test_a_law_that_is_not_silicons_is_told_and_not_kept(tmp_path: Path) -> None
     assert "dark_doubling_c" not in dict(Archive(tmp_path).load(id).provenance.figures)
 
 
-@given(st.floats(5, 9), st.floats(1, 1000), st.floats(10, 20), st.floats(23, 50))
+@given(st.floats(5, 9), st.floats(30, 1000), st.floats(10, 20), st.floats(23, 50))
 def test_two_steps_tell_the_law(doubling_c: float, e_per_s: float, cold_c: float, warm_c: float) -> None:
     law = fitted_warmth(Dark(c, e_per_s * 2 ** ((c - 25) / doubling_c)) for c in (cold_c, warm_c))
     assert law is not None
@@ -71,6 +71,8 @@ def test_two_steps_tell_the_law(doubling_c: float, e_per_s: float, cold_c: float
     assert law.is_plausible
 
 
-@pytest.mark.parametrize("darks", [[], [Dark(20, 5)], [Dark(20, 5), Dark(22, 6)], [Dark(20, 5), Dark(nan, 9)]])
+@pytest.mark.parametrize(
+    "darks", [[], [Dark(20, 5)], [Dark(20, 5), Dark(22, 6)], [Dark(20, 5), Dark(nan, 9)], [Dark(20, 0.1), Dark(30, 9)]]
+)
 def test_what_is_too_little_is_no_law(darks: list[Dark]) -> None:
     assert fitted_warmth(darks) is None
