@@ -67,7 +67,7 @@ def look(
     between: Callable[[], None] = lambda: None,
 ) -> Sight:  # fmt: skip
     """One capture against the calibration; `between` is called every few milliseconds, and may end it by raising."""
-    seen = darkness(calibration, known, at.dark, at.exposure_s)
+    seen = darkness(calibration, known, at.dark, at.exposure_s, between)
     between()
     return Sight(at.taken_at, seen, witness(at.lit, at.dark, between) if witness is not None else None)
 

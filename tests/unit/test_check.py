@@ -88,12 +88,12 @@ def test_an_axial_move_leaves_the_psf_as_it_was_and_is_seen_by_the_size_of_the_f
     assert findings["psf"].ok
     assert findings["psf"].value > 0.95
     assert findings["width"].hint
-    assert told(frame).wider == pytest.approx(by_um / 6000, abs=0.006)
+    assert told(frame).wider == pytest.approx(by_um / 6000, abs=0.008)
 
 
 @pytest.mark.parametrize(("by_um", "ok"), [(20.0, True), (50.0, False), (200.0, False)])
 def test_a_diffuser_pushed_aside_behind_its_iris_is_seen_by_where_the_picture_lies(by_um: float, ok: bool) -> None:
-    """Fifteen sixteenths of its surface are the same at 200 um, so the PSF is not blamed; 0.0127 deg to a micrometre."""
+    """Fifteen sixteenths of its surface are the same at 200 um: the PSF is not blamed. 0.0127 deg to a micrometre."""
     frame = lit(misfits.slid(by_um))
     assert told(frame).score > 0.9
     assert told(frame).off_deg == pytest.approx((0.0, -by_um * 0.01273), abs=0.15)
