@@ -20,13 +20,13 @@ ROUNDED_DN = 12**-0.5  # what whole counts add to a noise at the most; where it 
 class Darkness:
     """One dark frame against the calibration.
 
-    `black_off_dn` is how much brighter its darkest part is; `noise` the spread of its pixels over the most that is
+    `black_off_dn` is how much brighter its darkest part is; `noisier` the spread of its pixels over the most that is
     expected of whole counts (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and
     are not marked bad; `warmth_dn` is what the sensor's warmth brought when it was calibrated.
     """
 
     black_off_dn: float
-    noise: float | None
+    noisier: float | None
     hot: NDArray[np.int64]
     warmth_dn: float
 
