@@ -18,6 +18,7 @@ from device.ledger import MemoryLedger
 from device.spec import CalibrationTable, InstrumentSpec
 from device.values import Calibration, Psf
 from services.instrument.api import refusal
+from services.instrument.checking import checked, table
 from tests.journey.conftest import Diffuscope
 
 WEEK_S = 7 * 86400.0
@@ -169,6 +170,29 @@ def test_a_damaged_one_does_not_open(archived: Any) -> None:
 
 
 # By hand
+
+
+def test_what_the_shelf_tells_by_hand(make_rig: Any, wait_until: Callable[..., None], tmp_path: Path) -> None:
+    archive = Archive(tmp_path / "archive")
+    wrong: list[InstrumentSpec] = []
+
+    def with_another_psf(head: Head) -> Head:
+        strange, long_ago = turned(head.calibration), VirtualClock().wall() - timedelta(weeks=70)
+        archive.keep(strange, Provenance("D-1", long_ago, "a technician", "0.1.0"))
+        put_in_force(archive.root / CURRENT, VirtualClock().wall())
+        wrong.append(head.spec.model_copy(update={"calibration": CalibrationTable(archive=archive.root)}))
+        return replace(head, spec=wrong[0], calibration=strange)
+
+    rig = make_rig(head=with_another_psf)
+    for _ in range(2):
+        rig.exam.press("OD").result(30)
+    wait_until(lambda: not rig.exam.fitness.due)
+    found = checked(wrong[0], rig.store.folder, rig.clock, [].append)
+    assert (found.captures, found.darks) == (2, 0)
+    assert {one.name for one in found.findings if one.fails} == {"psf", "age"}
+    lines = table(found).splitlines()
+    assert lines[0].startswith("FAIL  age                  70 weeks  limit 61")
+    assert lines[1] == f"      {CalibrationOld.default_remedy}"
 
 
 @pytest.fixture
