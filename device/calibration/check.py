@@ -67,7 +67,7 @@ def look(
     between: Callable[[], None] = lambda: None,
 ) -> Sight:  # fmt: skip
     """One capture against the calibration; `between` is called every few milliseconds, and may end it by raising."""
-    seen = darkness(calibration, known, at.dark, at.exposure_s)
+    seen = darkness(calibration, known, at.dark, at.exposure_s, between)
     between()
     return Sight(at.taken_at, seen, witness(at.lit, at.dark, between) if witness is not None else None)
 
@@ -159,7 +159,7 @@ def _darks(calibration: Calibration, darks: Sequence[Darkness]) -> list[Finding]
         _hinted("black level", off_dn, BLACK_DN + warmth_dn, "DN", "The dark is not as dark as it was. Every picture "
                 "has a dark frame of its own, so it stays true; but shade the head, let it cool, and look again."),
     ]  # fmt: skip
-    noises = [one.noise for one in darks if one.noise is not None]
+    noises = [one.noisier for one in darks if one.noisier is not None]
     if noises:
         said = "The sensor is noisier than it was: shade the head, let it cool, and look again."
         found.append(_hinted("dark noise", median(noises), NOISE, "times", said))

@@ -1,5 +1,6 @@
 """What one dark frame of an ordinary press says about the sensor: black level, noise, pixels that turned hot."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot, sqrt
 
@@ -11,6 +12,7 @@ from device.values import Calibration, Counts, Image
 
 PARTS = 8  # x 8 parts of the frame; the darkest stands for a dark row, which these sensors do not give
 HOT_SIGMAS, HOT_DN = 10.0, 3.0  # of one frame's noise and the pixels' spread: a normal pixel is beyond in no lifetime
+EVERY = 7  # pixels: enough of them for percentiles
 ROUNDED_DN = 12**-0.5  # what whole counts add to a noise at the most; where it is smaller they hide it
 
 
@@ -18,19 +20,22 @@ ROUNDED_DN = 12**-0.5  # what whole counts add to a noise at the most; where it 
 class Darkness:
     """One dark frame against the calibration.
 
-    `black_off_dn` is how much brighter its darkest part is; `noise` the spread of its pixels over the most that is
+    `black_off_dn` is how much brighter its darkest part is; `noisier` the spread of its pixels over the most that is
     expected of whole counts (None: the calibration does not say); `hot` holds the flat indices of pixels that shine and
     are not marked bad; `warmth_dn` is what the sensor's warmth brought when it was calibrated.
     """
 
     black_off_dn: float
-    noise: float | None
+    noisier: float | None
     hot: NDArray[np.int64]
     warmth_dn: float
 
 
-def darkness(calibration: Calibration, known: Provenance | None, counts: Counts, exposure_s: float) -> Darkness:
-    """A dark frame (rows, cols) of `exposure_s`, judged by what was measured."""
+def darkness(
+    calibration: Calibration, known: Provenance | None, counts: Counts, exposure_s: float,
+    between: Callable[[], None] = lambda: None,
+) -> Darkness:  # fmt: skip
+    """A dark frame (rows, cols) of `exposure_s`, judged by what was measured; `between` is called between its steps."""
     figures = dict(known.figures) if known is not None else {}
     gain, black_dn = calibration.sensor.gain_e_per_dn, calibration.sensor.black_dn
     warmth_dn = figures.get("dark_e_per_s", 0.0) * exposure_s / gain if gain else 0.0
@@ -38,14 +43,18 @@ def darkness(calibration: Calibration, known: Provenance | None, counts: Counts,
     off: Image = counts.astype(np.float32) - level_dn
     good = np.ones(off.shape, np.bool_) if calibration.bad is None else ~calibration.bad
     sigma_dn = _sigma_dn(calibration, figures, warmth_dn)
-    middle_dn = float(np.median(off[good]))
-    far_dn = HOT_DN + HOT_SIGMAS * max(sigma_dn or 0.0, _seen_sigma_dn(off[good]))
+    between()
+    low_dn, middle_dn, high_dn = np.percentile(off.ravel()[::EVERY][good.ravel()[::EVERY]], (15.87, 50.0, 84.13))
+    far_dn = HOT_DN + HOT_SIGMAS * max(sigma_dn or 0.0, float(high_dn - low_dn) / 2)  # also of a room's light
+    between()
     hot = _lonely(off, np.flatnonzero(good & (off > middle_dn + far_dn)), far_dn, gain or 1.0)
     good &= np.abs(off - np.float32(middle_dn)) <= far_dn
+    between()
     noise = None
     if sigma_dn is not None:
         flat = off if calibration.dark_dn is not None else counts.astype(np.float32)
         noise = float(flat[good].std(dtype=np.float64)) / hypot(sigma_dn, ROUNDED_DN)
+    between()
     return Darkness(_darkest_dn(off, good), noise, hot, warmth_dn)
 
 
@@ -56,12 +65,6 @@ def _sigma_dn(calibration: Calibration, figures: dict[str, float], warmth_dn: fl
         return None
     pattern_e = figures["pattern_e"] if calibration.dark_dn is None else 0.0
     return sqrt(read_e**2 + pattern_e**2 + warmth_dn * gain) / gain
-
-
-def _seen_sigma_dn(off: NDArray[np.float32]) -> float:
-    """Of the middle of all pixels: a dark frame into which a room shines has that light's noise."""
-    low, high = np.percentile(off, (15.87, 84.13))
-    return float(high - low) / 2
 
 
 def _lonely(off: Image, bright: NDArray[np.int64], far_dn: float, gain_e_per_dn: float) -> NDArray[np.int64]:

@@ -209,13 +209,22 @@ class Refractor:
         self.fft.forward()
         return stray
 
-    def unlikelihood(self, frame: Linear, noise: float, m_dpt: float, part: Band) -> float:
+    def unlikelihood(self, frame: Linear, noise_dn2: float, m_dpt: float, part: Band) -> float:
         """Minus the log evidence of a candidate in a part of the band; leaves |H|^2 in the part's `power`."""
         self.residual(frame, m_dpt)
         stretch = transform(self.geometry, m_dpt)
         otf = self.elastic.at(part.rows, part.cols, part.share, self.grid.n, stretch)
         return sweeps.unlikelihood(
-            self.fft.spectrum, otf, part.where, part.ring, noise, SMEAR, TURNS, self._levels, part.energy, part.power
+            self.fft.spectrum,
+            otf,
+            part.where,
+            part.ring,
+            noise_dn2,
+            SMEAR,
+            TURNS,
+            self._levels,
+            part.energy,
+            part.power,
         )
 
     def noise_power(self, frame: Linear) -> float:

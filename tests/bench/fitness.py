@@ -12,10 +12,15 @@ from device.recon.metrics import Judge
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
+from device.recon.refraction import Refractor
 from device.recon.witness import Statement, Witness
+from device.sim.calibrate import simulated_calibration
+from device.sim.world import World
+from device.spec import load_head
 from device.values import Counts
 from tests import misfits
 from tests.misfits import calibrated, dark, lit, point
+from tests.simulated import exposed
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 RETINAS, SPHERES_DPT = range(1, 11), (-8.0, -4.0, 0.0, 2.0, 8.0)
@@ -50,6 +55,7 @@ def fitness(planner: Planner) -> None:
     print(f"one capture takes {np.median(seconds):.2f} s of idle time at {shape[0]} x {shape[1]}")
     _misfits(make, witness)
     _darks()
+    _waits(planner)
 
 
 def _sure(one: Statement | None) -> Statement | None:
@@ -104,3 +110,20 @@ def _darks() -> None:
             for one in check(calibrated(), None, seen, (), NOW)
         )
         print(f"black {black_dn:+g} DN, {hot:.2%} of the pixels hot: {found}")
+
+
+def _waits(planner: Planner) -> None:
+    """How long a press may have to wait for a look that is under way, at the sensor's full size."""
+    spec, clock = load_head(misfits.HEAD), SystemClock()
+    world = World(spec, VirtualClock())
+    calibration = simulated_calibration(world)
+    witness = Witness(Refractor(calibration, world.shape, planner, 0))
+    at = Exposures(NOW, exposed(world), exposed(world, lit=False), spec.camera.exposure_s)
+    looks = []
+    for _ in range(5):
+        moments_s = [clock.now_s()]
+        look(calibration, None, witness, at, lambda into=moments_s: into.append(clock.now_s()))
+        looks.append(np.diff([*moments_s, clock.now_s()]))
+    whole_s, longest_s, usual_s = (np.median([of(one) for one in looks]) for of in (np.sum, np.max, np.median))
+    waits = f"a press waits {1e3 * usual_s:.1f} ms, {1e3 * longest_s:.0f} at most"
+    print(f"a capture of {world.shape}: {whole_s:.2f} s; {waits}")

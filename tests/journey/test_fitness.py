@@ -1,14 +1,16 @@
 """Five ways in which a calibration does not fit, each from the head or the button to its code and its remedy."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from device.calibration.archive import Archive, Provenance
+from device.calibration.archive import CURRENT, Archive, Provenance
 from device.clock import VirtualClock
 from device.errors import CalibrationDamaged, CalibrationOld, CalibrationOtherMode, DiffuscopeError
 from device.head import Head, open_head
@@ -16,6 +18,7 @@ from device.ledger import MemoryLedger
 from device.spec import CalibrationTable, InstrumentSpec
 from device.values import Calibration, Psf
 from services.instrument.api import refusal
+from services.instrument.checking import checked, table
 from tests.journey.conftest import Diffuscope
 
 WEEK_S = 7 * 86400.0
@@ -25,6 +28,12 @@ CODES = {"age", "psf", "shift", "width", "hot pixels", "black level"}
 def turned(calibration: Calibration) -> Calibration:
     """A PSF as it was before the diffuser had turned by a quarter."""
     return replace(calibration, psfs=(Psf(np.ascontiguousarray(_quarter(calibration.psfs[0].pixels))),))
+
+
+def put_in_force(current: Path, at: datetime) -> None:
+    current.parent.mkdir(exist_ok=True)
+    current.touch()
+    os.utime(current, (at.timestamp(), at.timestamp()))
 
 
 def _quarter(pixels: np.ndarray) -> np.ndarray:
@@ -53,9 +62,16 @@ def test_a_good_head_is_looked_at_after_each_press_and_goes_on(rig: Any, wait_un
 
 
 def test_a_stale_calibration_is_refused_after_two_pictures_and_after_a_restart(
-    make_rig: Any, wait_until: Callable[..., None]
+    make_rig: Any, wait_until: Callable[..., None], tmp_path: Path
 ) -> None:
-    rig = make_rig(head=lambda head: replace(head, calibration=turned(head.calibration)))
+    current = tmp_path / "archive" / CURRENT
+    put_in_force(current, VirtualClock().wall())
+
+    def with_another_psf(head: Head) -> Head:
+        spec = head.spec.model_copy(update={"calibration": CalibrationTable(archive=current.parent)})
+        return replace(head, spec=spec, calibration=turned(head.calibration))
+
+    rig = make_rig(head=with_another_psf)
     for _ in range(2):
         assert rig.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
         wait_until(lambda: not rig.exam.fitness.due)
@@ -71,12 +87,14 @@ def test_a_stale_calibration_is_refused_after_two_pictures_and_after_a_restart(
     assert rig.world.glow is None
     assert ("calibration", True) in [(kind, "findings" in data) for kind, data in rig.told()]
     rig.exam.close()
-    again = make_rig(head=lambda head: replace(head, calibration=turned(head.calibration)))
+    again = make_rig(head=with_another_psf)
     wait_until(lambda: not again.exam.fitness.due)
     assert again.request("POST", "/api/captures", json={"eye": "OD"}).json()["code"] == "calibration.stale"
     again.exam.close()
-    other = make_rig()  # the head was calibrated again
-    assert other.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
+    put_in_force(current, VirtualClock().wall() + timedelta(days=1))  # somebody repaired the head, and went back to it
+    repaired = make_rig(head=with_another_psf)
+    assert not repaired.exam.fitness.due
+    assert repaired.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
 
 
 def test_a_calibration_that_grows_old_while_the_instrument_runs_is_a_notice_then_an_error(make_rig: Any) -> None:
@@ -152,6 +170,29 @@ def test_a_damaged_one_does_not_open(archived: Any) -> None:
 
 
 # By hand
+
+
+def test_what_the_shelf_tells_by_hand(make_rig: Any, wait_until: Callable[..., None], tmp_path: Path) -> None:
+    archive = Archive(tmp_path / "archive")
+    wrong: list[InstrumentSpec] = []
+
+    def with_another_psf(head: Head) -> Head:
+        strange, long_ago = turned(head.calibration), VirtualClock().wall() - timedelta(weeks=70)
+        archive.keep(strange, Provenance("D-1", long_ago, "a technician", "0.1.0"))
+        put_in_force(archive.root / CURRENT, VirtualClock().wall())
+        wrong.append(head.spec.model_copy(update={"calibration": CalibrationTable(archive=archive.root)}))
+        return replace(head, spec=wrong[0], calibration=strange)
+
+    rig = make_rig(head=with_another_psf)
+    for _ in range(2):
+        rig.exam.press("OD").result(30)
+    wait_until(lambda: not rig.exam.fitness.due)
+    found = checked(wrong[0], rig.store.folder, rig.clock, [].append)
+    assert (found.captures, found.darks) == (2, 0)
+    assert {one.name for one in found.findings if one.fails} == {"psf", "age"}
+    lines = table(found).splitlines()
+    assert lines[0].startswith("FAIL  age                  70 weeks  limit 61")
+    assert lines[1] == f"      {CalibrationOld.default_remedy}"
 
 
 @pytest.fixture

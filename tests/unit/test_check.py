@@ -12,14 +12,18 @@ from device.calibration import admission, check
 from device.calibration.archive import Provenance
 from device.calibration.check import Exposures, Sight, look
 from device.calibration.finding import Finding
+from device.clock import VirtualClock
 from device.errors import Busy, CalibrationOld, CalibrationOtherMode, CalibrationStale
 from device.recon.refraction import Refractor
 from device.recon.witness import Statement, Witness
-from device.spec import CameraSpec
+from device.sim.calibrate import simulated_calibration
+from device.sim.world import World
+from device.spec import CameraSpec, load_head
 from device.values import Calibration, Counts, Geometry, Psf, Sensor
 from tests import misfits
 from tests.misfits import calibrated, dark, lit, point
 from tests.scenes import PLANNER
+from tests.simulated import SCENES, coarse, exposed
 
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 FIGURES = (("dark_e_per_s", 0.0), ("pattern_e", 0.0))
@@ -67,6 +71,27 @@ def test_a_good_head_is_not_doubted_by_any_eye(retina: int, m_dpt: float, record
     assert seen[0].statement.sphere_dpt == pytest.approx(m_dpt, abs=0.4)
 
 
+RETINA_SCENES = (
+    "calm", "colour_sensor", "crowded_imx296", "diabetic", "dim", "drifting_eye", "paper_heine", "short_sighted",
+    "small_pupil", "stray_light", "worn_sensor",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RETINA_SCENES)
+def test_no_scene_with_a_retina_refuses_anybody(name: str, record_property: Callable[..., None]) -> None:
+    """Small pupils, dim light, moving eyes, stray light, another sensor: the psf is at 0.80 of 1 or more."""
+    spec = coarse(load_head(SCENES / f"{name}.toml"), misfits.K)
+    world = World(spec, VirtualClock())
+    calibration = simulated_calibration(world)
+    asked = Witness(Refractor(calibration, world.shape, PLANNER, 0))
+    seen = Exposures(NOW, exposed(world), exposed(world, lit=False), spec.camera.exposure_s)
+    findings = check.check(calibration, None, [look(calibration, None, asked, seen)], (), NOW)
+    record_property("findings", [(one.name, one.value) for one in findings])
+    assert {one.name for one in findings if not one.ok} <= {"black level"}  # where the room is lit, or the sensor warm
+    assert not any(one.fails for one in findings)
+    assert next(one.value for one in findings if one.name == "psf") > 0.7
+
+
 @pytest.mark.parametrize("diffuser", [5, 6, 7])
 def test_another_diffuser_explains_nothing(diffuser: int) -> None:
     assert abs(told(lit(point(diffuser=diffuser))).score) < 0.15
@@ -88,12 +113,12 @@ def test_an_axial_move_leaves_the_psf_as_it_was_and_is_seen_by_the_size_of_the_f
     assert findings["psf"].ok
     assert findings["psf"].value > 0.95
     assert findings["width"].hint
-    assert told(frame).wider == pytest.approx(by_um / 6000, abs=0.006)
+    assert told(frame).wider == pytest.approx(by_um / 6000, abs=0.008)
 
 
 @pytest.mark.parametrize(("by_um", "ok"), [(20.0, True), (50.0, False), (200.0, False)])
 def test_a_diffuser_pushed_aside_behind_its_iris_is_seen_by_where_the_picture_lies(by_um: float, ok: bool) -> None:
-    """Fifteen sixteenths of its surface are the same at 200 um, so the PSF is not blamed; 0.0127 deg to a um."""
+    """Fifteen sixteenths of its surface are the same at 200 um: the PSF is not blamed. 0.0127 deg to a micrometre."""
     frame = lit(misfits.slid(by_um))
     assert told(frame).score > 0.9
     assert told(frame).off_deg == pytest.approx((0.0, -by_um * 0.01273), abs=0.15)
