@@ -171,9 +171,7 @@ def test_names_stand_apart_from_pictures_and_keys_remember_nothing_readable(stor
     people.answer(next(keys), visit, "name", "Meenakshi")
     with sqlite3.connect(store.folder / "shelf.sqlite") as connection:
         names = [name for (name,) in connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
-        holding = [
-            name for name in names if "Meenakshi" in repr(connection.execute(f"SELECT * FROM {name}").fetchall())
-        ]
+        rows = {name: repr(connection.execute(f"SELECT * FROM {name}").fetchall()) for name in names}
     connection.close()
     assert [name for name, held in rows.items() if "Meenakshi" in held] == ["identifiers"]
 
