@@ -12,6 +12,7 @@ import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -91,12 +92,12 @@ def folder_name(visit: Visit) -> str:
     return f"{visit.number}-{visit.id}"
 
 
-def zipped(name: str, files: Mapping[str, bytes]) -> bytes:
-    """The files in one folder of a ZIP; PNGs do not shrink, so nothing is pressed."""
+def zipped(name: str, files: Mapping[str, bytes], begun_at: datetime) -> bytes:
+    """The files in one folder of a ZIP, dated by the visit; PNGs do not shrink, so nothing is pressed."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for path, content in files.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}/{path}"), content)
+            archive.writestr(zipfile.ZipInfo(f"{name}/{path}", begun_at.timetuple()[:6]), content)
     return out.getvalue()
 
 

@@ -162,7 +162,7 @@ def exports_router(people: People, store: Store, sticks: Sticks) -> APIRouter:
         """A visit as one file."""
         visit = people.get(id)
         name = folder_name(visit)
-        content = zipped(name, exported(store, visit, shown_visit(visit, people)))
+        content = zipped(name, exported(store, visit, shown_visit(visit, people)), visit.begun_at)
         return Response(
             content, media_type="application/zip", headers={"Content-Disposition": f'attachment; filename="{name}.zip"'}
         )

@@ -6,7 +6,10 @@ from itertools import count
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
+
+from device.sim import stage
 
 SLOTS = ["R-centre", "R-nerve", "L-centre", "L-nerve"]
 EYES = {"R-centre": "OD", "R-nerve": "OD", "L-centre": "OS", "L-nerve": "OS"}
@@ -84,6 +87,41 @@ def test_a_retake_keeps_the_old_picture_and_the_operator_chooses(old_rig: Any) -
     assert emptied["slots"]["R-centre"]["captures"] == [first["id"], second["id"]]
     back = post(old_rig, f"/api/visits/{visit['id']}/slots", slot="R-centre", capture=second["id"])
     assert back["slots"]["R-centre"]["capture"] == second["id"]
+
+
+def test_a_wall_instead_of_an_eye_is_told_at_once_and_after_the_retakes_it_is_not_clear(make_rig: Any) -> None:
+    rig = make_rig()
+    visit = begin(rig)
+    aim = json.loads(rig.request("GET", "/api/preview").headers["x-aim"])
+    assert aim == {"code": "ready", "fill": pytest.approx(0.98, abs=0.03)}
+    rig.clock.elapsed_s += 60  # so that nobody takes the wall for the lid of the eye that was there
+    eye = rig.world._rates  # what each colour of the lamp brings back; a wall gives it back evenly
+    rig.world._rates = {colour: np.full_like(light, light.mean()) for colour, light in eye.items()}
+    causes = [shoot(rig, visit, "R-centre")["verdict"] for _ in range(4)]
+    assert {one["word"] for one in causes} == {"again"}
+    assert [one["code"] for one in causes] == ["shot.noeye"] * 2 + ["shot.poor"] * 2
+    slot = rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
+    assert (slot["state"], slot["tries"]) == ("taken", 4)  # the real, poor picture, never an empty box
+    assert slot["verdict"]["code"] == "shot.poor"
+    told = [(kind, data.get("word"), data.get("code")) for kind, data in rig.told() if kind in ("verdict", "stage")]
+    assert told.index(("verdict", "again", "shot.noeye")) < 3  # before anything was made of it
+    number = int(rig.request("GET", "/api/preview").headers["x-frame"])
+    aim = json.loads(rig.request("GET", f"/api/preview?after={number}").headers["x-aim"])
+    assert aim == {"code": "noeye", "fill": 0.0}
+    rig.world._rates = eye
+    assert shoot(rig, visit, "R-centre")["verdict"]["word"] == "good"
+    assert rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]["verdict"]["word"] == "good"
+    heard = [data for kind, data in rig.told() if kind == "aim"]
+    assert [one["code"] for one in heard][:2] == ["ready", "noeye"]
+
+
+def test_too_much_light_is_told_even_if_no_picture_can_be_made(make_rig: Any) -> None:
+    rig = make_rig()
+    rig.world.stage = stage.screen(rig.world, 1e9)
+    answer = rig.request("POST", "/api/captures", json={"eye": "OD", "key": next(keys)})
+    assert answer.status_code == 422
+    told = [(kind, data.get("code")) for kind, data in rig.told() if kind in ("verdict", "failed")]
+    assert told == [("verdict", "shot.saturated"), ("failed", "input.frame")]
 
 
 def test_could_not_is_a_finished_outcome(old_rig: Any) -> None:
