@@ -23,6 +23,7 @@ MOST_DARK_SHARE = 0.05  # of the converter: a dark frame that rises by more than
 MOST_SHADING_DN = 0.5  # between parts of a dark frame, beside 6 sigma of its noise
 SEEN = 10.0  # times: what is rarer tells nothing
 UNDECIDED_DN = 0.05  # a noise below this never leaves its count
+NO_LIGHT = "Put the cap on, turn the lamp off, shade the room, then start again."
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(41)
 
 Floats = NDArray[np.float64]
@@ -61,6 +62,8 @@ def measured_darks(exposures: Sequence[Moments], map_s: float, white_dn: float) 
     """
     if len(exposures) < 2:
         raise CalibrationRefused("darks at one exposure only say nothing about warmth", "Take two exposures or more.")
+    for one in exposures:
+        _refuse_brightness(one, white_dn)
     shortest = min(exposures, key=lambda one: one.exposure_s)
     mapped = min(exposures, key=lambda one: abs(one.exposure_s - map_s))
     hot = hot_pixels(exposures)
@@ -171,10 +174,16 @@ def _temporal(one: Moments, hot: Mask) -> float:
     return float(one.variance_dn2[~hot].mean(dtype=np.float64))
 
 
+def _refuse_brightness(one: Moments, white_dn: float) -> None:
+    """Half of the pixels beyond the middle of the converter: no black level is there."""
+    if (middle_dn := float(np.median(one.mean_dn))) > white_dn / 2:
+        raise CalibrationRefused(f"the dark frames are bright: {middle_dn:.0f} of {white_dn:.0f} DN", NO_LIGHT)
+
+
 def _refuse_light(exposures: Sequence[Moments], hot: Mask, rise_dn: float, white_dn: float) -> None:
     """Darks that grow like a picture, or are brighter here than there, have seen light."""
     longest = max(exposures, key=lambda one: one.exposure_s)
-    remedy = "Put the cap on, turn the lamp off, shade the room, then start again."
+    remedy = NO_LIGHT
     if hot.mean() > MOST_HOT:
         raise CalibrationRefused(f"{hot.mean():.1%} of the pixels shine in the dark (at most {MOST_HOT:.0%})", remedy)
     if rise_dn > MOST_DARK_SHARE * white_dn:

@@ -16,7 +16,7 @@ from device.calibration.archive import Archive, Provenance
 from device.calibration.colours import SAME, differs, refuse_other_source
 from device.calibration.darks import Darks, measured_darks
 from device.calibration.dioptres import Dioptres, Stretch, between, measured_dioptres, refuse_other_place
-from device.calibration.flats import Flats, measured_flats
+from device.calibration.flats import LEAST_SHARE, Flats, measured_flats
 from device.calibration.leds import LedReadings
 from device.calibration.moments import Moments
 from device.calibration.point import Point, Steady, measured_point, refuse_level
@@ -222,7 +222,7 @@ class Procedure:
         return darks if self.warmth is None else replace(darks, warm_c=self.warmth.read_c())
 
     def _flats(self, darks: Darks) -> Flats:
-        full_s = self._exposure_for(FILLED, darks, 50.0, 3.0)
+        full_s = self._exposure_for(FILLED, darks, 50.0, 3.0, LEAST_SHARE)
         levels = [self._moments(share * full_s, FRAMES) for share in LEVELS]
         return measured_flats(levels, self._moments(TOO_BRIGHT * full_s, 2), darks)
 
@@ -255,8 +255,13 @@ class Procedure:
                 self.raws.keep(frame)
             yield frame
 
-    def _exposure_for(self, filled: float, darks: Darks, percentile: float, longest_s: float) -> float:
-        """The exposure that fills that percentile of the good pixels so far; what is too dark gets the longest."""
+    def _exposure_for(
+        self, filled: float, darks: Darks, percentile: float, longest_s: float, least: float = 0.0
+    ) -> float:
+        """The exposure that fills that percentile of the good pixels so far; what is dim gets the longest.
+
+        CalibrationRefused where even that fills less than `least`.
+        """
         good, top_dn = ~darks.hot, self.job.spec.camera.white_dn - darks.black_dn
         exposure_s = min(self.job.spec.camera.exposure_s, longest_s)
         for _ in range(10):
@@ -265,6 +270,11 @@ class Procedure:
             share = signal_dn / top_dn
             if 0.9 * filled < share < 1.1 * filled:
                 break
+            if exposure_s >= longest_s and share < least:  # now, not after minutes of long exposures
+                raise CalibrationRefused(
+                    f"it is dark: {signal_dn:.0f} DN in {exposure_s:.2g} s (at least {least * top_dn:.0f})",
+                    "Take the cap off and switch the light on, then start again.",
+                )
             factor = 1 / 8 if share > 0.95 else min(filled / max(share, 1e-6), 8.0)
             wanted_s = float(np.clip(exposure_s * factor, SHORTEST_S / 10, longest_s))
             if wanted_s == exposure_s:
