@@ -60,7 +60,7 @@ function header(state, act) {
       ${title(route, visit, act)}
       <p class="head-name">
         <span class="name">${status?.name ?? ""}</span>
-        <span class="state" data-state=${word}>${t(`state.${word}`)}</span>
+        <span class="state" data-state=${word}>${t(`doing.${word}`)}</span>
         ${space === undefined || space === null ? nothing : html`<span class="space">${t("space", { n: space })}</span>`}
       </p>
       ${kindChip(shotOf(state)?.capture?.simulated ? "simulated" : status?.kind)}

@@ -168,7 +168,7 @@ def _captures(app: FastAPI, stub: Stub) -> None:
         stub.tell("state", {"state": "making"})
         for step in range(5):
             stub.stage(name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, stub.refine_s * (1 - step / 5))
-            if step == 1:
+            if step == 2:
                 stub.tell("verdict", {"id": name, **verdict})
             await asyncio.sleep(stub.refine_s / 5)
         stub.stage(name, "keep", 1.0, 0)
