@@ -6,7 +6,7 @@ import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
 import { get, set, store } from "./memory.js";
-import { freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
+import { buzz, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
 import { follow, go } from "./routes.js";
 import { today } from "./screens/history.js";
 import { lower, raise } from "./states.js";
@@ -46,7 +46,9 @@ async function load(route) {
   const visit = await refreshVisit(route.visit);
   if (get().route.visit !== route.visit) return;
   if (!visit && !get().visit && get().link !== "lost") go({ screen: "home" }, { replace: true });
-  else if (route.screen === "picture") await openPicture(route);
+  if (route.screen !== "picture" || !visit) return;
+  if (!get().status) await refreshStatus(); // after a reload: is a picture being made?
+  await openPicture(route);
 }
 
 // Where the keyboard goes on; a finger does not notice.
@@ -152,7 +154,7 @@ function heardAim(aim) {
   if (aim.code !== was?.code && now - promptedAt >= READ_MS) {
     promptedAt = now;
     set({ prompt: Object.freeze(aim) });
-    if (aim.code === "ready") navigator.vibrate?.(15);
+    if (aim.code === "ready") buzz(15);
   }
   if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
 }

@@ -8,7 +8,7 @@ import { lower, raise, shownStates } from "./states.js";
 import { politely, refreshVisit } from "./visit.js";
 import { t } from "./words.js";
 
-const LOCK_MS = 600; // the second half of a double tap must neither take a picture nor leave one
+const LOCK_MS = 400; // the second half of a double tap must neither take a picture nor leave one
 const SHOTS = 12;
 const START = Object.freeze({ name: "expose", fraction: 0, left: 0 });
 
@@ -24,6 +24,11 @@ export function unlocked() {
   if (performance.now() < lockedUntil) return false;
   lock();
   return true;
+}
+
+/** A short vibration, where there is one and somebody has touched the page; others are complained about by browsers. */
+export function buzz(pattern) {
+  if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(pattern);
 }
 
 const put = (shots) => set({ shots: Object.freeze(shots.slice(-SHOTS)) });
@@ -55,7 +60,7 @@ async function makePicture(visit, slot) {
   lower(({ from }) => from === "press");
   put([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: START, verdict: null, over: false })]);
   go({ screen: "picture", visit, slot });
-  navigator.vibrate?.(30);
+  buzz(30);
   try {
     kept(await send("POST", "/api/captures", { eye, key, visit, slot }), key);
   } catch (problem) {
@@ -104,11 +109,12 @@ export const heardOfShots = {
     if (!shot || shot.verdict) return;
     lock();
     change(shot.key, { verdict: Object.freeze(verdict) });
-    if (verdict.word === "again") navigator.vibrate?.([30, 60, 30]);
+    if (verdict.word === "again") buzz([30, 60, 30]);
   },
 
   kept(capture) {
-    const shot = byId(capture.id);
+    const waiting = ({ id, over, visit, slot }) => !id && !over && visit === capture.visit && slot === capture.slot;
+    const shot = byId(capture.id) ?? get().shots.find(waiting);
     if (shot) kept(capture, shot.key);
     else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
   },

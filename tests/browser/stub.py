@@ -136,7 +136,8 @@ def build(stub: Stub) -> FastAPI:
 def _status(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/status")
     def status() -> dict[str, Any]:
-        state = "busy" if stub.busy else "aim"
+        told = [data["state"] for kind, data in stub.events if kind == "state"]
+        state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
                 "controller": stub.controller}  # fmt: skip
@@ -162,6 +163,7 @@ def _captures(app: FastAPI, stub: Stub) -> None:
             return JSONResponse(OTHER, 409)
         name = f"20261120T1000{stub.presses:02d}-{wish['eye']}-stub"
         verdict = stub.next_verdict()
+        shelf = stub.visits
         stub.tell("state", {"state": "busy"})
         stub.stage(name, "expose", 0.05, stub.refine_s)
         await asyncio.sleep(stub.expose_s)
@@ -171,6 +173,8 @@ def _captures(app: FastAPI, stub: Stub) -> None:
             if step == 2:
                 stub.tell("verdict", {"id": name, **verdict})
             await asyncio.sleep(stub.refine_s / 5)
+            if stub.visits is not shelf:
+                return JSONResponse(UNKNOWN, 404)  # a press of the test before: its shelf is gone
         stub.stage(name, "keep", 1.0, 0)
         stub.captures.insert(0, stub.capture(name, wish, verdict))
         if wish.get("visit"):

@@ -8,7 +8,6 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Complaints
-from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.stub import Stubbed
 from tests.browser.walk import SHUTTER, Open, aiming, new_person, settled, taken
 
@@ -19,7 +18,6 @@ BUSY = {
     "message": "The instrument is taking another picture.",
     "remedy": "A picture is being taken. Wait until it is done, then press again.",
 }
-BROKEN = {"code": "light.fault", "message": "One light is not working.", "remedy": "Call the technician."}
 
 
 def zoom(page: Page) -> float:
@@ -35,31 +33,6 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
     }"""
     value: list[int] = page.evaluate(script, dx)
     return value
-
-
-@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
-def test_the_exam_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int]) -> None:
-    stub.stub.refine_s = 2.5
-    stub.stub.problem = BROKEN
-    page = aiming(open_page, stub, size)
-    expect(page.locator(".state-bar")).to_be_visible()
-    faults = {"problem": look_for_faults(page, SHUTTER)}
-    stub.stub.problem = None
-    expect(page.locator(".state-bar")).to_have_count(0)
-    faults["aim"] = look_for_faults(page, SHUTTER)
-    place = page.locator(".stage").bounding_box()
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=quick]")
-    faults["making"] = look_for_faults(page, SHUTTER)
-    assert page.locator(".stage").bounding_box() == place, "the picture moved when the quick look came"
-    page.wait_for_selector("[data-phase=told]")
-    faults["told"] = look_for_faults(page, "#next", "#again")
-    page.wait_for_selector(".stage[data-mark=final]")
-    faults["result"] = look_for_faults(page, "#next", "#again")
-    assert page.locator(".stage").bounding_box() == place, "the picture moved when the final one came"
-    page.get_by_role("button", name="Menu").tap()
-    faults["menu"] = look_for_faults(page)
-    assert faults == {screen: [] for screen in faults}
 
 
 def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page: Open, stub: Stubbed) -> None:

@@ -7,7 +7,7 @@ from playwright.sync_api import Page, expect
 from tests.browser.stub import Stubbed
 
 SHUTTER = "#shutter"
-LOCK_MS = 700  # the page ignores presses for 600 ms after every change of screen
+LOCK_MS = 450  # the page ignores presses for 400 ms after every change of screen
 Open = Callable[..., Page]
 
 
