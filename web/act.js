@@ -5,6 +5,7 @@ import { get, remember, set, shotOf } from "./memory.js";
 import { typedBy } from "./parts.js";
 import { freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
+import { today } from "./screens/history.js";
 import { codeText } from "./screens/outcome.js";
 import { lower, raise } from "./states.js";
 import { EyePic, homeBox } from "./viewer.js";
@@ -23,7 +24,11 @@ const moves = {
   resume: visits.resume,
   shoot: () => unlocked() && go({ screen: "aim", visit: get().visit.id, slot: get().visit.next_slot ?? visits.nextSlot() }),
   setField: visits.setField,
-  typeNumber: (key) => set({ typed: typedBy(get().typed, key, 8) }),
+  typeNumber(key) {
+    const typed = typedBy(get().typed, key, 12);
+    set({ typed });
+    visits.refreshList(typed ? { q: typed, limit: "20" } : { day: today(), limit: "20" });
+  },
   only: (onlyShow) => set({ onlyShow }),
 
   /** One step back, also where the address was opened directly. */

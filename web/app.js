@@ -15,6 +15,7 @@ import { politely, refreshList, refreshVisit, saveRest } from "./visit.js";
 import { learn, t } from "./words.js";
 
 const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
+const HOLD_BEATS = 4; // the controls are lent for ten seconds
 const READ_MS = 700; // a prompt stays long enough to be read
 const AUTO_MS = 500;
 const LATE_S = 2;
@@ -38,7 +39,7 @@ async function arrive(route) {
 }
 
 async function load(route) {
-  if (route.screen === "home") refreshList({ open: "true", limit: "20" });
+  if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });
   if (!route.visit) return;
@@ -73,6 +74,7 @@ const heard = {
     beats += 1;
     // A problem that is over must go at once.
     if (beats % STATUS_BEATS === 0 || get().states.some(({ from }) => from === "status")) refreshStatus();
+    else if (beats % HOLD_BEATS === 0 && get().mine) holdControls();
   },
 
   state: ({ state }) => set({ doing: state }),
@@ -90,7 +92,6 @@ const heard = {
   },
 };
 
-let lease = null;
 let sweptTold = false;
 
 async function refreshStatus() {
@@ -106,7 +107,7 @@ async function refreshStatus() {
   lower(({ from, told }) => from === "status" && told !== problem?.code);
   if (problem) raise({ ...problem, told: problem.code, from: "status" });
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
-  if (!get().mine || lease === null || status.controller !== lease) await holdControls();
+  await holdControls();
 }
 
 function tellSwept(swept) {
@@ -124,8 +125,7 @@ async function holdControls() {
   }
 }
 
-function controls({ lease: given, mine }) {
-  lease = given;
+function controls({ mine }) {
   set({ mine });
   if (mine) lower("link.other");
   else raise({ code: "link.other", from: "page" });

@@ -104,10 +104,11 @@ export const heardOfShots = {
     change(shot.key, { id, stage, quick: url ?? shot.quick });
   },
 
+  /** The word on the raw frame, while the eye is there; once more when the made picture changes it. */
   verdict({ id, ...verdict }) {
     const shot = byId(id);
-    if (!shot || shot.verdict) return;
-    lock();
+    if (!shot || shot.over) return;
+    if (shot.verdict?.word !== verdict.word) lock();
     change(shot.key, { verdict: Object.freeze(verdict) });
     if (verdict.word === "again") buzz([30, 60, 30]);
   },

@@ -140,13 +140,13 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
-                "controller": stub.controller}  # fmt: skip
+                "controller": stub.controller and "a public name"}  # fmt: skip
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:
         if stub.controller is None or wish.get("take"):
             stub.controller = wish["key"]
-        return {"lease": stub.controller, "mine": stub.controller == wish["key"]}
+        return {"lease": "a public name", "mine": stub.controller == wish["key"]}
 
 
 def _captures(app: FastAPI, stub: Stub) -> None:
@@ -192,7 +192,7 @@ def _captures(app: FastAPI, stub: Stub) -> None:
     def keep(name: str, wish: dict[str, str]) -> Any:
         capture = next(capture for capture in stub.captures if capture["id"] == name)
         slot = stub.visits.kept[capture["visit"]]["slots"][capture["slot"]]
-        slot |= {"state": "taken", "capture": name, "verdict": capture["verdict"], "accepted": True}
+        slot |= {"state": "taken", "capture": name, "verdict": capture["verdict"]}
         return capture
 
     @app.get("/api/captures/{name}/{file}")
@@ -239,7 +239,7 @@ def _visits(app: FastAPI, stub: Stub) -> None:
         elif what == "slots":
             slot = visit["slots"][wish["slot"]]
             kept = next(capture for capture in stub.captures if capture["id"] == wish["capture"])
-            slot |= {"state": "taken", "capture": kept["id"], "verdict": kept["verdict"], "accepted": True}
+            slot |= {"state": "taken", "capture": kept["id"], "verdict": kept["verdict"]}
             slot["captures"] = [*{*slot["captures"], kept["id"]}]
         elif what == "finish":
             visits().finish(visit)

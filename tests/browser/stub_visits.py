@@ -50,11 +50,7 @@ class Visits:
 
     def seen(self, visit: dict[str, Any]) -> dict[str, Any]:
         """The visit with its next missing slot."""
-        missing = [
-            name
-            for name, slot in visit["slots"].items()
-            if slot["state"] == "empty" or (slot["verdict"] or {}).get("word") == "again" and not slot.get("accepted")
-        ]
+        missing = [name for name, slot in visit["slots"].items() if slot["state"] == "empty"]
         return visit | {"next_slot": missing[0] if missing else None}
 
     def listed(self, day: str | None, still_open: bool, q: str) -> dict[str, Any]:
@@ -77,7 +73,7 @@ class Visits:
         place = self.kept[visit]["slots"][slot]
         place["captures"].append(capture)
         place["tries"] += 1
-        place |= {"state": "taken", "capture": capture, "verdict": verdict, "reason": None, "accepted": False}
+        place |= {"state": "taken", "capture": capture, "verdict": verdict, "reason": None}
 
     def finish(self, visit: dict[str, Any]) -> None:
         urgent = {"sudden_loss", "pain"} & set(visit["fields"].get("complaints", []))

@@ -19,10 +19,14 @@ const QUESTIONS = [
   ["diabetes_years", () => options("years", ["<1", "1-5", "5-10", ">10", "unknown"])],
   ["vision_od", () => LADDER.map(seen)],
   ["vision_os", () => LADDER.map(seen)],
-  ["glasses", () => [[true, t("yes")], [false, t("no")]]],
+  ["glasses", () => [["yes", t("yes")], ["no", t("no")]]],
   ["drops_od", () => [[true, t("drops.given")], [false, t("drops.none")]]],
   ["drops_os", () => [[true, t("drops.given")], [false, t("drops.none")]]],
 ];
+
+// Drops are kept as the moment at which they were given: an hour later the pupil is another.
+const isDrops = (name) => name.startsWith("drops_");
+const sentAs = (name, one) => (isDrops(name) ? (one ? new Date().toISOString() : null) : one);
 
 export function person(state, act) {
   const { visit } = state;
@@ -75,23 +79,25 @@ function question({ visit }, act, name, answers) {
   const value = visit.fields[name];
   if (name === "age") return age(value, act);
   const many = name === "complaints";
-  const choose = (one) => act.setField(name, many ? toggled(value ?? [], one) : one);
+  const choose = (one) => act.setField(name, many ? toggled(value ?? [], one) : sentAs(name, one));
+  const chosen = isDrops(name) && value !== undefined ? value !== null : value;
   const urgent = many && (value ?? []).some((one) => URGENT.includes(one));
   return html`
     <div class="question">
       <h3>${label}</h3>
-      ${choice({ label, field: name, value, options: answers(), choose, many })}
+      ${choice({ label, field: name, value: chosen, options: answers(), choose, many })}
       ${urgent ? html`<p class="urgent" role="note">${icon("warn")} ${t("complaint.urgent")}</p>` : nothing}
     </div>
   `;
 }
 
-/** "None" and a complaint exclude each other. */
+/** "None" and a complaint exclude each other; nothing chosen is no answer. */
 function toggled(before, one) {
-  if (one === "none") return before.includes("none") ? [] : ["none"];
-  const rest = before.filter((other) => other !== one && other !== "none");
-  return before.includes(one) ? rest : [...rest, one];
+  if (before.includes(one)) return orNull(before.filter((other) => other !== one));
+  return one === "none" ? ["none"] : [...before.filter((other) => other !== "none"), one];
 }
+
+const orNull = (list) => (list.length ? list : null);
 
 function age(value, act) {
   const press = (key) => {
@@ -116,7 +122,7 @@ function typedWords({ visit }, act) {
         maxlength="120"
         autocomplete="off"
         .value=${visit.fields[name] ?? ""}
-        @change=${({ target }) => act.setField(name, target.value)}
+        @change=${({ target }) => act.setField(name, target.value.trim() || null)}
       />
     </label>
   `;

@@ -27,7 +27,8 @@ function triesOf({ visit }, shot) {
   return (slot?.tries ?? 0) + (slot?.captures.includes(shot.id) ? 0 : 1);
 }
 
-const exhausted = (state, shot) => triesOf(state, shot) > (state.protocol?.retakes ?? 2);
+const exhausted = (state, shot) =>
+  shot.verdict?.code === "shot.poor" || triesOf(state, shot) > (state.protocol?.retakes ?? 2);
 
 // ---- the card
 
