@@ -62,13 +62,11 @@ const exam = {
   print: () => window.print(),
 
   async showCode() {
-    const { default: encode } = await import("./vendor/qrcode.mjs");
-    const drawing = encode(0, "M");
-    drawing.addData(codeText(get()));
-    drawing.make();
-    const size = drawing.getModuleCount();
-    const rows = Array.from({ length: size }, (_, row) =>
-      Array.from({ length: size }, (_, col) => (drawing.isDark(row, col) ? `M${col} ${row}h1v1h-1z` : "")).join(""),
+    const { correction, generate } = await import("./vendor/lean-qr-nano.mjs");
+    const drawing = generate(codeText(get()), { minCorrectionLevel: correction.M });
+    const { size } = drawing;
+    const rows = Array.from({ length: size }, (_, y) =>
+      Array.from({ length: size }, (_, x) => (drawing.get(x, y) ? `M${x} ${y}h1v1h-1z` : "")).join(""),
     );
     set({ code: get().code ? undefined : { size, path: rows.join("") } });
   },
