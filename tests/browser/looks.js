@@ -76,6 +76,8 @@
     const stage = document.querySelector(".stage").getBoundingClientRect();
     const prompt = document.querySelector(".prompt").getBoundingClientRect();
     if (prompt.top < stage.bottom) faults.push("the words under the picture cover it");
+    const below = document.querySelector(".panel").getBoundingClientRect();
+    if (prompt.bottom > below.top && prompt.right > below.left) faults.push("the words under the picture lie over the controls");
     if (stage.height < 140) faults.push(`the picture is only ${stage.height} high`);
   }
 

@@ -58,7 +58,7 @@ export function film(state, act) {
   return html`
     <section class="film">
       <h2>${t("film.title", { number: visit.number })}</h2>
-      ${visit.outcome ? html`<p>${visit.outcome.sentence}</p>` : nothing}
+      ${visit.outcome ? html`<p><b>${t(`outcome.${visit.outcome.code}`)}</b> · ${visit.outcome.sentence}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       <div class="ends">
         ${picked.length === 2

@@ -13,7 +13,8 @@ export function outcome(state, act) {
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: visit.number })}</h2>
-      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${sentence(visit.outcome)}</p>
+      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${t(`outcome.${visit.outcome.code}`)}</p>
+      <p>${visit.outcome.sentence}</p>
       ${tiles(state, act)}
       <div class="ends">
         <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
@@ -41,8 +42,6 @@ function notYet(act, visit) {
   </section>`;
 }
 
-const sentence = ({ code: name, sentence: words }) => words || t(`outcome.${name}`);
-
 /** What the code says: number, date, outcome, telephone of the centre. Never a picture, a name or an age. */
 export function codeText({ visit, protocol }) {
   const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
@@ -65,7 +64,8 @@ function slip({ visit, protocol, code: drawn }) {
   return html`<section class="slip" aria-hidden="true">
     <p class="slip-number">${personWords(visit)}</p>
     <p>${calendarDay(moment)}, ${clockTime(moment)}</p>
-    <p class="slip-outcome">${sentence(visit.outcome)}</p>
+    <p class="slip-outcome">${t(`outcome.${visit.outcome.code}`)}</p>
+    <p>${visit.outcome.sentence}</p>
     ${phone ? html`<p>${t("outcome.phone", { phone })}</p>` : nothing} ${drawn ? code(drawn) : nothing}
   </section>`;
 }

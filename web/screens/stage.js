@@ -18,7 +18,7 @@ export function stage(state, act) {
           class=${none ? "" : "behind"}
           .head=${state.status}
           .link=${state.link}
-          .hint=${state.prompt}
+          .hint=${standing(state) ? null : state.prompt}
           .active=${state.route.screen === "aim"}
           @aim=${act.heardAim}
           @late=${act.heardLate}
