@@ -132,7 +132,7 @@ export const ENGLISH = {
   "tile.poor": "Take again",
   "tile.could_not": "Could not",
   "tile.making": "Being made",
-  "tile.name": "{eye}, {part}: {state}",
+  "tile.name": "{short}, {eye}: {state}",
 
   "make.expose": "Hold still",
   "make.refine": "Making the picture…",

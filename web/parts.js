@@ -51,7 +51,8 @@ function tile(state, act, { id, eye, field }) {
   const face = faceOf(state, id);
   const [mark, word] = FACES[face];
   const capture = state.visit?.slots[id]?.capture ?? state.visit?.slots[id]?.captures.at(-1);
-  const name = t("tile.name", { eye: t(`eye.${eye}`), part: fieldWord(field), state: t(word) });
+  const short = `${t(`eye.${eye}.letter`)} · ${fieldWord(field)}`;
+  const name = t("tile.name", { short, eye: t(`eye.${eye}`), state: t(word) }); // begins with what is seen (WCAG 2.5.3)
   return html`
     <button
       type="button"
@@ -62,7 +63,7 @@ function tile(state, act, { id, eye, field }) {
       @click=${() => act.chooseTile(id)}
     >
       <span class="thumb">${capture ? thumb(capture, act) : nothing}<span class="mark">${icon(mark)}</span></span>
-      <span class="tile-word">${t(`eye.${eye}.letter`)} · ${fieldWord(field)}</span>
+      <span class="tile-word">${short}</span>
     </button>
   `;
 }
