@@ -170,6 +170,8 @@ act.heardLate = ({ detail: seconds }) => {
 function draw(state) {
   document.documentElement.dataset.theme = state.theme;
   render(page(state, act), $("#app"));
+  // The shutter had the focus and is gone: a keyboard goes on at the verdict, and a screen reader reads it.
+  if (document.activeElement === document.body) $("#result-title")?.focus({ preventScroll: true });
 }
 
 await learn(get().language);

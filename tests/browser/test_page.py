@@ -30,7 +30,7 @@ def a_new_person(page: Page, complaints: Complaints) -> Page:
     page.wait_for_selector("#new")
     if page.evaluate("fetch('/api/protocol').then((answer) => answer.status)") != 200:
         pytest.skip("this server keeps no visits")
-    page.locator(".state[data-state=aim]").wait_for(timeout=120_000)
+    page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=120_000)
     if settled(page).locator("[data-do=useHere]").count():
         page.locator("[data-do=useHere]").tap()
         expect(page.locator(".state-bar")).to_have_count(0)
@@ -123,7 +123,7 @@ def test_what_was_taken_is_still_there_after_a_restart(page: Page, server: Serve
     server.wait_until_ready()
     expect(page.get_by_role("alert")).to_have_count(0, timeout=8000)  # by itself; nothing to tap
     frame = live(page)
-    live_after(page, frame)
+    live_after(page, frame, limit_s=60)  # it makes its plans anew first
     page.reload()
     expect(page.locator("[data-slot=R-centre] img")).to_have_attribute("src", taken or "")
     tap(page, "[data-slot=R-centre]")
