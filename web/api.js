@@ -5,10 +5,11 @@ import { t } from "./words.js";
 
 /** The instrument's own words about why something was not done. */
 export class Refusal extends Error {
-  constructor({ code, message, remedy }) {
+  constructor({ code, message, remedy, ...vars }) {
     super(message);
     this.code = code;
     this.remedy = remedy;
+    this.vars = vars; // numbers that the words may need, such as minutes to wait
   }
 }
 
@@ -26,20 +27,44 @@ async function json(path, options) {
 }
 
 export const getStatus = () => json("/api/status");
-export const getCaptures = async (limit = 20) => (await json(`/api/captures?limit=${limit}`)).captures;
+export const getProtocol = () => json("/api/protocol");
+export const getVisit = (id) => json(`/api/visits/${encodeURIComponent(id)}`);
+export const getVisits = (query) => json(`/api/visits?${new URLSearchParams(query)}`);
+export const getCapture = (id) => json(`/api/captures/${encodeURIComponent(id)}`);
+export const getFolders = async () => (await json("/api/exports")).folders;
+export const fileOf = (capture, name) => `/api/captures/${encodeURIComponent(capture)}/${name}`;
+export const zipOf = (visit) => `/api/visits/${encodeURIComponent(visit)}/export.zip`;
 
-/** Ask for one picture. Never repeated by itself: light goes on only because somebody pressed. */
-export function takePicture(eye) {
-  return json("/api/captures", {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ eye, key: pressKey() }),
+/** Send a change. The key makes a request that the network doubles, or that we repeat after a lost link, happen once. */
+export function send(method, path, { key = freshKey(), ...body } = {}) {
+  return json(path, {
+    method,
+    headers: { "Content-Type": "application/json", "X-Controller": controllerKey() },
+    body: JSON.stringify({ ...body, key }),
   });
 }
 
-// Sixteen hex digits per press, so that a request that the network doubles still makes one picture.
-function pressKey() {
+/** Ask for the controls of the instrument, which one page holds at a time; `take` takes them from another page. */
+export const askForControls = (take) =>
+  send("POST", "/api/controller", take ? { key: controllerKey(), take } : { key: controllerKey() });
+
+// Sixteen hex digits; crypto.randomUUID does not exist on plain http.
+export function freshKey() {
   return Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+let ownKey = null;
+
+// The tab's own name towards the instrument: a reload keeps it, another tab has another.
+function controllerKey() {
+  if (ownKey) return ownKey;
+  try {
+    ownKey = sessionStorage.getItem("diffuscope.controller") ?? freshKey();
+    sessionStorage.setItem("diffuscope.controller", ownKey);
+  } catch {
+    ownKey = freshKey();
+  }
+  return ownKey;
 }
 
 /** The next preview frame after number `after`, or null when none came; throws when the link is broken. */
@@ -50,8 +75,17 @@ export async function getPreview(after, signal) {
   return {
     number: Number(answer.headers.get("X-Frame")),
     ageMs: Number(answer.headers.get("X-Age-Ms")),
+    aim: aimFrom(answer.headers.get("X-Aim")),
     bitmap: await createImageBitmap(await answer.blob()),
   };
+}
+
+function aimFrom(header) {
+  try {
+    return header ? JSON.parse(header) : null;
+  } catch {
+    return null; // a frame is a frame, whatever somebody wrote beside it
+  }
 }
 
 export async function getBitmap(url, signal) {
@@ -62,7 +96,7 @@ export async function getBitmap(url, signal) {
 
 const SILENCE_MS = 3500; // the server's heart beats every second; three missed beats are a lost link
 const RETRY_MS = 2500; // a half-open connection can look alive for minutes, so we open a fresh one
-const EVENTS = ["beat", "state", "stage", "kept", "failed"];
+const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "notice"];
 
 /**
  * One event stream per visible page: six open ones freeze the whole origin, so a hidden page closes its own.

@@ -1,327 +1,182 @@
-// The page's story: aim, press, hold still, look, next. State lives in the store, looks live in views.js.
+// The page's story: where the person is, what the instrument tells, what is drawn. What a person can do stands in act.js.
 
-import { EventLine, getCaptures, getStatus, Refusal, takePicture } from "./api.js";
+import { act, answers } from "./act.js";
+import { askForControls, EventLine, getProtocol, getStatus, Refusal } from "./api.js";
+import { page } from "./frame.js";
+import { listenToKeys } from "./keys.js";
 import "./live.js";
-import { createStore } from "./store.js";
+import { get, set, store } from "./memory.js";
+import { buzz, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
+import { follow, go } from "./routes.js";
+import { today } from "./screens/history.js";
+import { lower, raise } from "./states.js";
 import { render } from "./vendor/lit-html.js";
-import { EyePic, homeBox } from "./viewer.js";
-import { otherEye, page } from "./views.js";
-import { t } from "./words.js";
+import { politely, refreshList, refreshVisit, saveRest } from "./visit.js";
+import { learn, t } from "./words.js";
 
-const LOCK_MS = 600; // the second half of a double tap must neither take a picture nor leave one
-const STRIP = 20;
 const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
+const HOLD_BEATS = 4; // the controls are lent for ten seconds
+const READ_MS = 700; // a prompt stays long enough to be read
+const AUTO_MS = 500;
+const LATE_S = 2;
 
-const START = Object.freeze({ name: "expose", fraction: 0, left: 0 });
-
-const store = createStore({
-  link: "opening", // opening | live | lost
-  status: null,
-  doing: "aim", // what the instrument says about itself
-  screen: "aim", // aim | making | result
-  eye: "OD",
-  subject: null, // whose picture the viewer holds: a press, or a capture from the list
-  src: null, // what the viewer should load
-  picture: "none", // what the viewer has really drawn: none | quick | final
-  grey: false,
-  stage: START,
-  shown: null, // the capture on the result screen
-  fresh: false, // it was taken just now, so "Take again" and "Next" make sense
-  captures: [],
-  alert: null,
-  note: "",
-  redfree: false,
-  contrast: 0,
-  zoom: 1,
-  theme: remembered("theme", "dim"),
-  letters: remembered("letters", "on") === "on",
-});
-
-const { get, set } = store;
 const $ = (selector) => document.querySelector(selector);
-let lockedUntil = 0;
-let press = 0; // counts presses, names their subject
-let makingId = null; // the capture that our press is making, once the instrument has named it
-let lastId = null; // the capture before it: late events about it are not about our press
 
-// ---- acts: everything a person can do
+// ---- arriving at a screen
 
-const act = {
-  chooseEye: (eye) => set({ eye }),
-
-  take() {
-    if (performance.now() < lockedUntil) return;
-    lock();
-    // A press into a dead link could arrive later, and light nobody expects would go on: it is not sent.
-    if (get().link === "lost") return;
-    // Our own second press costs the eye nothing: it is not even sent. Everything else the instrument decides.
-    if (get().screen === "making") sayAlready();
-    else if (get().screen === "aim") makePicture(get().eye);
-  },
-
-  again() {
-    toAim(get().shown.eye);
-  },
-
-  next() {
-    toAim(otherEye(get().shown.eye));
-  },
-
-  back() {
-    toAim(get().eye);
-  },
-
-  open(capture) {
-    if (get().screen === "making") return sayAlready();
-    if (get().shown?.id === capture.id && get().screen === "result") return undefined;
-    set({ ...noPicture(), subject: capture.id, alert: null });
-    showCapture(capture, false);
-    return undefined;
-  },
-
-  // The viewer tells what it has drawn; until then nothing on the page says "final".
-  drawn({ detail }) {
-    set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
-  },
-
-  pictureFault({ detail }) {
-    if (detail.mark === "quick") return; // the final picture is still to come
-    set({ alert: { code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy") } });
-  },
-
-  zoomed: ({ detail }) => set({ zoom: detail }),
-  zoomIn: () => $("eye-pic").zoomIn(),
-  zoomOut: () => $("eye-pic").zoomOut(),
-  setRedfree: (redfree) => set({ redfree }),
-  contrastBy: (step) => set({ contrast: EyePic.clampContrast(get().contrast + step) }),
-
-  reset() {
-    set({ contrast: 0 });
-    $("eye-pic").showAll();
-  },
-
-  // A thumbnail shows the illuminated disc, not the dark frame around it.
-  thumbLoaded({ target }) {
-    const { naturalWidth: width, naturalHeight: height } = target;
-    const home = homeBox(get().status, width, height);
-    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
-  },
-
-  closeAlert: () => set({ alert: null }),
-  openMenu: () => $("#menu").showModal(),
-  closeMenu: () => $("#menu").close(),
-
-  setTheme(theme) {
-    remember("theme", theme);
-    set({ theme });
-  },
-
-  setLetters({ target }) {
-    remember("letters", target.checked ? "on" : "off");
-    set({ letters: target.checked });
-  },
-};
-
-// ---- from the press to the picture
-
-async function makePicture(eye) {
-  press += 1;
-  makingId = null;
-  lastId = get().captures[0]?.id ?? null;
-  set({ ...noPicture(), screen: "making", subject: `press-${press}`, stage: START, alert: null, note: "" });
-  navigator.vibrate?.(30);
-  const mine = press;
-  try {
-    const capture = await takePicture(eye);
-    if (mine === press) pictureKept(capture);
-  } catch (problem) {
-    if (!(problem instanceof Refusal)) throw problem;
-    if (mine === press && get().screen === "making") fail(problem);
-  }
+async function arrive(route) {
+  const before = get().route;
+  const same = ["screen", "visit", "slot", "capture"].every((name) => before[name] === route[name]);
+  const picked = route.visit === before.visit ? get().picked : Object.freeze([]);
+  if (!same) freshPicture();
+  if (route.slot !== before.slot) lower(({ from }) => from === "press");
+  set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
+  lock(); // a double tap must not also press what stands there on the new screen
+  lower("link.slow");
+  if (!same) set({ visits: null, folders: null, copied: null, blink: false });
+  await load(route);
+  if (!same) requestAnimationFrame(() => focusOn(route.screen));
 }
 
-function pictureKept(capture) {
-  addToStrip(capture);
-  if (get().screen !== "making") return;
-  press += 1; // this press is over; a late answer changes nothing any more
-  showCapture(capture, true);
+async function load(route) {
+  if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
+  if (route.screen === "find") refreshList({ day: today(), limit: "100" });
+  if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });
+  if (!route.visit) return;
+  if (get().visit?.id !== route.visit) set({ visit: null });
+  const visit = await refreshVisit(route.visit);
+  if (get().route.visit !== route.visit) return;
+  if (!visit && !get().visit && get().link !== "lost") go({ screen: "home" }, { replace: true });
+  if (route.screen !== "picture" || !visit) return;
+  if (!get().status) await refreshStatus(); // after a reload: is a picture being made?
+  await openPicture(route);
 }
 
-function fail({ code, message, remedy }) {
-  press += 1;
-  toAim(get().eye);
-  set({ alert: { code, message, remedy } });
-}
-
-function noPicture() {
-  return { src: null, picture: "none", grey: false, shown: null, redfree: false, contrast: 0 };
-}
-
-function showCapture(capture, fresh) {
-  set({
-    screen: "result",
-    shown: capture,
-    fresh,
-    note: "",
-    src: { url: capture.links.picture, mark: "final" },
-  });
-  lock();
-  if (history.state?.screen !== "result") history.pushState({ screen: "result" }, "");
-  requestAnimationFrame(() => $("#result-title")?.focus({ preventScroll: true }));
-}
-
-function toAim(eye) {
-  lock();
-  const had = get().screen;
-  set({ ...noPicture(), screen: "aim", subject: null, eye, note: "", alert: get().status?.problem ?? null });
-  if (history.state?.screen === "result") history.back();
-  if (had === "result") requestAnimationFrame(() => $("#shutter")?.focus({ preventScroll: true }));
-}
-
-function lock() {
-  lockedUntil = performance.now() + LOCK_MS;
-}
-
-// The note stands where the picture's mark stands, so it must soon give the place back.
-function sayAlready() {
-  set({ note: t("take.already") });
-  setTimeout(() => set({ note: "" }), 3000);
-}
-
-function addToStrip(capture) {
-  const others = get().captures.filter(({ id }) => id !== capture.id);
-  set({ captures: [capture, ...others].slice(0, STRIP) });
-}
+// Where the keyboard goes on; a finger does not notice.
+const FOCUS = { aim: "#shutter", picture: "#shutter", home: "#new", outcome: "#done" };
+const focusOn = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
 
 // ---- what the instrument tells
 
 let beats = 0;
 
 const heard = {
+  ...heardOfShots,
+
   link(link) {
     set({ link });
+    if (link === "lost") raise({ code: "link.lost", from: "page" });
+    else lower("link.lost");
     if (link === "live") refresh();
   },
 
   beat() {
     beats += 1;
-    if (beats % STATUS_BEATS === 0 || get().status?.problem) refreshStatus(); // a problem that is over must go at once
+    // A problem that is over must go at once.
+    if (beats % STATUS_BEATS === 0 || get().states.some(({ from }) => from === "status")) refreshStatus();
+    else if (beats % HOLD_BEATS === 0 && get().mine) holdControls();
   },
 
-  state({ state }) {
-    set({ doing: state });
+  state: ({ state }) => set({ doing: state }),
+  aim: (aim) => heardAim(aim),
+
+  /** What only tells begins, changes (`n`), or is over. */
+  notice({ code, over, ...more }) {
+    if (over) lower(code);
+    else raise({ code, ...more, from: "notice" });
   },
 
-  stage({ id, stage: name, url, fraction, left_s: left }) {
-    const { screen, stage } = get();
-    if (screen !== "making" || id === lastId || (makingId && id !== makingId)) return;
-    makingId = id;
-    // A bar that goes back tells people that something broke, so it never does.
-    set({ stage: { name, fraction: Math.max(stage.fraction, fraction ?? 0), left: left ?? 0 } });
-    if (url) set({ src: { url, mark: "quick" } });
-  },
-
-  failed() {
-    // Our own press hears of its failure by its answer; anything else is a problem of the instrument that stands now.
-    if (get().screen !== "making") refreshStatus();
-  },
-
-  kept(capture) {
-    if (get().screen === "making" && capture.id === makingId) pictureKept(capture);
-    else addToStrip(capture);
+  failed(what) {
+    heardOfShots.failed(what);
+    refreshStatus();
   },
 };
 
-async function refreshStatus() {
-  try {
-    const status = await getStatus();
-    const { problem } = status;
-    const was = get().status?.problem;
-    set({ status: Object.freeze(status), doing: status.state });
-    // Tell a standing problem once, not again every ten seconds after somebody has read it.
-    if (problem && problem.code !== was?.code) set({ alert: problem });
-    if (!problem && was && get().alert?.code === was.code) set({ alert: null });
-    return status;
-  } catch (problem) {
-    if (!(problem instanceof Refusal)) throw problem;
-    return null; // the banner already tells
-  }
-}
-
 let sweptTold = false;
 
-async function refresh() {
-  const status = await refreshStatus();
-  if (status?.swept?.length && !sweptTold && !status.problem) {
-    sweptTold = true;
-    set({ alert: { code: "swept", message: t("swept", { n: status.swept.length }), remedy: t("swept.remedy") } });
-  }
+async function refreshStatus() {
+  let status;
   try {
-    set({ captures: await getCaptures(STRIP) });
+    status = await getStatus();
   } catch (problem) {
     if (!(problem instanceof Refusal)) throw problem;
-    if (get().link === "live") set({ alert: problem });
+    return; // the lost link already tells
   }
+  const { problem } = status;
+  set({ status: Object.freeze(status), doing: status.state });
+  lower(({ from, told }) => from === "status" && told !== problem?.code);
+  if (problem) raise({ ...problem, told: problem.code, from: "status" });
+  if (status.swept?.length && !sweptTold) tellSwept(status.swept);
+  await holdControls();
 }
 
-// ---- keys
+function tellSwept(swept) {
+  sweptTold = true;
+  const [first] = swept;
+  const known = swept.length === 1 && first.slot ? first : { buttons: ["ok"] };
+  raise({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
+}
 
-addEventListener("keydown", (event) => {
-  if (event.defaultPrevented || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-  if ($("#menu").open) return;
-  const { screen, fresh, picture, redfree, letters } = get();
-  const inControl = event.target.closest("button, a, input, summary, eye-pic");
-  if (event.key === " " || event.key === "Enter") {
-    if (screen !== "aim" || inControl) return;
-    event.preventDefault();
-    act.take();
-    return;
-  }
-  if (!letters || picture === "none") return;
-  const result = screen === "result";
-  const keys = {
-    g: () => act.setRedfree(!redfree),
-    "+": () => act.contrastBy(1),
-    "=": () => act.contrastBy(1),
-    "-": () => act.contrastBy(-1),
-    0: act.reset,
-    r: () => result && fresh && act.again(),
-    n: () => result && (fresh ? act.next() : act.back()),
-  };
-  keys[event.key.toLowerCase()]?.();
-});
-
-// The browser's (and Android's) Back goes from the result to the live picture, not out of the page.
-addEventListener("popstate", () => {
-  if (get().screen === "result") toAim(get().eye);
-});
-history.replaceState(null, "");
-
-// ---- what this tablet remembers: how the page looks, and nothing about people
-
-function remember(key, value) {
+async function holdControls() {
   try {
-    localStorage.setItem(`diffuscope.${key}`, value);
-  } catch {
-    // A browser that keeps nothing still works; it only forgets the theme.
+    controls(await askForControls(false));
+  } catch (problem) {
+    if (!(problem instanceof Refusal)) throw problem;
   }
 }
 
-function remembered(key, otherwise) {
-  try {
-    return localStorage.getItem(`diffuscope.${key}`) ?? otherwise;
-  } catch {
-    return otherwise;
-  }
+function controls({ mine }) {
+  set({ mine });
+  if (mine) lower("link.other");
+  else raise({ code: "link.other", from: "page" });
 }
+
+Object.assign(answers, { refreshStatus, controls });
+
+async function refresh() {
+  await refreshStatus();
+  if (!get().protocol) set({ protocol: (await politely(getProtocol)) ?? null });
+  await saveRest();
+  await load(get().route);
+}
+
+// ---- aiming: one prompt from the device, at most every 0.7 s
+
+let promptedAt = 0;
+let readySince = 0;
+
+function heardAim(aim) {
+  if (!aim || get().route.screen !== "aim") return;
+  const now = performance.now();
+  const was = get().prompt;
+  if (aim.code !== "ready") readySince = 0;
+  else readySince ||= now;
+  if (aim.code !== was?.code && now - promptedAt >= READ_MS) {
+    promptedAt = now;
+    set({ prompt: Object.freeze(aim) });
+    if (aim.code === "ready") buzz(15);
+  }
+  if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
+}
+
+act.heardAim = ({ detail }) => heardAim(detail);
+act.heardLate = ({ detail: seconds }) => {
+  if (seconds >= LATE_S && get().link === "live") raise({ code: "link.slow", n: seconds, from: "page" });
+  else lower("link.slow");
+};
 
 // ---- draw
 
 function draw(state) {
   document.documentElement.dataset.theme = state.theme;
   render(page(state, act), $("#app"));
+  // The shutter had the focus and is gone: a keyboard goes on at the verdict, and a screen reader reads it.
+  if (document.activeElement === document.body) $("#result-title")?.focus({ preventScroll: true });
 }
 
+await learn(get().language);
 store.subscribe(draw);
+listenToKeys(act);
+follow(arrive);
 draw(get());
 new EventLine(heard);

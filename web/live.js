@@ -20,6 +20,8 @@ export class EyeLive extends HTMLElement {
   #bitmap = null;
   #number = 0;
   #takenAt = 0; // on this page's clock: when the light of the drawn frame was collected
+  #hint = null; // what the device says about aiming: {code, fill}
+  #told = 0;
   #abort = new AbortController();
   #canvas = document.createElement("canvas");
   #age = document.createElement("p");
@@ -51,6 +53,12 @@ export class EyeLive extends HTMLElement {
 
   set head(head) {
     this.#head = head;
+    this.#draw();
+  }
+
+  set hint(hint) {
+    if (hint === this.#hint) return;
+    this.#hint = hint;
     this.#draw();
   }
 
@@ -86,6 +94,7 @@ export class EyeLive extends HTMLElement {
       this.#empty.hidden = true;
       this.#draw();
       this.#tellAge();
+      this.dispatchEvent(new CustomEvent("aim", { detail: frame.aim }));
     } catch {
       this.#number = 0;
       if (!abort.signal.aborted) await pause(RETRY_MS);
@@ -101,6 +110,9 @@ export class EyeLive extends HTMLElement {
     this.#age.hidden = !late;
     this.toggleAttribute("late", late);
     if (late) this.#age.textContent = t("aim.late", { s: number(age / 1000, age < 10000 ? 1 : 0) });
+    const seconds = late ? Math.floor(age / 1000) : 0;
+    if (seconds !== this.#told) this.dispatchEvent(new CustomEvent("late", { detail: seconds }));
+    this.#told = seconds;
   }
 
   #draw() {
@@ -118,15 +130,18 @@ export class EyeLive extends HTMLElement {
       context.imageSmoothingQuality = "high";
       context.drawImage(this.#bitmap, (width - w) / 2, (height - h) / 2, w, h);
     }
-    if (this.#active) ring(context, width / 2, height / 2, (disc * RING) / 2);
+    if (this.#active) ring(context, width / 2, height / 2, (disc * RING) / 2, this.#hint?.code);
   }
 }
 
-// A dark line under a bright one can be seen on any picture.
-function ring(context, x, y, radius) {
+// A dark line under a bright one can be seen on any picture. Dashed and yellow until the device says ready, then solid and
+// green: never by colour alone. Where to move stands as an arrow at the ring's rim.
+function ring(context, x, y, radius, code) {
   const line = Math.max(3, radius / 60);
-  context.setLineDash([line * 5, line * 3]);
-  for (const [colour, wide] of [["rgba(0, 0, 0, 0.6)", line * 2], ["#ffd060", line]]) {
+  const ready = code === "ready";
+  context.setLineDash(ready ? [] : [line * 5, line * 3]);
+  const strokes = [["rgba(0, 0, 0, 0.6)", line * 2], [ready ? "#6fdd8b" : "#ffd060", line]];
+  for (const [colour, wide] of strokes) {
     context.strokeStyle = colour;
     context.lineWidth = wide;
     context.beginPath();
@@ -134,6 +149,24 @@ function ring(context, x, y, radius) {
     context.stroke();
   }
   context.setLineDash([]);
+  const turn = { right: 0, down: 90, left: 180, up: 270 }[code];
+  if (turn !== undefined) arrow(context, x, y, radius, turn, strokes);
+}
+
+function arrow(context, x, y, radius, turn_deg, strokes) {
+  context.save();
+  context.translate(x, y);
+  context.rotate((turn_deg * Math.PI) / 180);
+  for (const [colour, wide] of strokes) {
+    context.strokeStyle = colour;
+    context.lineWidth = wide * 1.5;
+    context.beginPath();
+    context.moveTo(radius * 0.86, -radius * 0.14);
+    context.lineTo(radius, 0);
+    context.lineTo(radius * 0.86, radius * 0.14);
+    context.stroke();
+  }
+  context.restore();
 }
 
 customElements.define("eye-live", EyeLive);

@@ -76,6 +76,11 @@ export class EyePic extends HTMLElement {
     this.#note();
   }
 
+  /** Where another viewer looks, so that two pictures are seen with one zoom: {zoom, u, v}. */
+  set view({ zoom, u, v }) {
+    this.#look(zoom, u, v, false);
+  }
+
   /** Whose picture this is; another subject begins with the whole picture, the same one keeps the view. */
   set subject(name) {
     if (name === this.#subject) return;
@@ -132,6 +137,7 @@ export class EyePic extends HTMLElement {
     this.#view = { zoom: 1, u: 0, v: 0 };
     this.#note();
     this.#redraw();
+    this.dispatchEvent(new CustomEvent("looked", { detail: { ...this.#view } }));
   }
 
   async #load({ url, mark }) {
@@ -260,7 +266,7 @@ export class EyePic extends HTMLElement {
   // ---- view
 
   /** Put the view at `zoom` with the centre at (u, v), as far as there is picture. */
-  #look(zoom, u, v) {
+  #look(zoom, u, v, tell = true) {
     if (!this.#bitmap) return;
     zoom = clamp(zoom, 1, ZOOM_MAX);
     const { width, height } = this.#bitmap;
@@ -271,6 +277,7 @@ export class EyePic extends HTMLElement {
     this.#view = { zoom, u: clamp(u, -roomU, roomU), v: clamp(v, -roomV, roomV) };
     this.#note();
     this.#redraw();
+    if (tell) this.dispatchEvent(new CustomEvent("looked", { detail: { ...this.#view } }));
   }
 
   /** Zoom so that the picture point under (x, y), in CSS pixels from the middle, stays where it is. */

@@ -1,120 +1,14 @@
-// Every text that the page itself says, and how to say it. Words about faults and light come from the instrument
-// ({code, message, remedy}) and are shown as they are: the page has no opinion of its own about safety.
+// How the page speaks: the words of english.js, or those of a language that is loaded when somebody chooses it.
 
-const ENGLISH = {
-  "app.name": "Diffuscope",
-  "chip.simulated": "SIMULATED",
-  "chip.simulated.why": "No real eye: these pictures are simulated.",
-  "chip.recording": "RECORDING",
-  "chip.recording.why": "No live eye: a recording is being played.",
-  "state.opening": "Connecting",
-  "state.starting": "Getting ready",
-  "state.making": "Making the picture",
-  "state.aim": "Ready",
-  "state.busy": "Taking",
-  "state.lost": "No link",
+import { ENGLISH } from "./english.js";
 
-  "eye.choose": "Which eye",
-  "eye.OD": "Right eye (OD)",
-  "eye.OS": "Left eye (OS)",
-  "eye.OD.short": "Right",
-  "eye.OS.short": "Left",
-
-  "part.live": "Live picture and result",
-  "part.controls": "Controls",
-  "part.tools": "Picture tools",
-  "part.strip": "Last pictures",
-
-  "aim.live": "Live picture of the retina, with an aiming ring",
-  "aim.waiting": "Waiting for the live picture…",
-  "aim.late": "{s} s old",
-  "aim.prompt": "Bring the retina into the ring. Then take the picture.",
-  "aim.starting": "The instrument is getting ready. You may press: the picture is taken as soon as it is.",
-  "aim.making": "The last picture is still being made. You may take another.",
-  "aim.busy": "A picture is being taken. Please wait.",
-  "take": "Take picture",
-  "take.hold": "Hold still",
-  "take.making": "Please wait",
-  "take.lost": "No link",
-  "take.already": "This picture is still being made. Please wait.",
-
-  "make.expose": "Hold still",
-  "make.refine": "Making the picture…",
-  "make.keep": "Keeping the picture…",
-  "make.progress": "Progress of the picture",
-  "make.left": { one: "About {n} second left", other: "About {n} seconds left" },
-  "make.soon": "Almost done",
-
-  "mark.quick": "Quick look: not the final picture",
-  "mark.final": "Final picture, kept",
-  "mark.opening": "Opening the picture…",
-  "pic.name": "{mark}. {eye}, {time}. Plus and minus zoom, arrows move, zero shows all.",
-  "pic.none": "No picture yet",
-  "result.title": "{eye}",
-  "result.again": "Take again",
-  "result.next": "Next",
-  "result.back": "Back to the live picture",
-  "result.grey": "Taken in one colour of light: red-free looks the same.",
-  "result.details": "Details",
-  "detail.method": "Method",
-  "detail.rounds": "Rounds",
-  "detail.stopped": "Stopped because",
-  "detail.seconds": "Time to make",
-  "detail.seconds.value": "{s} s",
-  "detail.calibration": "Calibration",
-  "detail.id": "Name",
-  "detail.picture": "Picture (PNG)",
-  "detail.raw": "Raw frame",
-  "detail.report": "Report",
-
-  "tool.colour": "Colour",
-  "tool.plain": "As taken",
-  "tool.redfree": "Red-free",
-  "tool.contrast": "Contrast",
-  "tool.contrast.less": "Less contrast",
-  "tool.contrast.more": "More contrast",
-  "tool.zoom": "Zoom {z}×",
-  "tool.zoom.less": "Zoom out",
-  "tool.zoom.more": "Zoom in",
-  "tool.reset": "Show all",
-
-  "strip.empty": "Pictures that you take appear here.",
-  "strip.open": "{eye} {time}: open this picture",
-
-  "alert.close": "OK",
-  "link.lost": "The camera is not answering. Stay close to it. Trying again…",
-  "link.cut": "The link broke while the picture was taken.",
-  "link.cut.remedy": "If it is not in the list below when the link is back, take it again.",
-  "fault.unknown": "The instrument refused, and did not say why.",
-  "fault.unknown.remedy": "Wait a moment and try again. If it happens again, call the technician.",
-  "fault.picture": "The picture could not be opened.",
-  "fault.picture.remedy": "It is kept. Open it again from the list.",
-  "swept": {
-    one: "Power went off during a picture. Please take it again.",
-    other: "Power went off during {n} pictures. Please take them again.",
-  },
-  "swept.remedy": "Everything that was kept is still in the list.",
-
-  "menu": "Menu",
-  "menu.close": "Close",
-  "menu.theme": "Screen",
-  "theme.dim": "Dim room",
-  "theme.daylight": "Daylight",
-  "menu.keys": "Keys",
-  "menu.letters": "Use the keys G, R, N, + − 0",
-  "key.take": "Space or Enter",
-  "key.take.what": "Take the picture",
-  "key.g": "G",
-  "key.g.what": "Red-free or colour",
-  "key.contrast": "+ and −",
-  "key.contrast.what": "Contrast (zoom when the picture has the focus)",
-  "key.zero": "0",
-  "key.zero.what": "Show all",
-  "key.rn": "R and N",
-  "key.rn.what": "Take again, next",
-  "menu.technician": "For the technician: calibration",
-  "menu.version": "Version {version}",
-};
+/** Languages of the screener's page. Drafts were written without a native speaker, and say so where they are chosen. */
+export const LANGUAGES = Object.freeze({
+  en: { name: "English" },
+  hi: { name: "हिन्दी", draft: true },
+  ta: { name: "தமிழ்", draft: true },
+  te: { name: "తెలుగు", draft: true },
+});
 
 let language = "en-u-nu-latn"; // Latin digits in every language: some locales would otherwise switch to their own
 let words = ENGLISH;
@@ -128,12 +22,38 @@ export function speak(tag, table) {
   document.documentElement.lang = tag;
 }
 
+/** Load and use a language; "en-XA" is English stretched by 40 %, in which no text of the page can hide. */
+export async function learn(tag) {
+  if (tag === "en-XA") speak(tag, stretched());
+  else if (LANGUAGES[tag]?.draft) speak(tag, (await import(`./words_${tag}.js`)).WORDS);
+  else speak("en", {});
+}
+
+const ACCENTS = { a: "á", e: "é", i: "í", o: "ó", u: "ú", A: "Á", E: "É", I: "Í", O: "Ó", U: "Ú", n: "ñ", c: "ç" };
+
+function stretched() {
+  const long = (text) => {
+    const accented = text.replace(/\{\w+\}|[a-zA-Z]/g, (part) => ACCENTS[part] ?? part);
+    return `[${accented}${" one two three four five six seven".slice(0, Math.round(text.length * 0.4))}]`;
+  };
+  const both = (entry) => (typeof entry === "string" ? long(entry) : { one: long(entry.one), other: long(entry.other) });
+  return Object.fromEntries(Object.entries(ENGLISH).map(([key, entry]) => [key, both(entry)]));
+}
+
 /** The text for `key`, with {names} filled in; a key with a plural is chosen by `vars.n`. */
 export function t(key, vars = {}) {
   const entry = words[key];
   if (entry === undefined) throw new Error(`no words for ${key}`);
   const text = typeof entry === "string" ? entry : (entry[plurals.select(vars.n)] ?? entry.other);
   return text.replace(/\{(\w+)\}/g, (_, name) => String(vars[name]));
+}
+
+/** Whether there are words for `key` and everything that they mention is known. */
+export function has(key, vars = {}) {
+  const entry = ENGLISH[key];
+  if (entry === undefined) return false;
+  const text = typeof entry === "string" ? entry : entry.other;
+  return [...text.matchAll(/\{(\w+)\}/g)].every(([, name]) => vars[name] !== undefined && vars[name] !== null);
 }
 
 export function clockTime(iso) {

@@ -27,7 +27,7 @@
     if (!shown(el) || el.matches("label input")) continue;
     const box = el.getBoundingClientRect();
     const least = el.id === "shutter" ? 84 : 48;
-    const narrow = el.tagName === "BUTTON" && box.width < 48;
+    const narrow = el.matches("button, .button") && box.width < 48;
     if (box.height < least - 0.01 || narrow) faults.push(`too small: ${name(el)} ${box.width}x${box.height}`);
     if (!said(el)) faults.push(`no name: ${name(el)}`);
     if (el.scrollWidth > el.clientWidth + 1) faults.push(`words cut off: ${name(el)}`);
@@ -38,6 +38,14 @@
     const el = walker.currentNode.parentElement;
     if (!walker.currentNode.data.trim() || !el || !shown(el)) continue;
     if (el.closest("script, noscript, dialog:not([open])")) continue;
+    const control = el.closest("button, .button, .card, .prompt, .notices li, .state-bar");
+    const glyphs = document.createRange();
+    glyphs.selectNodeContents(walker.currentNode);
+    const [ink, frame] = [glyphs.getBoundingClientRect(), (control ?? document.documentElement).getBoundingClientRect()];
+    const scrolls = control?.matches(".card");
+    if (ink.left < frame.left - 1 || ink.right > frame.right + 1) faults.push(`words stick out sideways: ${name(el)}`);
+    const room = 1 + parseFloat(getComputedStyle(el).fontSize) / 6; // a line's box is lower than its font's
+    if (control && !scrolls && (ink.top < frame.top - room || ink.bottom > frame.bottom + room)) faults.push(`words stick out: ${name(el)}`);
     const style = getComputedStyle(el);
     if (parseFloat(style.fontSize) < 18) faults.push(`small text: ${name(el)} ${style.fontSize}`);
     const ratio = contrast(rgb(style.color), ground(el));
@@ -64,11 +72,20 @@
     if (!el.contains(top)) faults.push(`covered: ${selector} by ${name(top)}`);
   }
 
-  const stage = document.querySelector(".stage")?.getBoundingClientRect();
-  const prompt = document.querySelector(".prompt").getBoundingClientRect();
-  const apart = !stage || prompt.top >= stage.bottom || prompt.bottom <= stage.top || prompt.left >= stage.right;
-  if (!apart) faults.push("the words beside the picture cover it");
-  if (stage?.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  if (document.querySelector(".exam")) {
+    const stage = document.querySelector(".stage").getBoundingClientRect();
+    const prompt = document.querySelector(".prompt").getBoundingClientRect();
+    if (prompt.top < stage.bottom) faults.push("the words under the picture cover it");
+    const below = document.querySelector(".panel").getBoundingClientRect();
+    if (prompt.bottom > below.top && prompt.right > below.left) faults.push("the words under the picture lie over the controls");
+    if (stage.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  } else if (document.querySelector(".prompt")) {
+    const stage = document.querySelector(".stage")?.getBoundingClientRect();
+    const prompt = document.querySelector(".prompt").getBoundingClientRect();
+    const apart = !stage || prompt.top >= stage.bottom || prompt.bottom <= stage.top || prompt.left >= stage.right;
+    if (!apart) faults.push("the words beside the picture cover it");
+    if (stage?.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  }
 
   for (const role of ["main", "header", "h1", "[role=status]"]) {
     if (document.querySelectorAll(role).length !== 1) faults.push(`not exactly one ${role}`);

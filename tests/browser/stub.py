@@ -18,13 +18,17 @@ from typing import Any
 
 import numpy as np
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Header
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from PIL import Image
 
+from tests.browser.stub_visits import PROTOCOL, Visits, empty_slot
+
 WEB = Path(__file__).parents[2] / "web"
 ROWS, COLS, FIELD_PX = 540, 960, 260
+OTHER = {"code": "link.other", "message": "Another screen is taking pictures.", "remedy": "Use this one instead."}
+UNKNOWN = {"code": "store.unknown", "message": "This is not kept here.", "remedy": "Choose from the list."}
 CSP = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "require-trusted-types-for 'script'; trusted-types lit-html"
@@ -58,6 +62,11 @@ class Stub:
 
     expose_s: float = 0.1
     refine_s: float = 0.3
+    verdicts: list[str | None] = field(default_factory=list)  # causes of the next pictures; None and none left: good
+    aim: dict[str, Any] | None = field(default_factory=lambda: {"code": "ready", "fill": 0.9})
+    controller: str | None = None
+    visits: Visits = field(default_factory=Visits)
+    patched: list[tuple[str, Any]] = field(default_factory=list)
     kind: str = "simulated"
     problem: dict[str, str] | None = None
     swept: list[str] = field(default_factory=list)
@@ -82,10 +91,17 @@ class Stub:
         url = f"/api/captures/{name}/quick.jpg" if stage != "expose" else None
         self.tell("stage", {"id": name, "stage": stage, "url": url, "fraction": fraction, "left_s": left_s})
 
-    def capture(self, name: str, eye: str) -> dict[str, Any]:
+    def next_verdict(self) -> dict[str, Any]:
+        code = self.verdicts.pop(0) if self.verdicts else None
+        return {"word": "again" if code else "good", "code": code, "numbers": {}}
+
+    def capture(self, name: str, wish: dict[str, Any], verdict: dict[str, Any]) -> dict[str, Any]:
         return {
             "id": name,
-            "eye": eye,
+            "eye": wish["eye"],
+            "visit": wish.get("visit"),
+            "slot": wish.get("slot"),
+            "verdict": verdict,
             "taken_at": datetime.now(UTC).isoformat(),
             "simulated": True,
             "calibration_id": "0123456789abcdef",
@@ -106,6 +122,7 @@ def build(stub: Stub) -> FastAPI:
     app = FastAPI()
     _status(app, stub)
     _captures(app, stub)
+    _visits(app, stub)
     _live(app, stub)
 
     @app.get("/")
@@ -119,9 +136,17 @@ def build(stub: Stub) -> FastAPI:
 def _status(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/status")
     def status() -> dict[str, Any]:
-        state = "busy" if stub.busy else "aim"
+        told = [data["state"] for kind, data in stub.events if kind == "state"]
+        state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
-                "version": "0.0", "swept": stub.swept, "problem": stub.problem}  # fmt: skip
+                "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
+                "controller": stub.controller and "a public name"}  # fmt: skip
+
+    @app.post("/api/controller")
+    def controller(wish: dict[str, Any]) -> dict[str, Any]:
+        if stub.controller is None or wish.get("take"):
+            stub.controller = wish["key"]
+        return {"lease": "a public name", "mine": stub.controller == wish["key"]}
 
 
 def _captures(app: FastAPI, stub: Stub) -> None:
@@ -130,22 +155,45 @@ def _captures(app: FastAPI, stub: Stub) -> None:
         return {"captures": stub.captures[:limit]}
 
     @app.post("/api/captures", status_code=201)
-    async def press(wish: dict[str, str]) -> Any:
+    async def press(wish: dict[str, str], x_controller: str | None = Header(None)) -> Any:
         stub.presses += 1
         if stub.refuse:
             return JSONResponse(stub.refuse[1], stub.refuse[0])
+        if stub.controller not in (None, x_controller):
+            return JSONResponse(OTHER, 409)
         name = f"20261120T1000{stub.presses:02d}-{wish['eye']}-stub"
+        verdict = stub.next_verdict()
+        shelf = stub.visits
         stub.tell("state", {"state": "busy"})
         stub.stage(name, "expose", 0.05, stub.refine_s)
         await asyncio.sleep(stub.expose_s)
+        stub.tell("state", {"state": "making"})
         for step in range(5):
             stub.stage(name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, stub.refine_s * (1 - step / 5))
+            if step == 2:
+                stub.tell("verdict", {"id": name, **verdict})
             await asyncio.sleep(stub.refine_s / 5)
+            if stub.visits is not shelf:
+                return JSONResponse(UNKNOWN, 404)  # a press of the test before: its shelf is gone
         stub.stage(name, "keep", 1.0, 0)
-        stub.captures.insert(0, stub.capture(name, wish["eye"]))
+        stub.captures.insert(0, stub.capture(name, wish, verdict))
+        if wish.get("visit"):
+            stub.visits.taken(wish["visit"], wish["slot"], name, verdict)
         stub.tell("kept", stub.captures[0])
         stub.tell("state", {"state": "aim"})
         return stub.captures[0]
+
+    @app.get("/api/captures/{name}")
+    def one(name: str) -> Any:
+        found = [capture for capture in stub.captures if capture["id"] == name]
+        return found[0] if found else JSONResponse(UNKNOWN, 404)
+
+    @app.post("/api/captures/{name}/keep")
+    def keep(name: str, wish: dict[str, str]) -> Any:
+        capture = next(capture for capture in stub.captures if capture["id"] == name)
+        slot = stub.visits.kept[capture["visit"]]["slots"][capture["slot"]]
+        slot |= {"state": "taken", "capture": name, "verdict": capture["verdict"]}
+        return capture
 
     @app.get("/api/captures/{name}/{file}")
     def kept(name: str, file: str) -> Response:
@@ -153,11 +201,65 @@ def _captures(app: FastAPI, stub: Stub) -> None:
         return Response(encoded(kind, blur), media_type=f"image/{kind}")
 
 
+def _visits(app: FastAPI, stub: Stub) -> None:
+    visits = lambda: stub.visits  # noqa: E731  # a reset brings new ones
+
+    @app.get("/api/protocol")
+    def protocol() -> dict[str, Any]:
+        return PROTOCOL
+
+    @app.get("/api/visits")
+    def listed(day: str | None = None, open: bool = False, q: str = "") -> dict[str, Any]:
+        return visits().listed(day, open, q)
+
+    @app.post("/api/visits", status_code=201)
+    def begin(wish: dict[str, str]) -> dict[str, Any]:
+        known = visits().keys
+        if wish["key"] not in known:
+            known[wish["key"]] = visits().begin(wish.get("number"))
+        return visits().seen(known[wish["key"]])
+
+    @app.get("/api/visits/{name}")
+    def visit(name: str) -> Any:
+        return visits().seen(visits().kept[name]) if name in visits().kept else JSONResponse(UNKNOWN, 404)
+
+    @app.patch("/api/visits/{name}")
+    def patch(name: str, wish: dict[str, Any]) -> dict[str, Any]:
+        stub.patched.append((wish["field"], wish["value"]))
+        visits().kept[name]["fields"][wish["field"]] = wish["value"]
+        return visits().seen(visits().kept[name])
+
+    @app.post("/api/visits/{name}/{what}")
+    def change(name: str, what: str, wish: dict[str, Any]) -> Any:
+        visit = visits().kept[name]
+        if what == "could-not":
+            visit["slots"][wish["slot"]] |= {"state": "could_not", "reason": wish["reason"]}
+        elif what == "slots" and wish["capture"] is None:
+            visit["slots"][wish["slot"]] = empty_slot()
+        elif what == "slots":
+            slot = visit["slots"][wish["slot"]]
+            kept = next(capture for capture in stub.captures if capture["id"] == wish["capture"])
+            slot |= {"state": "taken", "capture": kept["id"], "verdict": kept["verdict"]}
+            slot["captures"] = [*{*slot["captures"], kept["id"]}]
+        elif what == "finish":
+            visits().finish(visit)
+        elif what == "reopen":
+            visit |= {"outcome": None, "finished_at": None, "undo_until": None}
+        elif what == "export":
+            return {"folder": wish["folder"], "files": 9}
+        return visits().seen(visit)
+
+    @app.get("/api/exports")
+    def exports() -> dict[str, Any]:
+        return {"folders": [{"id": "usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
+
+
 def _live(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/preview")
     async def preview(after: int) -> Response:
         await asyncio.sleep(0.1)
         headers = {"X-Frame": str(after + 1), "X-Age-Ms": str(stub.preview_age_ms)}
+        headers |= {"X-Aim": json.dumps(stub.aim)} if stub.aim else {}
         return Response(encoded("jpeg", 4, 3.0 * (after % 2)), media_type="image/jpeg", headers=headers)
 
     async def stream() -> AsyncIterator[str]:

@@ -2,15 +2,14 @@
 
 import re
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Complaints
-from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.stub import Stubbed
+from tests.browser.walk import SHUTTER, Open, aiming, new_person, settled, taken
 
 pytestmark = pytest.mark.browser
 
@@ -19,25 +18,16 @@ BUSY = {
     "message": "The instrument is taking another picture.",
     "remedy": "A picture is being taken. Wait until it is done, then press again.",
 }
-BROKEN = {"code": "light.fault", "message": "One light is not working.", "remedy": "Call the technician."}
-SHUTTER = "#shutter"
-Open = Callable[..., Page]
-
-
-def live(page: Page) -> Page:
-    """Wait until a live picture has been drawn."""
-    page.wait_for_selector("eye-live[data-frame]")
-    return page
 
 
 def zoom(page: Page) -> float:
-    return float(page.locator("eye-pic").get_attribute("data-zoom") or 0)
+    return float(page.locator("#picture").get_attribute("data-zoom") or 0)
 
 
 def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
     """The RGB value drawn in the viewer, `dx` picture heights right of the middle."""
     script = """dx => {
-        const c = document.querySelector("eye-pic canvas");
+        const c = document.querySelector("#picture canvas");
         const { data } = c.getContext("2d").getImageData(c.width / 2 + dx * c.height, c.height / 2, 1, 1);
         return [...data].slice(0, 3);
     }"""
@@ -45,32 +35,9 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
     return value
 
 
-@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
-def test_every_screen_fits_reads_and_can_be_hit(open_page: Open, stub: Stubbed, size: tuple[int, int]) -> None:
-    stub.stub.refine_s = 1.2
-    stub.stub.problem = BROKEN
-    page = live(open_page(stub.url, size))
-    faults = {"problem": look_for_faults(page, SHUTTER)}
-    stub.stub.problem = None
-    page.get_by_role("button", name="OK").tap()
-    expect(page.locator(".alert")).to_have_count(0)
-    faults["aim"] = look_for_faults(page, SHUTTER)
-    place = page.locator(".stage").bounding_box()
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=quick]")
-    faults["making"] = look_for_faults(page, SHUTTER)
-    assert page.locator(".stage").bounding_box() == place, "the picture moved when the quick look came"
-    page.wait_for_selector(".stage[data-mark=final]")
-    faults["result"] = look_for_faults(page, "#next", "#again")
-    assert page.locator(".stage").bounding_box() == place, "the picture moved when the final one came"
-    page.get_by_role("button", name="Menu").tap()
-    faults["menu"] = look_for_faults(page, "dialog .primary")
-    assert faults == {screen: [] for screen in faults}
-
-
 def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page: Open, stub: Stubbed) -> None:
     stub.stub.refine_s = 2.5
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
     expect(page.get_by_role("status")).to_contain_text("Quick look")
@@ -80,7 +47,7 @@ def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page:
     page.get_by_role("button", name="Zoom in").tap()
     assert zoom(page) == 2.25
     assert page.locator(".stage").get_attribute("data-mark") == "quick"
-    page.wait_for_timeout(300)
+    page.wait_for_timeout(500)
     assert page.locator("progress").evaluate("bar => bar.value") > bar
     page.wait_for_selector(".stage[data-mark=final]")
     expect(page.get_by_role("status")).to_contain_text("Final picture, kept")
@@ -89,9 +56,8 @@ def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page:
 
 
 def test_red_free_and_contrast_change_what_is_drawn(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
+    page = aiming(open_page, stub)
+    taken(page)
     page.wait_for_timeout(300)  # the cross-fade
     red, green, blue = middle_pixel(page)
     assert red > green > blue
@@ -109,10 +75,9 @@ def test_red_free_and_contrast_change_what_is_drawn(open_page: Open, stub: Stubb
 
 
 def test_fingers_wheel_and_keys_zoom_between_one_and_eight(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
-    box = page.locator("eye-pic").bounding_box()
+    page = aiming(open_page, stub)
+    taken(page)
+    box = page.locator("#picture").bounding_box()
     assert box is not None
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     touch = page.context.new_cdp_session(page)
@@ -135,8 +100,8 @@ def test_fingers_wheel_and_keys_zoom_between_one_and_eight(open_page: Open, stub
     page.mouse.move(x, y)
     for _ in range(20):
         page.mouse.wheel(0, -200)
-    expect(page.locator("eye-pic")).to_have_attribute("data-zoom", "8.00")
-    page.locator("eye-pic").focus()
+    expect(page.locator("#picture")).to_have_attribute("data-zoom", "8.00")
+    page.locator("#picture").focus()
     page.keyboard.press("ArrowLeft")
     for _ in range(12):
         page.keyboard.press("-")
@@ -152,100 +117,97 @@ def test_a_refusal_is_shown_in_the_instruments_own_words(
 ) -> None:
     complaints.expect("409")
     stub.stub.refuse = (409, BUSY)
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
-    card = page.get_by_role("alert")
-    expect(card).to_contain_text(BUSY["message"])
-    expect(card).to_contain_text(BUSY["remedy"])
-    expect(page.locator(SHUTTER)).to_be_enabled()
+    bar = page.get_by_role("status")
+    expect(bar).to_contain_text(BUSY["message"])
+    expect(bar).to_contain_text(BUSY["remedy"])
+    expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false")
     stub.stub.refuse = None
-    page.wait_for_timeout(700)
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
-    expect(page.locator(".alert")).to_have_count(0)
+    taken(page)
+    expect(page.locator(".state-bar")).to_have_count(0)
 
 
 def test_an_impatient_second_press_costs_the_eye_nothing(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.refine_s = 1.2
-    page = live(open_page(stub.url))
+    stub.stub.expose_s, stub.stub.refine_s = 1.2, 1.2
+    page = aiming(open_page, stub)
     page.locator(SHUTTER).dblclick()
-    page.wait_for_timeout(700)
-    page.locator(SHUTTER).tap(force=True)
+    settled(page).locator(SHUTTER).tap(force=True)
     expect(page.get_by_role("status")).to_contain_text("still being made")
     page.wait_for_selector(".stage[data-mark=final]")
     assert stub.stub.presses == 1
 
 
 def test_a_double_tap_on_next_takes_no_picture(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
-    box = page.locator("#next").bounding_box()
+    page = aiming(open_page, stub)
+    taken(page)
+    box = settled(page).locator("#next").bounding_box()
     assert box is not None
     for _ in range(2):
         page.touchscreen.tap(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    expect(page.locator(SHUTTER)).to_contain_text("Left eye (OS)")
+    expect(page.locator(SHUTTER)).to_contain_text("Nerve")
     page.wait_for_timeout(300)
     assert stub.stub.presses == 1
+
+
+def test_a_double_tap_on_new_person_makes_one_person(open_page: Open, stub: Stubbed) -> None:
+    page = settled(open_page(stub.url))
+    page.locator("#new").dblclick()
+    page.wait_for_selector(".person")
+    page.wait_for_timeout(300)
+    assert len(stub.stub.visits.kept) == 1
 
 
 def test_an_answer_without_words_still_says_what_to_do(open_page: Open, stub: Stubbed, complaints: Complaints) -> None:
     complaints.expect("500")
     stub.stub.refuse = (500, {})
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
-    expect(page.get_by_role("alert")).to_contain_text("try again")
+    expect(page.get_by_role("status")).to_contain_text("try again")
 
 
-def test_notices_at_the_start(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.swept = ["a", "b"]
+def test_a_recording_is_marked_on_every_screen(open_page: Open, stub: Stubbed) -> None:
     stub.stub.kind = "recording"
-    page = live(open_page(stub.url))
-    expect(page.get_by_role("alert")).to_contain_text("Power went off during 2 pictures.")
+    page = open_page(stub.url)
+    expect(page.locator("header .chip")).to_have_text("RECORDING")
+    new_person(page)
     expect(page.locator("header .chip")).to_have_text("RECORDING")
 
 
 def test_an_old_live_picture_says_its_age(open_page: Open, stub: Stubbed) -> None:
     stub.stub.preview_age_ms = 2400
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^2\.\d s old$"))
+    expect(page.locator("[data-code='link.slow']")).to_contain_text("2 s late")
     stub.stub.preview_age_ms = 40
     expect(page.locator("eye-live .age")).to_be_hidden()
+    expect(page.locator("[data-code='link.slow']")).to_have_count(0)
 
 
 def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, stub: Stubbed) -> None:
     stub.stub.warnings = ["The frame was partly saturated."]
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
     expect(page.locator(".card")).to_contain_text("partly saturated")
 
 
-def test_back_leaves_the_result_and_not_the_page(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
-    page.go_back()
-    expect(page.locator(SHUTTER)).to_be_visible()
-    assert page.url == f"{stub.url}/"
-
-
 def test_silence_is_a_lost_link_and_the_shutter_says_so(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     expect(page.locator(".state")).to_have_text("Ready")
     stub.stub.silent = True
     began = time.monotonic()
-    expect(page.locator(".banner")).to_be_visible(timeout=6000)
+    expect(page.get_by_role("alert")).to_contain_text("Trying again", timeout=6000)
     assert 2 < time.monotonic() - began < 5
     expect(page.locator(SHUTTER)).to_contain_text("No link")
     page.locator(SHUTTER).tap(force=True)
     page.wait_for_timeout(200)
     assert stub.stub.presses == 0, "a press into a dead link must not fire later"
     stub.stub.silent = False
-    expect(page.locator(".banner")).to_have_count(0, timeout=3000)
+    expect(page.get_by_role("alert")).to_have_count(0, timeout=3000)
 
 
 def test_the_theme_is_chosen_in_the_menu_and_remembered(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
+    page = open_page(stub.url)
     expect(page.locator("html")).to_have_attribute("data-theme", "dim")
     page.get_by_role("button", name="Menu").tap()
     page.get_by_role("button", name="Daylight").tap()
@@ -255,18 +217,16 @@ def test_the_theme_is_chosen_in_the_menu_and_remembered(open_page: Open, stub: S
 
 
 def test_letter_keys_can_be_switched_off(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url))
+    page = aiming(open_page, stub)
     page.get_by_role("button", name="Menu").tap()
-    page.get_by_role("checkbox").uncheck()
+    page.locator("#letters").uncheck()
     page.get_by_role("button", name="Close").tap()
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
+    taken(page)
     page.keyboard.press("g")
     expect(page.get_by_role("button", name="Red-free")).to_have_attribute("aria-pressed", "false")
 
 
 def test_motion_is_left_out_where_it_is_not_wanted(open_page: Open, stub: Stubbed) -> None:
-    page = live(open_page(stub.url, reduced_motion="reduce"))
+    page = aiming(open_page, stub, reduced_motion="reduce")
     assert page.locator(SHUTTER).evaluate("b => getComputedStyle(b).transitionDuration") == "0s"
-    page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=final]")
+    taken(page)

@@ -1,0 +1,84 @@
+"""The stand-in's people: visits, their four slots, and what a press, a retake or a "could not" does to them."""
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+SLOTS = [
+    {"id": f"{side}-{field}", "eye": eye, "field": field, "required": True}
+    for side, eye in (("R", "OD"), ("L", "OS"))
+    for field in ("centre", "nerve")
+]
+PROTOCOL = {
+    "slots": SLOTS,
+    "reasons": ["pupil", "cloudy", "still", "refused", "device"],
+    "retakes": 2,
+    "programme": {"vision_limit": "6/18", "prefix": "A", "centre_phone": "+91 44 5550 0142"},
+}
+SENTENCES = {
+    "refer_today": "See the doctor today.",
+    "refer_vision": "Refer: vision of the left eye below 6/18.",
+    "refer_picture": "Refer: picture not possible.",
+    "send": "Send to reader.",
+}
+
+
+def now() -> datetime:
+    return datetime.now(UTC)
+
+
+def empty_slot() -> dict[str, Any]:
+    return {"state": "empty", "capture": None, "captures": [], "verdict": None, "reason": None, "tries": 0}
+
+
+class Visits:
+    """All the visits of the pretended shelf."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, dict[str, Any]] = {}
+        self.keys: dict[str, dict[str, Any]] = {}
+
+    def begin(self, number: str | None = None, **fields: Any) -> dict[str, Any]:
+        count = len(self.kept) + 142
+        visit = {
+            "id": f"v{count}", "number": number or f"A{count:04d}", "begun_at": now().isoformat(),
+            "day": now().date().isoformat(), "fields": dict(fields),
+            "slots": {slot["id"]: empty_slot() for slot in SLOTS}, "next_slot": "R-centre",
+            "outcome": None, "finished_at": None, "undo_until": None,
+        }  # fmt: skip
+        self.kept[visit["id"]] = visit
+        return visit
+
+    def seen(self, visit: dict[str, Any]) -> dict[str, Any]:
+        """The visit with its next missing slot."""
+        missing = [name for name, slot in visit["slots"].items() if slot["state"] == "empty"]
+        return visit | {"next_slot": missing[0] if missing else None}
+
+    def listed(self, day: str | None, still_open: bool, q: str) -> dict[str, Any]:
+        every = [self.seen(visit) for visit in reversed(self.kept.values())]
+        today = [v for v in every if v["day"] == (day or now().date().isoformat())]
+        counts = {
+            "done": sum(v["finished_at"] is not None for v in today),
+            "to_finish": sum(v["finished_at"] is None for v in today),
+            "referred": sum((v["outcome"] or {}).get("code", "").startswith("refer") for v in today),
+        }
+        chosen = [
+            v
+            for v in every
+            if (not day or v["day"] == day) and (not still_open or v["finished_at"] is None) and q in v["number"]
+        ]
+        return {"visits": chosen, "counts": counts}
+
+    def taken(self, visit: str, slot: str, capture: str, verdict: dict[str, Any]) -> None:
+        """A kept picture: an accepted one stays in the slot, a better or a later one takes its place."""
+        place = self.kept[visit]["slots"][slot]
+        place["captures"].append(capture)
+        place["tries"] += 1
+        place |= {"state": "taken", "capture": capture, "verdict": verdict, "reason": None}
+
+    def finish(self, visit: dict[str, Any]) -> None:
+        urgent = {"sudden_loss", "pain"} & set(visit["fields"].get("complaints", []))
+        poor = any(s["state"] == "could_not" for s in visit["slots"].values())
+        code = "refer_today" if urgent else "refer_picture" if poor else "send"
+        visit["outcome"] = {"code": code, "sentence": SENTENCES[code]}
+        visit["finished_at"] = now().isoformat()
+        visit["undo_until"] = (now() + timedelta(seconds=10)).isoformat()

@@ -1,0 +1,56 @@
+"""How the tests walk through the page: to a live picture, through a press, to a verdict."""
+
+from collections.abc import Callable
+
+from playwright.sync_api import Page, expect
+
+from tests.browser.stub import Stubbed
+
+SHUTTER = "#shutter"
+LOCK_MS = 450  # the page ignores presses for 400 ms after every change of screen
+Open = Callable[..., Page]
+
+
+def live(page: Page) -> int:
+    """Wait for a live picture; its number."""
+    page.wait_for_selector("eye-live[data-frame]")
+    return int(page.locator("eye-live").get_attribute("data-frame") or 0)
+
+
+def settled(page: Page) -> Page:
+    page.wait_for_timeout(LOCK_MS)
+    return page
+
+
+def tap(page: Page, selector: str) -> None:
+    """Tap as a person would: not within the blink of an eye after the last change."""
+    page.locator(selector).first.wait_for()
+    settled(page).locator(selector).first.tap()
+
+
+def aiming(open_page: Open, stub: Stubbed, size: tuple[int, int] = (1280, 800), **options: object) -> Page:
+    """A page that aims at the first slot of a person who agreed."""
+    visit = stub.stub.visits.begin(consent="agreed", sex="woman", age=54)
+    page = open_page(f"{stub.url}/#/visit/{visit['id']}/aim/R-centre", size, **options)
+    live(page)
+    expect(page.locator(".state")).not_to_have_attribute("data-state", "opening")
+    return settled(page)
+
+
+def new_person(page: Page) -> None:
+    """From Home to a live picture in three taps."""
+    tap(page, "#new")
+    tap(page, "[data-value=agreed]")
+    tap(page, "#shoot")
+    live(page)
+
+
+def taken(page: Page) -> None:
+    """Press, and wait until the final picture is drawn."""
+    tap(page, SHUTTER)
+    page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+
+
+def spoken(page: Page, language: str) -> None:
+    """Let every page of this context speak a language from its start."""
+    page.context.add_init_script(f"localStorage.setItem('diffuscope.language', '{language}')")

@@ -1,0 +1,201 @@
+// Everything that a person can do, by tap or key: one object that the templates and the keys share.
+
+import { fileOf, getFolders, askForControls } from "./api.js";
+import { get, remember, set, shotOf } from "./memory.js";
+import { typedBy } from "./parts.js";
+import { freshPicture, take, unlocked } from "./press.js";
+import { go } from "./routes.js";
+import { today } from "./screens/history.js";
+import { codeText } from "./screens/outcome.js";
+import { lower, raise } from "./states.js";
+import { EyePic, homeBox } from "./viewer.js";
+import * as visits from "./visit.js";
+import { learn, t } from "./words.js";
+
+const $ = (selector) => document.querySelector(selector);
+const here = () => get().route;
+const PUPIL_REST_MS = 60_000;
+
+const toAim = (slot) => go({ screen: "aim", visit: here().visit, slot });
+
+const moves = {
+  go,
+  begin: (number) => unlocked() && visits.begin(number),
+  resume: visits.resume,
+  shoot: () => unlocked() && go({ screen: "aim", visit: get().visit.id, slot: get().visit.next_slot ?? visits.nextSlot() }),
+  setField: visits.setField,
+  typeNumber(key) {
+    const typed = typedBy(get().typed, key, 12);
+    set({ typed });
+    visits.refreshList(typed ? { q: typed, limit: "20" } : { day: today(), limit: "20" });
+  },
+  only: (onlyShow) => set({ onlyShow }),
+
+  /** One step back, also where the address was opened directly. */
+  back() {
+    if (get().asking) set({ asking: false });
+    else if (history.state?.depth) history.back();
+    else go({ screen: "home" }, { replace: true });
+  },
+
+  /** A tile with a picture shows it; one without is aimed at. */
+  chooseTile(slot) {
+    const { visit, shots } = get();
+    const underway = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
+    lower(({ from }) => from === "press");
+    if (underway || visit.slots[slot].captures.length) go({ screen: "picture", visit: visit.id, slot });
+    else toAim(slot);
+  },
+};
+
+const exam = {
+  take,
+  again: () => unlocked() && toAim(here().slot),
+  next: () => unlocked() && visits.goOn(here().slot),
+  keepThis: () => unlocked() && visits.keepPoor(shotOf(get()).id, here().slot),
+  useThis: () => unlocked() && visits.useInSlot(here().slot, here().capture),
+  ask: () => unlocked() && set({ asking: true }),
+  stopAsking: () => set({ asking: false }),
+  couldNot: (slot, reason) => unlocked() && visits.couldNot(slot, reason),
+  finish: () => unlocked() && visits.finish(),
+  reopen: () => unlocked() && visits.reopen(),
+  print: () => window.print(),
+
+  async showCode() {
+    const { correction, generate } = await import("./vendor/lean-qr-nano.mjs");
+    const drawing = generate(codeText(get()), { minCorrectionLevel: correction.M });
+    const { size } = drawing;
+    const rows = Array.from({ length: size }, (_, y) =>
+      Array.from({ length: size }, (_, x) => (drawing.get(x, y) ? `M${x} ${y}h1v1h-1z` : "")).join(""),
+    );
+    set({ code: get().code ? undefined : { size, path: rows.join("") } });
+  },
+
+  openFilm: (visit) => {
+    set({ visit });
+    go({ screen: "film", visit: visit.id });
+  },
+  openPicture: (slot, capture) => go({ screen: "picture", visit: here().visit, slot, capture }),
+  pick(id) {
+    const { picked } = get();
+    set({ picked: picked.includes(id) ? picked.filter((one) => one !== id) : [...picked, id].slice(-2) });
+  },
+  compare: () => go({ screen: "compare", visit: here().visit, capture: get().picked[0], other: get().picked[1] }),
+  setBlink: (blink) => set({ blink, front: 0 }),
+  swap: () => set({ front: get().front ? 0 : 1 }),
+  linkZoom({ target, detail }) {
+    for (const pic of document.querySelectorAll(".two eye-pic")) if (pic !== target) pic.view = detail;
+  },
+  listFolders: async () => set({ folders: (await visits.politely(getFolders)) ?? null, copied: null }),
+  copyTo: visits.copyTo,
+};
+
+// One object per capture, so that the same picture is not loaded again at every drawing of the page.
+const finals = new Map();
+
+const picture = {
+  finalOf(id) {
+    if (!finals.has(id)) finals.set(id, { url: fileOf(id, "picture.png"), mark: "final" });
+    return finals.get(id);
+  },
+
+  // The viewer tells what it has drawn; until then nothing on the page says "final".
+  drawn({ detail }) {
+    set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
+  },
+
+  pictureFault({ detail }) {
+    if (detail.mark === "quick") return; // the final picture is still to come
+    raise({ code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy"), from: "press" });
+  },
+
+  zoomed: ({ detail }) => set({ zoom: detail }),
+  zoomIn: () => $("#picture").zoomIn(),
+  zoomOut: () => $("#picture").zoomOut(),
+  setRedfree: (redfree) => set({ redfree }),
+  contrastBy: (step) => set({ contrast: EyePic.clampContrast(get().contrast + step) }),
+
+  reset() {
+    set({ contrast: 0 });
+    $("#picture").showAll();
+  },
+
+  // A thumbnail shows the illuminated disc, not the dark frame around it.
+  thumbLoaded({ target }) {
+    const { naturalWidth: width, naturalHeight: height } = target;
+    const home = homeBox(get().status, width, height);
+    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
+  },
+};
+
+// ---- buttons of states
+
+const ofState = {
+  ok: ({ code }) => lower(code),
+  later: ({ code }) => lower(code),
+  dateIsRight: ({ code }) => lower(code),
+  retry: () => answers.refreshStatus(),
+  useHere: async () => {
+    const answer = await visits.politely(() => askForControls(true));
+    if (answer) answers.controls(answer);
+  },
+  otherEye() {
+    const { protocol } = get();
+    const now = protocol.slots.find(({ id }) => id === here().slot);
+    lower(({ code }) => code.startsWith("light."));
+    toAim(protocol.slots.find(({ eye, field }) => eye !== now.eye && field === now.field).id);
+  },
+  finish: () => exam.finish(),
+  how: () => go(here().visit ? { screen: "film", visit: here().visit } : { screen: "history" }),
+  takeNow({ visit, slot }) {
+    lower("power.lost");
+    if (visit && slot) go({ screen: "aim", visit, slot });
+  },
+  see: () => go({ screen: "history" }),
+  why: () => go({ screen: "history" }),
+  tryNow: ({ code }) => lower(code),
+  next: () => exam.next(),
+  again: () => exam.again(),
+  couldNot: () => exam.ask(),
+  timer: () => set({ timer: Date.now() + PUPIL_REST_MS, now: Date.now() }),
+  change({ id, slot }) {
+    lower("eye.side");
+    visits.moveToOtherEye(slot ?? here().slot, id ?? shotOf(get()).id);
+  },
+  keepEye: () => lower("eye.side"),
+};
+
+const settings = {
+  openMenu: () => $("#menu").showModal(),
+  closeMenu: () => $("#menu").close(),
+
+  setTheme(theme) {
+    remember("theme", theme);
+    set({ theme });
+  },
+  setLetters({ target }) {
+    remember("letters", target.checked ? "on" : "off");
+    set({ letters: target.checked });
+  },
+  setAuto({ target }) {
+    remember("auto", target.checked ? "on" : "off");
+    set({ auto: target.checked });
+  },
+  async setLanguage(language) {
+    await learn(language);
+    remember("language", language);
+    set({ language });
+  },
+};
+
+/** What the page's story (app.js) answers to two of the buttons. */
+export const answers = { refreshStatus: () => {}, controls: () => {} };
+
+export const act = {
+  ...moves,
+  ...exam,
+  ...picture,
+  ...settings,
+  freshPicture,
+  stateDo: (name, state) => ofState[name](state),
+};

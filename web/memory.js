@@ -1,0 +1,63 @@
+// What the page knows now, in one store; and what this tablet remembers, which is how the page looks and no person.
+
+import { createStore } from "./store.js";
+
+export function remember(key, value) {
+  try {
+    localStorage.setItem(`diffuscope.${key}`, value);
+  } catch {
+    // A browser that keeps nothing still works; it only forgets the theme.
+  }
+}
+
+function remembered(key, otherwise) {
+  try {
+    return localStorage.getItem(`diffuscope.${key}`) ?? otherwise;
+  } catch {
+    return otherwise;
+  }
+}
+
+export const FRESH_PICTURE = Object.freeze({ picture: "none", grey: false, redfree: false, contrast: 0, asking: false });
+
+export const store = createStore({
+  link: "opening", // opening | live | lost
+  status: null,
+  doing: "aim", // what the instrument says about itself
+  mine: true, // this page holds the controls; any other page may take them by a tap
+  states: Object.freeze([]), // what stands now: see states.js
+  route: Object.freeze({ screen: "home" }),
+  protocol: null, // slots, reasons, retakes: data of the programme
+  visit: null,
+  visits: null, // the list on the screen that shows one
+  counts: null,
+  typed: "", // on the number pad
+  onlyShow: "all", // all | open | referred
+  shots: Object.freeze([]), // pictures in the making and those looked at: see press.js
+  prompt: null, // the device's word for what to do now
+  ...FRESH_PICTURE,
+  zoom: 1,
+  note: "",
+  picked: Object.freeze([]), // two pictures to compare
+  folders: null, // where a visit can be copied to
+  copied: null,
+  undoUntil: 0,
+  now: 0, // set every second while something counts down
+  theme: remembered("theme", "dim"),
+  letters: remembered("letters", "on") === "on",
+  auto: remembered("auto", "off") === "on",
+  language: remembered("language", "en"),
+});
+
+export const { get, set } = store;
+
+/** The shot on the picture screen: the named capture, or the newest of the slot. */
+export function shotOf({ route, shots }) {
+  if (route.screen !== "picture") return null;
+  const here = shots.filter((shot) => shot.visit === route.visit && shot.slot === route.slot);
+  if (route.capture) return here.find((shot) => shot.id === route.capture) ?? null;
+  return here.at(-1) ?? null;
+}
+
+export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slot.id === id) ?? null;
+export const eyeOf = (state, slot) => slotPlan(state, slot)?.eye ?? "OD";

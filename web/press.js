@@ -1,0 +1,155 @@
+// From the press to the picture: which shots are in the making, what the instrument says about each, what is kept.
+// A shot: {key, visit, slot, eye, id, stage, verdict, quick, capture, over}; `id` is the instrument's, `key` is ours and stays.
+
+import { freshKey, getCapture, Refusal, send } from "./api.js";
+import { eyeOf, FRESH_PICTURE, get, set, shotOf } from "./memory.js";
+import { go } from "./routes.js";
+import { lower, raise, shownStates } from "./states.js";
+import { politely, refreshVisit } from "./visit.js";
+import { t } from "./words.js";
+
+const LOCK_MS = 400; // the second half of a double tap must neither take a picture nor leave one
+const SHOTS = 12;
+const START = Object.freeze({ name: "expose", fraction: 0, left: 0 });
+
+let lockedUntil = 0;
+const known = new Set(); // captures that were there before: late events about them are not about our press
+
+export function lock() {
+  lockedUntil = performance.now() + LOCK_MS;
+}
+
+/** True, once, when an act may follow the last one. */
+export function unlocked() {
+  if (performance.now() < lockedUntil) return false;
+  lock();
+  return true;
+}
+
+/** A short vibration, where there is one and somebody has touched the page; others are complained about by browsers. */
+export function buzz(pattern) {
+  if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(pattern);
+}
+
+const put = (shots) => set({ shots: Object.freeze(shots.slice(-SHOTS)) });
+const change = (key, more) =>
+  put(get().shots.map((shot) => (shot.key === key ? Object.freeze({ ...shot, ...more }) : shot)));
+const byId = (id) => get().shots.find((shot) => shot.id === id);
+
+export function take() {
+  if (!unlocked()) return;
+  const { route, visit } = get();
+  if (route.screen === "picture") sayAlready();
+  if (route.screen !== "aim" || visit?.fields.consent !== "agreed") return;
+  // A press into a dead link could arrive later, and light nobody expects would go on: it is not sent. Everything else
+  // that may forbid a press the instrument has told, and would refuse.
+  if (shownStates(get()).stop) return;
+  makePicture(route.visit, route.slot);
+}
+
+// The note stands where the picture's mark stands, so it must soon give the place back.
+function sayAlready() {
+  set({ note: t("take.already") });
+  setTimeout(() => set({ note: "" }), 3000);
+}
+
+async function makePicture(visit, slot) {
+  const eye = eyeOf(get(), slot);
+  const key = freshKey();
+  for (const { id } of get().shots) if (id) known.add(id);
+  lower(({ from }) => from === "press");
+  put([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: START, verdict: null, over: false })]);
+  go({ screen: "picture", visit, slot });
+  buzz(30);
+  try {
+    kept(await send("POST", "/api/captures", { eye, key, visit, slot }), key);
+  } catch (problem) {
+    if (!(problem instanceof Refusal)) throw problem;
+    refused(key, problem);
+  }
+}
+
+function refused(key, { code, message, remedy, vars }) {
+  const shot = get().shots.find((one) => one.key === key);
+  if (!shot || shot.over) return;
+  const here = shotOf(get())?.key === key;
+  if (shot.id && code !== "link.cut" && here) {
+    change(key, { over: true, failed: { code: "make.failed", message, remedy } }); // light was spent: the raw shot is kept
+    return;
+  }
+  put(get().shots.filter((one) => one.key !== key));
+  raise({ code, message, remedy, ...vars, from: "press" });
+  if (here) go({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
+  refreshVisit(shot.visit);
+}
+
+function kept(capture, key = byId(capture.id)?.key) {
+  known.add(capture.id);
+  const shot = get().shots.find((one) => one.key === key);
+  if (!shot || shot.capture) return;
+  lock(); // the buttons have just changed under the finger
+  const verdict = capture.verdict ?? shot.verdict;
+  change(key, { id: capture.id, capture: Object.freeze(capture), verdict, over: true, stage: { ...shot.stage, fraction: 1 } });
+  refreshVisit(shot.visit);
+}
+
+/** What the instrument says about shots, by the name of the event. */
+export const heardOfShots = {
+  stage({ id, stage: name, url, fraction, left_s: left }) {
+    if (known.has(id)) return;
+    const shot = byId(id) ?? get().shots.find((one) => !one.id && !one.over);
+    if (!shot || shot.over) return;
+    // A bar that goes back tells people that something broke, so it never does.
+    const stage = { name, fraction: Math.max(shot.stage.fraction, fraction ?? 0), left: left ?? 0 };
+    change(shot.key, { id, stage, quick: url ?? shot.quick });
+  },
+
+  /** The word on the raw frame, while the eye is there; once more when the made picture changes it. */
+  verdict({ id, ...verdict }) {
+    const shot = byId(id);
+    if (!shot || shot.over) return;
+    if (shot.verdict?.word !== verdict.word) lock();
+    change(shot.key, { verdict: Object.freeze(verdict) });
+    if (verdict.word === "again") buzz([30, 60, 30]);
+  },
+
+  kept(capture) {
+    const waiting = ({ id, over, visit, slot }) => !id && !over && visit === capture.visit && slot === capture.slot;
+    const shot = byId(capture.id) ?? get().shots.find(waiting);
+    if (shot) kept(capture, shot.key);
+    else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
+  },
+
+  failed({ id, code, message, remedy }) {
+    const shot = byId(id);
+    if (shot && !shot.over) change(shot.key, { over: true, failed: { code: code ?? "make.failed", message, remedy } });
+  },
+};
+
+/** Show a picture that was taken before: after a reload, or from the tiles. Without one, aim instead. */
+export async function openPicture(route) {
+  if (shotOf(get())) return;
+  const { visit } = get();
+  const slot = visit?.slots[route.slot];
+  const id = route.capture ?? slot?.capture ?? slot?.captures?.at(-1);
+  if (id) {
+    const capture = await politely(() => getCapture(id));
+    if (capture) put([...get().shots, shotFrom(capture, route)]);
+  } else if (["making", "busy"].includes(get().doing)) {
+    const eye = eyeOf(get(), route.slot);
+    put([...get().shots, Object.freeze({ key: freshKey(), ...route, eye, id: null, stage: START, verdict: null })]);
+  } else {
+    go({ screen: "aim", visit: route.visit, slot: route.slot }, { replace: true });
+  }
+}
+
+function shotFrom(capture, { visit, slot }) {
+  known.add(capture.id);
+  const { id, eye } = capture;
+  return Object.freeze({ key: id, visit, slot, eye, id, stage: START, verdict: capture.verdict ?? null, capture, over: true });
+}
+
+/** Another picture begins with neutral tools. */
+export function freshPicture() {
+  set({ ...FRESH_PICTURE, zoom: 1, note: "" });
+}

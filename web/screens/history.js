@@ -1,0 +1,147 @@
+// History: the people of a day, the pictures of a person, and two pictures compared with the same zoom.
+
+import { zipOf } from "../api.js";
+import { people } from "./home.js";
+import { icon } from "../icons.js";
+import { choice, slotWords, thumb } from "../parts.js";
+import { html, nothing } from "../vendor/lit-html.js";
+import { calendarDay, t } from "../words.js";
+
+const KEEP = {
+  all: () => true,
+  open: ({ finished_at: end }) => !end,
+  referred: ({ outcome }) => Boolean(outcome?.code.startsWith("refer")),
+};
+
+export function history(state, act) {
+  const { visits, onlyShow, route } = state;
+  const day = route.day ?? today();
+  const listed = (visits ?? []).filter(KEEP[onlyShow]);
+  const step = (days) => () => act.go({ screen: "history", day: shifted(day, days) });
+  return html`
+    <section class="history">
+      <h2>${t("history.title")}</h2>
+      <div class="days" role="group" aria-label=${t("history.day")}>
+        <button type="button" id="before" @click=${step(-1)}>${icon("left")} <span>${t("history.before")}</span></button>
+        <p aria-live="polite">${calendarDay(`${day}T12:00`)}</p>
+        <button type="button" id="after" ?disabled=${day >= today()} @click=${step(1)}>
+          <span>${t("history.after")}</span> ${icon("next")}
+        </button>
+      </div>
+      ${choice({
+        label: t("history.title"),
+        value: onlyShow,
+        options: Object.keys(KEEP).map((name) => [name, t(`show.${name}`)]),
+        choose: act.only,
+      })}
+      ${listed.length ? people(listed, act.openFilm) : html`<p class="muted">${t("history.none")}</p>`}
+    </section>
+  `;
+}
+
+const two = (value) => String(value).padStart(2, "0");
+const dayName = (date) => `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}`;
+const shifted = (day, days) => {
+  const date = new Date(`${day}T12:00`);
+  date.setDate(date.getDate() + days);
+  return dayName(date);
+};
+
+export const today = () => dayName(new Date());
+
+// ---- one person's pictures
+
+export function film(state, act) {
+  const { visit, picked } = state;
+  if (!visit) return nothing;
+  const taken = Object.entries(visit.slots).flatMap(([slot, { captures }]) => captures.map((id) => ({ slot, id })));
+  return html`
+    <section class="film">
+      <h2>${t("film.title", { number: visit.number })}</h2>
+      ${visit.outcome ? html`<p><b>${t(`outcome.${visit.outcome.code}`)}</b> · ${visit.outcome.sentence}</p>` : nothing}
+      ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
+      <div class="ends">
+        ${picked.length === 2
+          ? html`<button class="primary" type="button" id="compare" @click=${act.compare}>${t("film.compare")}</button>`
+          : taken.length > 1
+            ? html`<p class="muted">${t("film.pick", { n: 2 - picked.length })}</p>`
+            : nothing}
+        ${visit.finished_at
+          ? nothing
+          : html`<button type="button" @click=${() => act.resume(visit)}>
+              ${t("home.continue", { number: visit.number })}
+            </button>`}
+      </div>
+      ${taken.length ? away(state, act) : nothing}
+    </section>
+  `;
+}
+
+function frame(state, act, { slot, id }) {
+  const { eye, part } = slotWords(state, slot);
+  const on = state.picked.includes(id);
+  return html`<li>
+    <button type="button" class="open" data-id=${id} @click=${() => act.openPicture(slot, id)}>
+      <span class="thumb">${thumb(id, act)}</span> <span>${eye} · ${part}</span>
+    </button>
+    <button type="button" class="pick" aria-pressed=${on} @click=${() => act.pick(id)}>
+      ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
+    </button>
+  </li>`;
+}
+
+function away({ visit, folders, copied }, act) {
+  return html`
+    <div class="ends">
+      <a class="button" href=${zipOf(visit.id)} download>${t("film.zip")}</a>
+      <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
+      ${(folders ?? []).map(
+        (folder) => html`<button type="button" data-folder=${folder.id ?? folder} @click=${() => act.copyTo(folder)}>
+          ${folder.name ?? folder}
+        </button>`,
+      )}
+    </div>
+    <p role="note">
+      ${copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : ""}
+    </p>
+  `;
+}
+
+// ---- two pictures: side by side, or one over the other
+
+export function compare(state, act) {
+  const { route, blink, front = 0 } = state;
+  const shown = [route.capture, route.other];
+  return html`
+    <section class="compare" ?data-blink=${blink}>
+      <div class="ends">
+        ${choice({
+          label: t("compare.title"),
+          value: Boolean(blink),
+          options: [
+            [false, t("compare.side")],
+            [true, t("compare.blink")],
+          ],
+          choose: act.setBlink,
+        })}
+        ${blink
+          ? html`<button class="primary" type="button" id="swap" @click=${act.swap}>
+              ${t("compare.swap")} (${t("compare.which", { n: front + 1 })})
+            </button>`
+          : nothing}
+      </div>
+      <div class="two">
+        ${shown.map(
+          (id, i) => html`<eye-pic
+            class=${blink && i !== front ? "behind" : ""}
+            aria-label=${t("compare.which", { n: i + 1 })}
+            .head=${state.status}
+            .subject=${id}
+            .src=${act.finalOf(id)}
+            @looked=${act.linkZoom}
+          ></eye-pic>`,
+        )}
+      </div>
+    </section>
+  `;
+}

@@ -1,0 +1,84 @@
+// Home: one big button, what is unfinished, how the day went, the language. Find: a number pad and today's people.
+
+import { icon } from "../icons.js";
+import { choice, pad, personWords } from "../parts.js";
+import { html, nothing } from "../vendor/lit-html.js";
+import { clockTime, LANGUAGES, t } from "../words.js";
+
+export function home(state, act) {
+  const { visits, counts } = state;
+  const left = (visits ?? []).find((visit) => !visit.finished_at);
+  return html`
+    <section class="home">
+      <button class="primary big" type="button" id="new" @click=${() => act.begin()}>${icon("person")} ${t("home.new")}</button>
+      ${left
+        ? html`<button class="big" type="button" id="continue" @click=${() => act.resume(left)}>
+            ${icon("next")} <span>${t("home.continue", { number: left.number })}</span>
+          </button>`
+        : nothing}
+      <div class="pair">
+        <button type="button" id="find" @click=${() => act.go({ screen: "find" })}>${t("home.find")}</button>
+        <button type="button" id="history" @click=${() => act.go({ screen: "history" })}>${t("home.history")}</button>
+      </div>
+      ${counts ? day(counts) : nothing} ${languages(state, act)}
+    </section>
+  `;
+}
+
+function day({ done, to_finish: open, referred }) {
+  return html`
+    <p class="day">
+      <b>${t("home.today")}</b> <span>${t("home.done", { n: done })}</span> <span>${t("home.open", { n: open })}</span>
+      <span>${t("home.referred", { n: referred })}</span>
+    </p>
+  `;
+}
+
+function languages({ language }, act) {
+  const draft = LANGUAGES[language]?.draft;
+  const options = Object.entries(LANGUAGES).map(([tag, { name }]) => [tag, name]);
+  return html`
+    <section class="languages">
+      <h2>${t("home.language")}</h2>
+      ${choice({ label: t("home.language"), value: language, options, choose: act.setLanguage })}
+      ${draft ? html`<p class="muted">${t("home.draft")}</p>` : nothing}
+    </section>
+  `;
+}
+
+export function find({ typed, visits }, act) {
+  const found = (visits ?? []).filter((visit) => visit.number.includes(typed)).slice(0, 20);
+  return html`
+    <section class="find">
+      <div>
+        <h2>${t("find.title")}</h2>
+        <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
+        ${pad(act.typeNumber)}
+        <button class="primary" type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
+          ${t("find.start", { number: typed })}
+        </button>
+        <p class="muted">${t("find.scan")}</p>
+      </div>
+      <div>
+        <h2>${t("home.today")}</h2>
+        ${found.length ? people(found, act.resume) : html`<p class="muted">${t("find.none")}</p>`}
+      </div>
+    </section>
+  `;
+}
+
+export function people(visits, open) {
+  return html`
+    <ul class="people">
+      ${visits.map((visit) => {
+        const [name, word] = visit.outcome ? ["check", `outcome.${visit.outcome.code}`] : ["wait", "find.open"];
+        return html`<li>
+          <button type="button" data-visit=${visit.id} @click=${() => open(visit)}>
+            <span>${personWords(visit)}</span> <span class="muted">${clockTime(visit.begun_at)}</span>
+            <span class="end">${icon(name)} ${t(word)}</span>
+          </button>
+        </li>`;
+      })}
+    </ul>
+  `;
+}

@@ -1,0 +1,71 @@
+// Outcome: one sentence, the slip, the code, done. Undo for ten seconds instead of "are you sure?".
+
+import { icon } from "../icons.js";
+import { personWords, tiles } from "../parts.js";
+import { html, nothing, svg } from "../vendor/lit-html.js";
+import { calendarDay, clockTime, t } from "../words.js";
+
+export function outcome(state, act) {
+  const { visit, undoUntil } = state;
+  if (!visit) return nothing;
+  if (!visit.outcome) return notYet(act, visit);
+  const left = Math.ceil((undoUntil - Date.now()) / 1000);
+  return html`
+    <section class="outcome" data-outcome=${visit.outcome.code}>
+      <h2>${t("outcome.title", { number: visit.number })}</h2>
+      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${t(`outcome.${visit.outcome.code}`)}</p>
+      <p>${visit.outcome.sentence}</p>
+      ${tiles(state, act)}
+      <div class="ends">
+        <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
+        <button type="button" id="code" aria-expanded=${state.code !== undefined} @click=${act.showCode}>
+          ${t("outcome.code")}
+        </button>
+        ${left > 0
+          ? html`<button type="button" id="undo" @click=${act.reopen}>${icon("again")} ${t("outcome.undo", { s: left })}</button>`
+          : nothing}
+        <button class="primary big" type="button" id="done" @click=${() => act.go({ screen: "home" })}>
+          ${t("outcome.done")}
+        </button>
+      </div>
+      ${state.code ? code(state.code) : nothing} ${slip(state)}
+    </section>
+  `;
+}
+
+function notYet(act, visit) {
+  return html`<section class="outcome">
+    <h2>${t("outcome.open")}</h2>
+    <button class="primary big" type="button" @click=${() => act.resume(visit)}>
+      ${t("home.continue", { number: visit.number })}
+    </button>
+  </section>`;
+}
+
+/** What the code says: number, date, outcome, telephone of the centre. Never a picture, a name or an age. */
+export function codeText({ visit, protocol }) {
+  const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
+  return [visit.number, day, visit.outcome.code, protocol?.programme?.centre_phone].filter(Boolean).join("\n");
+}
+
+function code({ size, path }) {
+  return html`<figure class="code">
+    <svg viewBox=${`-4 -4 ${size + 8} ${size + 8}`} role="img" aria-label=${t("outcome.code.name")} shape-rendering="crispEdges">
+      ${svg`<rect x="-4" y="-4" width=${size + 8} height=${size + 8} fill="#fff"></rect><path d=${path} fill="#000"></path>`}
+    </svg>
+    <figcaption class="muted">${t("outcome.code.name")}</figcaption>
+  </figure>`;
+}
+
+// Only on paper: the print style sheet shows this and nothing else.
+function slip({ visit, protocol, code: drawn }) {
+  const phone = protocol?.programme?.centre_phone;
+  const moment = visit.finished_at ?? visit.begun_at;
+  return html`<section class="slip" aria-hidden="true">
+    <p class="slip-number">${personWords(visit)}</p>
+    <p>${calendarDay(moment)}, ${clockTime(moment)}</p>
+    <p class="slip-outcome">${t(`outcome.${visit.outcome.code}`)}</p>
+    <p>${visit.outcome.sentence}</p>
+    ${phone ? html`<p>${t("outcome.phone", { phone })}</p>` : nothing} ${drawn ? code(drawn) : nothing}
+  </section>`;
+}

@@ -1,0 +1,125 @@
+// Every state that the page can tell, as data: one table, one way to show it. The words stand in words.js under
+// "state.CODE" (English master); what stops stands in the prompt bar and in the shutter ("stop.CODE"), what only tells is a chip.
+
+import { get, set } from "./memory.js";
+import { has, t } from "./words.js";
+
+const SAID_ALOUD = /^(link\.lost|light\.|heat\.)/;
+
+// Worst first. `stop`: no press while it stands. `tell`: a chip. `shot`: about one picture, on its card. `ask`: a question there.
+// `wait`: how long until it is over by itself; "n" means the n minutes that the instrument named.
+const TABLE = [
+  ["link.lost", "stop", []],
+  ["link.other", "stop", ["useHere"]],
+  ["lock.idle", "stop", ["pin"]],
+  ["light.fault", "stop", ["technician"]],
+  ["camera.missing", "stop", ["retry", "technician"]],
+  ["heat.hot", "stop", [], { wait_s: 300 }],
+  ["batt.empty", "stop", []],
+  ["light.day", "stop", ["finish"]],
+  ["light.limit", "stop", ["otherEye"], { wait_s: "n" }],
+  ["store.full", "stop", ["how"]],
+  ["cal.missing", "stop", ["technician"]],
+  ["cal.mismatch", "stop", ["technician"]],
+  ["camera.stalled", "tell", []],
+  ["power.lost", "tell", ["takeNow"]],
+  ["link.slow", "tell", []],
+  ["batt.low", "tell", []],
+  ["store.low", "tell", []],
+  ["clock.wrong", "tell", ["dateIsRight", "setClock"]],
+  ["send.stuck", "tell", ["why", "tryNow"]],
+  ["make.slow", "tell", ["next"]],
+  ["heat.warm", "tell", []],
+  ["send.waiting", "tell", ["see"]],
+  ["cal.old", "tell", ["later"]],
+  ["eye.side", "ask", ["change", "keepEye"]],
+  ["make.failed", "shot", ["again", "next"]],
+  ["shot.poor", "shot", ["couldNot", "again"]],
+  ["shot.pupil", "shot", ["timer", "again"]],
+  ...["shot.saturated", "shot.dark", "shot.moved", "shot.blink", "shot.noeye", "shot.edge", "shot.halo"].map((code) => [
+    code,
+    "shot",
+    ["again"],
+  ]),
+];
+
+export const STATES = Object.freeze(
+  Object.fromEntries(
+    TABLE.map(([code, level, buttons, more], rank) => [
+      code,
+      Object.freeze({ code, level, buttons, rank, aloud: SAID_ALOUD.test(code), ...more }),
+    ]),
+  ),
+);
+
+// The instrument's inner names of things that are one and the same to a screener.
+const SAME = {
+  "head.hot": "heat.hot",
+  "power.low": "batt.empty",
+  "calibration.missing": "cal.missing",
+  "calibration.mode": "cal.mismatch",
+  "calibration.stale": "cal.mismatch",
+  "head.mismatch": "cal.mismatch",
+};
+
+// Stops that the server has and the table has not are as bad as a fault of the light; refusals without a fault only tell.
+const UNKNOWN = { buttons: [], aloud: false };
+
+/** The words of a state: the page's own in the reader's language, or the instrument's where those miss a number. */
+export function wordsOf({ code, message, remedy, ...vars }) {
+  const key = `state.${code}`;
+  const values = filled(vars);
+  if (has(key, values)) return t(key, values);
+  return message ? `${message} ${remedy ?? ""}`.trim() : t("fault.unknown");
+}
+
+const filled = ({ eye, other, slot, ...vars }) => ({
+  ...vars,
+  ...(eye ? { eye: t(`eye.${eye}`) } : {}),
+  ...(other ? { other: t(`eye.${other}.word`) } : {}),
+  ...(slot ? { part: t(`field.${slot.split("-")[1] ?? slot}`) } : {}),
+});
+
+/**
+ * A state begins, or is told anew. `from` says who takes it back: "status" (gone when the next status has no problem),
+ * "press" (gone with OK, another slot, the next press), "notice" (the instrument says when), or "page".
+ */
+export function raise({ code: told, from, ...vars }) {
+  const code = SAME[told] ?? told;
+  const known = STATES[code] ?? { ...UNKNOWN, code, level: from === "press" ? "refused" : "stop", rank: 3 };
+  const wait = known.wait_s === "n" ? vars.n * 60 : known.wait_s;
+  const before = get().states.find((state) => state.code === code);
+  const until = before?.until || (wait ? Date.now() + wait * 1000 : 0);
+  const state = Object.freeze({ ...known, ...vars, code, from, until });
+  set({ states: Object.freeze([...get().states.filter((other) => other.code !== code), state].sort(worstFirst)) });
+}
+
+export function lower(test) {
+  const code = SAME[test] ?? test;
+  const gone = typeof code === "function" ? code : (state) => state.code === code;
+  const left = get().states.filter((state) => !gone(state));
+  if (left.length !== get().states.length) set({ states: Object.freeze(left) });
+}
+
+const worstFirst = (one, other) => one.rank - other.rank;
+
+/** At most one stop and two chips, worst first. */
+export function shownStates({ states }) {
+  return {
+    stop: states.find(({ level }) => level === "stop") ?? null,
+    chips: states.filter(({ level }) => level === "tell").slice(0, 2),
+  };
+}
+
+/** "4:12" until a state is over by itself; empty when nobody knows. */
+export function timeLeft(until) {
+  const left = Math.ceil((until - Date.now()) / 1000);
+  return until && left > 0 ? `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")}` : "";
+}
+
+// One clock for everything that counts down; it stands still when nothing does.
+setInterval(() => {
+  const { states, undoUntil, timer } = get();
+  lower(({ until }) => until && until <= Date.now());
+  if (undoUntil > Date.now() - 2000 || timer || states.some(({ until }) => until)) set({ now: Date.now() });
+}, 1000);
