@@ -158,6 +158,11 @@ class Dimensions:
         """Width of the tilted plate as the light sees it: the bore of the block."""
         return self.path.relay.splitter_mm / sqrt(2)
 
+    def light_mm(self, z_mm: float) -> float:
+        """Width of the field's light so far before the iris, with room for a part around it."""
+        relay = relay_of(self.path, self.path.optics)
+        return relay.clear_before_iris_mm(self.path.optics.field_deg, -z_mm) + 1.0
+
     @property
     def block_z_mm(self) -> Place:
         """Front and rear face of the splitter block."""

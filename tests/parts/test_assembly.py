@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from device.optics.light_path import relay_of
 from device.optics.matrix import ring
-from hardware.parts import assembly
+from hardware.parts import assembly, bought
 from hardware.parts.dimensions import FOUR, Dimensions
 from hardware.parts.printed import diffuser_cell, pinhole_piston, retaining_ring, splitter_block, tube_flange
 from hardware.parts.printed.iris import iris
@@ -92,14 +92,16 @@ def test_the_iris_is_as_wide_as_the_light_path_says_and_sharp(d: Dimensions, hea
 
 
 def test_the_light_of_the_field_meets_no_printed_part(d: Dimensions, head: Solids) -> None:
-    """From the plate's clear width to the iris, and from the iris to the edge of what the sensor could see."""
+    """From before the tube flange to the plate, to the iris, and on to the edge of what a sensor could see."""
     relay, field = relay_of(d.path, d.path.optics), d.path.optics.field_deg
     before = relay.clear_before_iris_mm(field, 9.0)
     extent = d.iris_mm + 2 * relay.half_shift_tan_mm(field)
     front = bundle((d.iris_mm - 0.02, 0, 0, -0.01), (before, 0, 0, -9.0))
     behind = bundle((d.iris_mm, 0, 0, 0.01), (extent, 0, 0, 5.0))
-    printed = ("iris", "diffuser cell", "retaining ring", "polariser ring", "sensor spacer", "splitter block")
-    assert {name for name in printed if common_mm3(front + behind, head[name]) > NOTHING_MM3} == set()
+    far = [(relay.clear_before_iris_mm(field, -z), 0, d.lens_y_mm, z) for z in (-45.0, d.plate_z_mm)]
+    printed = {name: body for name, body in head.items() if name not in {*bought.HEAD, "dust cap"}}
+    light = front + behind + bundle(*far)
+    assert {name for name, body in printed.items() if common_mm3(light, body) > NOTHING_MM3} == set()
     wider = bundle((d.iris_mm + 0.2, 0, 0, -0.01), (before, 0, 0, -9.0))
     assert common_mm3(wider, head["iris"]) > NOTHING_MM3
 
@@ -125,7 +127,7 @@ def screws(d: Dimensions) -> dict[str, list[tuple[Manifold, str]]]:
         "tube": [rod((*at, d.block_z_mm[0] + 5.9), (0, 0, -1), 40, 3.0) for at in splitter_block.tube_screws_mm(d)],
         "diffuser": [rod((*at, d.cell_rear_z_mm - 6), (0, 0, 1), 6.5, 1.6) for at in retaining_ring.screws_mm()],
         "plate": [
-            rod((splitter_block.HALF_MM - 5.9, *at), (1, 0, 0), 20, 1.6) for at in splitter_block.lid_screws_mm(d)
+            rod((-splitter_block.HALF_MM - 14, *at), (1, 0, 0), 19.9, 1.6) for at in splitter_block.lid_screws_mm(d)
         ],
     }
 

@@ -5,7 +5,7 @@ from build123d import Part
 from hardware.parts.dimensions import Dimensions
 from hardware.parts.shapes import rod
 
-UP = (0.0, 0.0, -1.0)
+UP = (0.0, 0.0, 1.0)
 DEEP_MM = 10.0
 WALL_MM = 2.0
 

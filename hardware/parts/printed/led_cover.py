@@ -6,7 +6,7 @@ from hardware.parts.dimensions import Dimensions
 from hardware.parts.printed.led_cap import outline_mm
 from hardware.parts.shapes import box, joined, rod_y
 
-UP = (0.0, 1.0, 0.0)
+UP = (0.0, -1.0, 0.0)
 ROOM_MM = 5.0  # for solder joints, the capacitors and the bend of the wires
 ROOF_MM = 1.6
 PILLAR_MM = 7.0

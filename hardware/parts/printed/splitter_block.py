@@ -6,7 +6,7 @@ from build123d import Axis, Part, Plane, Solid
 
 from hardware.parts.dimensions import FOUR, Dimensions
 from hardware.parts.printed import diffuser_cell
-from hardware.parts.shapes import box, joined, rod, rod_x, rod_y
+from hardware.parts.shapes import box, cone, joined, rod, rod_x, rod_y
 
 UP = (0.0, 1.0, 0.0)
 HALF_MM = 28.0
@@ -53,13 +53,13 @@ def splitter_block(d: Dimensions) -> Part:
     fit, (front, rear), top = d.fit, d.block_z_mm, d.cap_front_y_mm
     body = box((-HALF_MM, HALF_MM), (FLOOR_Y_MM, top), (front, rear), fit.chamfer_mm, along=Axis.Y)
     lens, bore, plate = (0, d.lens_y_mm), d.plate_seen_mm, d.path.relay.splitter_mm / 2 + fit.slide_mm
-    body -= rod(bore, (front, rear), lens)
+    body -= rod(bore, (front, rear), lens) + cone(bore, d.light_mm(front), (d.plate_z_mm, front), lens)
     body -= rod_y(bore, (FLOOR_Y_MM + TRAP_MM, top), (0, d.plate_z_mm))
     body -= rod(diffuser_cell.SPIGOT_MM + fit.slide_mm, (d.spigot_z_mm - fit.press_mm, rear))
-    body -= slab(d, (-plate, HALF_MM), plate, (0, d.bought.plate_thick_mm + fit.slide_mm))
+    body -= slab(d, (-HALF_MM, plate), plate, (0, d.bought.plate_thick_mm + fit.slide_mm))
     x, y = diffuser_cell.SCREWS_MM
     holes = [rod(fit.insert_mm, (rear - fit.insert_deep_mm, rear), (i * x, j * y)) for i, j in FOUR]
     holes += [rod(fit.insert_mm, (front, front + fit.insert_deep_mm), at) for at in tube_screws_mm(d)]
     holes += [rod_y(fit.insert_mm, (top - fit.insert_deep_mm, top), at) for at in d.led_screws_mm]
-    holes += [rod_x(fit.m2_forms_mm, (HALF_MM - 6, HALF_MM), at) for at in lid_screws_mm(d)]
+    holes += [rod_x(fit.m2_forms_mm, (-HALF_MM, -HALF_MM + 6), at) for at in lid_screws_mm(d)]
     return body - joined(holes)

@@ -25,7 +25,7 @@ def tube_flange(d: Dimensions) -> Part:
     rear, lens = d.block_z_mm[0], (0, d.lens_y_mm)
     inside = d.bought.tube_mm + 2 * d.fit.slide_mm
     body = rod(inside + 2 * WALL_MM, (rim, rear), lens) - rod(inside, (rim, floor), lens)
-    body -= rod(d.plate_seen_mm + 4, (floor, rear), lens)
+    body -= rod(d.light_mm(floor), (floor, rear), lens)
     sunk = (HEAD_MM - d.fit.m3_mm) / 2
     for at in tube_screws_mm(d):
         body -= rod(d.fit.m3_mm, (floor, rear), at) + cone(HEAD_MM, d.fit.m3_mm, (floor, floor + sunk), at)
