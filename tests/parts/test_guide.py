@@ -58,7 +58,7 @@ def test_the_guide_says_the_figures_of_the_models(d: Dimensions) -> None:
     assert [figure for figure in figures if figure not in said] == []
     assert (min(leds), max(leds)) == (4, 8)
     assert "four LEDs of eight" in said
-    wide = replace(d, path=d.path.model_copy(update={"relay": d.path.relay.model_copy(update={"splitter_mm": 36.0})}))
+    wide = replace(d, path=d.path.model_copy(update={"relay": d.path.relay.model_copy(update={"splitter_mm": 50.8})}))
     assert min(lit(wide, azimuth) for azimuth in range(0, 360, 15)) == 8
 
 
