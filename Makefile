@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers lock clean
+.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -26,7 +26,7 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 	@$(BIN)/diffuscope run --port $(PORT)
 
 test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports --ignore tests/parts
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser
 
@@ -79,12 +79,33 @@ bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-ve
 		.bench-venv/bin/pip install -qq --disable-pip-version-check ducc0 pyfftw numpy scipy matplotlib opencv-python-headless pillow \
 		|| { rm -rf .bench-venv; echo "LenslessPiCam could not be installed (is there a network?): make bench leaves it out"; }
 
+# A CAD kernel is heavy, and no instrument needs one: an environment of its own.
+PARTS_LOCK := hardware/parts/requirements.lock
+
+.parts-venv/ready: $(PARTS_LOCK) hardware/parts/install
+	@hardware/parts/install
+	@echo "Setting up .parts-venv (a minute, once)"
+	@$(PYTHON) -m venv .parts-venv
+	@.parts-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r $(PARTS_LOCK)
+	@touch $@
+
+parts: .parts-venv/ready ## Write the printed parts as STEP and STL into out/parts.
+	@.parts-venv/bin/python -m hardware.parts export out/parts
+
+part-pictures: .parts-venv/ready ## Draw the pictures of the assembly guide anew, from the same models.
+	@.parts-venv/bin/python -m hardware.parts pictures hardware/pictures
+
+test-parts: .parts-venv/ready ## Measure the printed parts: closed, thick enough, clear of one another and of the light.
+	@.parts-venv/bin/python -m pytest tests/parts
+
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready ## Write requirements.lock anew.
+lock: .venv/ready ## Write requirements.lock anew, and that of the printed parts.
 	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra test --group lock pyproject.toml -o requirements.lock
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+		hardware/parts/requirements.in -o $(PARTS_LOCK)
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .bench-venv .other-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .bench-venv .other-venv .parts-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

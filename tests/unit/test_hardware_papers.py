@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import pytest
 
 from device.optics.budget import design_of_head, optical_budget
-from device.optics.light_path import load_light_path
+from device.optics.light_path import load_light_path, relay_of
 from device.optics.matrix import for_pupil, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
 from device.spec import ChainSpec, load_head
 from services.instrument.light_path_plot import drawn
@@ -197,6 +197,51 @@ def test_every_figure_of_the_assembly_is_the_optics() -> None:
     ]  # fmt: skip
     said = " ".join(text("hardware/assembly.md").split())
     assert [figure for figure in figures if figure not in said] == []
+
+
+def test_the_steps_of_the_calibrations_eye_are_those_that_the_guide_says() -> None:
+    """21 and 29 mm behind a lens of 25: exact vergence, 1/s - 1/f, and what the caustic's width makes of it."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    said = " ".join(text("hardware/assembly.md").split())
+    shrinks_per_dpt = relay.diffuser_to_sensor_mm * relay.angular_magnification**2 / 1000
+    for distance_mm, kind, goes in ((21, "hyperopia", "wider"), (29, "myopia", "narrower")):
+        dpt = abs(1000 / distance_mm - 1000 / 25)
+        assert re.search(rf"{dpt:.2f}( dioptres)? of {kind}", said)
+        assert re.search(rf"{100 * shrinks_per_dpt * dpt:.1f} % {goes}", said)
+    assert f"bright disc, {7.7 * relay.pupil_magnification:.1f} mm" in said
+
+
+def printed() -> set[str]:
+    """Every printed part is one file of models; its name is the file's."""
+    stems = {path.stem for path in (HARDWARE / "parts" / "printed").glob("[a-z]*.py")}
+    return {stem.replace("_", " ").replace("led ", "LED ") for stem in stems}
+
+
+def test_the_bill_lists_what_is_printed_and_nothing_else_is() -> None:
+    assert len(printed()) > 10
+    assert {name for name, row in parts().items() if row["from"].startswith("printed")} == printed()
+    said = re.search(r"The (\w+) printed parts", text("hardware/assembly.md"))
+    assert said is not None
+    assert {"fifteen": 15}[said[1]] == len(printed())
+
+
+@pytest.mark.parametrize("name", ["printed", "exploded", "section", "eye"])
+def test_the_pictures_of_the_parts_can_be_read(name: str) -> None:
+    """The guide shows each; it names parts of the bill, no name covers another, and none is heavy."""
+    file = f"hardware/pictures/parts-{name}.svg"
+    assert f"(pictures/parts-{name}.svg)" in text("hardware/assembly.md")
+    found = boxes(ElementTree.fromstring(text(file)))
+    assert overlapping(found) == []
+    assert len({box.words for box in found} & {*parts(), *printed()}) >= 4
+    assert len(text(file)) < 150_000
+
+
+def test_every_printed_part_is_pictured() -> None:
+    """Alone as it is printed, and where it belongs."""
+    shown = {name: text(f"hardware/pictures/parts-{name}.svg") for name in ("printed", "exploded", "eye")}
+    assert not [part for part in printed() if f">{part}<" not in shown["printed"]]
+    together = shown["exploded"] + shown["eye"]
+    assert [part for part in printed() if f">{part}<" not in together] == ["dust cap"]
 
 
 @pytest.mark.parametrize("ring_mm", [4.49, 10.04, 13.47, 16.19])

@@ -1,0 +1,1 @@
+"""The printed parts of a head, as models that follow `hardware/optics.toml`."""

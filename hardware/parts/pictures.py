@@ -1,0 +1,148 @@
+"""The pictures of the assembly guide, drawn from the models that are printed: `make part-pictures`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from build123d import Part
+
+from device.optics.light_path import relay_of
+from hardware.parts import assembly
+from hardware.parts.dimensions import Dimensions
+from hardware.parts.sheet import MEASURE, Sheet, labels
+from hardware.parts.view import Drawn, Offset, View, cut
+from services.instrument.plot import text
+
+BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring are
+UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
+BOUGHT = {
+    "lens tubes": "metal", "beam splitter": "glass", "LED matrix": "board", "LED film": "glass", "lever": "metal",
+    "polariser film": "glass", "diffuser": "glass", "camera": "board", "eye lens": "glass", "pinhole": "metal",
+}  # fmt: skip
+AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
+    "lens tubes": (0, 0, -60), "tube flange": (0, 0, -38), "plate lid": (-58, 0, 0), "beam splitter": (-34, 0, 0),
+    "LED film": (0, 14, 0), "LED cap": (0, 34, 0), "LED matrix": (0, 54, 0), "LED cover": (0, 72, 0),
+    "polariser ring": (0, 0, 26), "polariser film": (0, 0, 36), "diffuser cell": (0, 0, 56), "lever": (0, 22, 56),
+    "iris": (0, 0, 66), "diffuser": (0, 0, 74), "retaining ring": (0, 0, 84), "sensor spacer": (0, 0, 96),
+    "camera": (0, 0, 112), "camera cover": (0, 0, 128),
+}  # fmt: skip
+EYE_AWAY: dict[str, Offset] = {
+    "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "pinhole": (0, 0, -60), "pinhole piston": (0, 0, -70),
+}  # fmt: skip
+OBLIQUE = View((-0.60, 0.52, 0.24))
+
+
+def pictures(d: Dimensions, folder: Path) -> list[Path]:
+    """Draw them all; answers what was written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, picture in PICTURES.items():
+        (file := folder / f"parts-{name}.svg").write_text(picture(d), encoding="utf-8")
+        written.append(file)
+    return written
+
+
+def exploded(d: Dimensions) -> str:
+    """Every part of the head beside its place, along the axes on which it is put together."""
+    parts = {name: part for name, part in assembly.head(d).items() if name != "dust cap"}
+    return _exploded("The head, taken apart", parts, AWAY)
+
+
+def eye(d: Dimensions) -> str:
+    """The calibration's eye."""
+    return _exploded("The eye for the calibration, taken apart", assembly.eye(d), EYE_AWAY)
+
+
+def _exploded(title: str, parts: dict[str, Part], away: dict[str, Offset]) -> str:
+    drawn = {name: OBLIQUE.seen(part, _kind(name), away.get(name, (0, 0, 0))) for name, part in parts.items()}
+    behind = sorted(drawn, key=lambda name: drawn[name].depth)
+    sheet = Sheet(title, drawn.values(), 4.2)
+    body = [drawn[name].svg for name in behind]
+    return sheet.document(body, labels(sheet, drawn, frozenset(parts) & UPRIGHT))
+
+
+def section(d: Dimensions) -> str:
+    """The head cut along its axis, its LEDs where the ring has some, with light and the distances that count."""
+    parts = {name: part for name, part in assembly.head(d).items() if name != "dust cap"}
+    beside = min((x for x, _ in d.ring_places_mm), key=abs)
+    cuts = {name: cut(part, _kind(name), at_x_mm=beside if name in BESIDE else 0) for name, part in parts.items()}
+    drawn = {name: face for name, face in cuts.items() if face is not None}
+    sheet = Sheet("The head, cut along its axis", drawn.values(), 9.0)
+    light = [f'<path class="light" d="{places}"/>' for places in (_light(d), *_led_light(d, beside))]
+    return sheet.document([*(face.svg for face in drawn.values()), *light], labels(sheet, drawn) + _measures(sheet, d))
+
+
+def _light(d: Dimensions) -> str:
+    """The field's outermost light: from the plate's front through the iris to the sensor."""
+    relay, field, begin = relay_of(d.path, d.path.optics), d.path.optics.field_deg, d.block_z_mm[0]
+    before, iris = relay.clear_before_iris_mm(field, -begin) / 2, d.iris_mm / 2
+    end, sensor = d.image_z_mm, d.iris_mm / 2 + relay.half_shift_tan_mm(field)
+    upper = [(0, iris), (end, sensor), (end, -sensor), (0, -iris)]
+    plate, at_plate = d.plate_z_mm, relay.clear_before_iris_mm(field, -d.plate_z_mm) / 2
+    low, high = d.lens_y_mm - before, d.lens_y_mm + before
+    return _outline([*upper, (plate, -at_plate), (begin, low), (begin, high), (plate, at_plate)])
+
+
+def _led_light(d: Dimensions, x_mm: float) -> list[str]:
+    """What the cap lets out of each LED in this cut, down to the plate or to the bore around it."""
+    slope = d.led_hole_mm / 2 / (d.led_y_mm - d.cap_end_y_mm)
+    long, bore = d.led_y_mm - d.lens_y_mm, d.plate_seen_mm / 2
+    outlines = []
+    for off in (z - d.plate_z_mm for x, z in d.ring_places_mm if x == x_mm):
+        places = [(off, long)]
+        for side in (1, -1):
+            end = (long - off) / (1 + side * slope)  # the plate is where both coordinates from its middle agree
+            met = off + side * slope * end
+            wall = side * bore, long - (bore - side * off) / slope
+            reached = [(met, met)] if abs(met) <= bore else [wall, (side * bore, side * bore)]
+            places += reached if side == 1 else reversed(reached)
+        outlines.append(_outline([(d.plate_z_mm + z, d.lens_y_mm + y) for z, y in places]))
+    return outlines
+
+
+def _outline(places: list[tuple[float, float]]) -> str:
+    return "M" + "L".join(f"{z:.1f} {-y:.1f}" for z, y in places) + "Z"
+
+
+def _measures(sheet: Sheet, d: Dimensions) -> list[str]:
+    """Three distances of `optics.toml`, between the planes that they join."""
+    optics, relay = d.path.optics, d.path.relay
+    deep, plate, image = -8.0, d.plate_z_mm, d.image_z_mm
+    lines = [
+        sheet.measure((plate, deep), (0, deep)),
+        sheet.measure((0, deep), (image, deep)),
+        sheet.measure((plate, d.lens_y_mm), (plate, d.led_y_mm)),
+    ]
+    splitter, air = f"{relay.splitter_to_iris_mm:g} mm", f"{optics.diffuser_to_sensor_um / 1000:g} mm in air"
+    x, y = sheet.at((plate, d.led_y_mm * 0.6))
+    return [
+        *lines,
+        text(*sheet.at((plate / 2, deep - 1.8)), splitter, MEASURE, "middle"),
+        text(x + 6, y, splitter, MEASURE),
+        text(*sheet.at((image / 2, deep - 2.6)), air, MEASURE, "middle"),
+    ]
+
+
+def printed(d: Dimensions) -> str:
+    """Every printed part as it lies on the printer's bed."""
+    view, cols, wide, high = View((-0.5, -0.62, 0.75), (0, 0, 1)), 5, 88.0, 88.0
+    drawn, names = [], list(assembly.printed())
+    for i, part in enumerate(assembly.printed().values()):
+        seen = view.seen(part.on_the_bed(d), "printed")
+        x, y = (i % cols) * wide - seen.middle[0], -(i // cols) * high - seen.middle[1]
+        box = seen.left + x, seen.low + y, seen.right + x, seen.high + y
+        drawn.append(Drawn(f'<g transform="translate({x:.1f} {-y:.1f})">{seen.svg}</g>', *box))
+    sheet = Sheet("What is printed, as it lies on the bed", drawn, 2.4, top=40)
+    words = []
+    for i, name in enumerate(names):
+        x, y = sheet.at(((i % cols) * wide, -(i // cols) * high - high / 2))
+        words.append(text(x, y + 4, name, "small", "middle"))
+    return sheet.document([one.svg for one in drawn], words)
+
+
+def _kind(name: str) -> str:
+    return BOUGHT.get(name, "printed")
+
+
+PICTURES: dict[str, Callable[[Dimensions], str]] = {
+    "exploded": exploded, "section": section, "eye": eye, "printed": printed,
+}  # fmt: skip

@@ -1,0 +1,255 @@
+"""The parts fit one another and the light: distances, screws, apertures, LEDs, and no light from the side."""
+
+from collections.abc import Callable
+from itertools import combinations
+from math import cos, pi, radians, sin, tan
+
+import numpy as np
+import pytest
+from manifold3d import OpType
+from numpy.typing import NDArray
+
+from device.optics.light_path import relay_of
+from device.optics.matrix import ring
+from hardware.parts import assembly, bought
+from hardware.parts.dimensions import FOUR, Dimensions
+from hardware.parts.printed import diffuser_cell, pinhole_piston, retaining_ring, splitter_block, tube_flange
+from hardware.parts.printed.iris import iris
+from hardware.parts.printed.led_cap import led_cap
+from hardware.parts.solids import Manifold, solid
+
+pytestmark = pytest.mark.parts
+
+Place = tuple[float, float, float]
+Rays = NDArray[np.float64]  # directions, a row each
+Solids = dict[str, Manifold]
+Change = Callable[[str, str], Dimensions]
+CUTS_ITS_THREAD = {("lever", "polariser ring")}
+FAR_MM = 300.0
+NOTHING_MM3 = 0.05  # tessellated faces that touch
+
+
+def common_mm3(one: Manifold, other: Manifold) -> float:
+    return (one ^ other).volume()
+
+
+def rod(at: tuple[float, float, float], along: tuple[float, float, float], long_mm: float, wide_mm: float) -> Manifold:
+    """A cylinder from a point."""
+    x, y, z = along
+    turn = {(0, 0, 1): (0, 0, 0), (0, 0, -1): (180, 0, 0), (0, 1, 0): (-90, 0, 0), (1, 0, 0): (0, 90, 0)}[(x, y, z)]
+    return Manifold.cylinder(long_mm, wide_mm / 2, -1, 48).rotate(turn).translate(at)
+
+
+def bundle(*discs: tuple[float, float, float, float]) -> Manifold:
+    """All straight light between discs, each (diameter, x, y, z) square to the axis."""
+    turns = np.linspace(0, 2 * pi, 96, endpoint=False)
+    places = [(x + w / 2 * cos(a), y + w / 2 * sin(a), z) for w, x, y, z in discs for a in turns]
+    return Manifold.hull_points(np.array(places))
+
+
+@pytest.mark.parametrize("which", ["head", "eye"])
+def test_nothing_stands_inside_anything_else(which: str, request: pytest.FixtureRequest) -> None:
+    parts: Solids = request.getfixturevalue(which)
+    inside = {
+        pair: common_mm3(parts[pair[0]], parts[pair[1]])
+        for pair in combinations(sorted(parts), 2)
+        if pair not in CUTS_ITS_THREAD
+    }
+    assert len(inside) > 9
+    assert {pair: volume for pair, volume in inside.items() if volume > NOTHING_MM3} == {}
+
+
+def test_two_parts_in_one_place_would_be_noticed(head: Solids) -> None:
+    assert common_mm3(head["camera"], head["sensor spacer"].translate((0, 0, 0.1))) > NOTHING_MM3
+
+
+def in_air_mm(d: Dimensions, head: Solids) -> float:
+    """From diffuser to image plane in air, as the printed parts stack it: iris, shoulder, cell, spacer, board."""
+    low, high = head["sensor spacer"].bounding_box()[2::3]
+    assert low == pytest.approx(head["diffuser cell"].bounding_box()[5], abs=1e-5)
+    board = d.bought.board_mm**2
+    assert head["camera"].slice(high + 0.01).area() > 0.98 * board > head["camera"].slice(high - 0.01).area()
+    rough = head["iris"].bounding_box()[5]
+    part = d.bought
+    image = high - part.image_above_board_mm
+    glass = part.diffuser_thick_mm * (1 - 1 / part.diffuser_index)
+    return image - rough - glass - part.cover_glass_mm * (1 - 1 / part.cover_glass_index)
+
+
+def test_the_spacer_makes_the_distance_of_the_light_path(d: Dimensions, head: Solids) -> None:
+    assert in_air_mm(d, head) == pytest.approx(d.path.optics.diffuser_to_sensor_um / 1000, abs=1e-4)
+    assert head["diffuser"].bounding_box()[2] == pytest.approx(head["iris"].bounding_box()[5], abs=1e-5)
+    assert head["retaining ring"].bounding_box()[2] == pytest.approx(head["diffuser"].bounding_box()[5], abs=1e-5)
+
+
+def test_the_iris_is_as_wide_as_the_light_path_says_and_sharp(d: Dimensions, head: Solids) -> None:
+    """A hole of 3.2 mm at the diffuser, in a land of 0.2 mm, with nothing narrower before it."""
+    low, high = head["iris"].bounding_box()[2::3]
+    widths = [hole_mm(head["iris"], z) for z in np.linspace(low + 0.01, high - 0.01, 9)]
+    assert widths[-1] == pytest.approx(d.iris_mm, abs=0.01)
+    assert widths[0] > d.iris_mm + 1.5
+    assert widths == pytest.approx(sorted(widths, reverse=True), abs=1e-6)
+
+
+def test_the_light_of_the_field_meets_no_printed_part(d: Dimensions, head: Solids) -> None:
+    """From before the tube flange to the plate, to the iris, and on to the edge of what a sensor could see."""
+    relay, field = relay_of(d.path, d.path.optics), d.path.optics.field_deg
+    before = relay.clear_before_iris_mm(field, 9.0)
+    extent = d.iris_mm + 2 * relay.half_shift_tan_mm(field)
+    front = bundle((d.iris_mm - 0.02, 0, 0, -0.01), (before, 0, 0, -9.0))
+    behind = bundle((d.iris_mm, 0, 0, 0.01), (extent, 0, 0, 5.0))
+    far = [(relay.clear_before_iris_mm(field, -z), 0, d.lens_y_mm, z) for z in (-45.0, d.plate_z_mm)]
+    printed = {name: body for name, body in head.items() if name not in {*bought.HEAD, "dust cap"}}
+    light = front + behind + bundle(*far)
+    assert {name for name, body in printed.items() if common_mm3(light, body) > NOTHING_MM3} == set()
+    wider = bundle((d.iris_mm + 0.2, 0, 0, -0.01), (before, 0, 0, -9.0))
+    assert common_mm3(wider, head["iris"]) > NOTHING_MM3
+
+
+def test_the_block_lets_through_what_the_plate_can(d: Dimensions, head: Solids) -> None:
+    """The tilted plate is the narrowest place of lens and LED path, not the block around it."""
+    wide, z, y = d.plate_seen_mm - 0.1, d.plate_z_mm, d.lens_y_mm
+    lens = rod((0, y, d.block_z_mm[0] - 13), (0, 0, 1), z - d.block_z_mm[0] + 13, wide)
+    light = rod((0, y, z), (0, 1, 0), d.cap_front_y_mm - y, wide)
+    for name in ("splitter block", "tube flange", "plate lid"):
+        assert common_mm3(lens + light, head[name]) < NOTHING_MM3, name
+
+
+def screws(d: Dimensions) -> dict[str, list[tuple[Manifold, str]]]:
+    """Every screw as a rod of its own width, and the part in which it ends."""
+    half, rear = d.bought.board_holes_mm / 2, d.cell_rear_z_mm
+    x, y = diffuser_cell.SCREWS_MM
+    deep = d.cell_front_z_mm - d.fit.insert_deep_mm + 0.1
+    return {
+        "camera": [rod((i * half, j * half, rear - 5.9), (0, 0, 1), 30, 2.5) for i, j in FOUR],
+        "cell": [rod((i * x, j * y, deep), (0, 0, 1), 30, 3.0) for i, j in FOUR],
+        "matrix": [rod((x, d.cap_front_y_mm - 5.9, z), (0, 1, 0), 40, 3.0) for x, z in d.led_screws_mm],
+        "tube": [rod((*at, d.block_z_mm[0] + 5.9), (0, 0, -1), 40, 3.0) for at in splitter_block.tube_screws_mm(d)],
+        "diffuser": [rod((*at, d.cell_rear_z_mm - 6), (0, 0, 1), 6.5, 1.6) for at in retaining_ring.screws_mm()],
+        "plate": [
+            rod((-splitter_block.HALF_MM - 14, *at), (1, 0, 0), 19.9, 1.6) for at in splitter_block.lid_screws_mm(d)
+        ],
+    }
+
+
+@pytest.mark.parametrize("name", ["camera", "cell", "matrix", "tube", "diffuser", "plate"])
+def test_screws_find_their_holes_and_a_driver_finds_them(d: Dimensions, head: Solids, name: str) -> None:
+    """A screw of full width, with a driver as wide behind it, meets nothing on its way into its thread."""
+    for screw in screws(d)[name]:
+        met = {part for part, body in head.items() if part != "lens tubes" and common_mm3(screw, body) > NOTHING_MM3}
+        assert met == set()
+
+
+def test_a_screw_beside_its_hole_is_noticed(d: Dimensions, head: Solids) -> None:
+    moved = screws(d)["camera"][0].translate((0.6, 0, 0))
+    assert common_mm3(moved, head["sensor spacer"]) > NOTHING_MM3
+
+
+def free(body: Manifold, start: Place, ways: Rays) -> Rays:
+    """Those of the rays that meet no surface."""
+    ends = np.array(start) + FAR_MM * ways
+    met = [bool(body.ray_cast(start, tuple(end))) for end in ends.tolist()]
+    return ways[~np.array(met)]
+
+
+def fan(down: tuple[float, float, float], most_deg: float, count: int) -> NDArray[np.float64]:
+    """Directions evenly over a cone, by the golden angle."""
+    n = np.arange(count) + 0.5
+    along = 1 - n / count * (1 - cos(radians(most_deg)))
+    turn, away = n * pi * (3 - 5**0.5), np.sqrt(1 - along**2)
+    axis = np.array(down)
+    u = np.cross(axis, (1.0, 0.0, 0.0) if abs(axis[0]) < 0.9 else (0.0, 1.0, 0.0))
+    v = np.cross(axis, u)
+    return along[:, None] * axis + (away * np.cos(turn))[:, None] * u + (away * np.sin(turn))[:, None] * v
+
+
+def seen_through(d: Dimensions, cap: Manifold, half_deg: float) -> tuple[list[float], list[float]]:
+    """What part of each LED's light gets through the cap: within the cone, and outside of all that a hole allows."""
+    inside, outside = [], []
+    cone, rest = fan((0, -1, 0), 0.98 * half_deg, 24), fan((0, -1, 0), 89.0, 160)
+    rest = rest[rest @ (0, -1, 0) < cos(radians(1.02 * half_deg))]
+    for x, z in d.led_places_mm:
+        start = (x, d.led_y_mm - 1e-4, z)
+        inside.append(len(free(cap, start, cone)) / len(cone))
+        outside.append(len(free(cap, start, rest)) / len(rest))
+    return inside, outside
+
+
+def test_the_cap_shows_the_ring_and_no_other_led(d: Dimensions, head: Solids) -> None:
+    half_deg = relay_of(d.path, d.path.optics).led_cone_deg(d.path.optics.field_deg) / 2
+    inside, outside = seen_through(d, head["LED cap"], half_deg)
+    assert {i for i, part in enumerate(inside) if part == 1} == set(ring(d.path.ring))
+    assert max(part for i, part in enumerate(inside) if i not in ring(d.path.ring)) == 0
+    assert max(outside) == 0
+
+
+def test_no_light_reaches_the_sensor_but_along_the_axis(d: Dimensions, head: Solids) -> None:
+    """Rays backwards from the sensor: one that meets no part has passed the iris and leaves through the lens tube."""
+    clear = {"polariser film", "LED film", "diffuser", "beam splitter", "dust cap"}
+    whole = Manifold.batch_boolean([body for name, body in head.items() if name not in clear], OpType.Add)
+    z = d.image_z_mm - 1.2
+    ways = np.concatenate([fan((0, 0, -1), 89.5, 1500), fan((0, 0, -1), 30, 500)])
+    for x, y in ((0, 0), (1.2, 0.9), (-1.2, 0.9)):
+        out = free(whole, (x, y, z), ways)
+        assert 5 < len(out) < 300
+        at_tube = np.array((x, y - d.lens_y_mm)) + out[:, :2] / -out[:, 2:] * (z - tube_flange.tube_z_mm(d)[0])
+        assert np.hypot(*at_tube.T).max() < d.bought.tube_mm / 2
+
+
+@pytest.mark.parametrize("rings", [0, 1, 2])
+def test_step_rings_put_the_point_of_light_where_it_is_wanted(d: Dimensions, eye: Solids, rings: int) -> None:
+    """21, 25 and 29 mm behind the lens: -4, 0 and +4 mm of the screen."""
+    thick = np.diff(eye["step ring"].bounding_box()[2::3]).item()
+    nose = eye["pinhole"].bounding_box()[5] + (1 - rings) * thick
+    assert -nose == pytest.approx(d.bought.eye_focal_mm + (rings - 1) * d.bought.eye_step_mm, abs=1e-4)
+    assert nose == pytest.approx(pinhole_piston.nose_z_mm(d, rings), abs=1e-4)
+    lens = sum(eye["eye lens"].bounding_box()[2::3]) / 2
+    assert lens == pytest.approx(0, abs=1e-4)
+
+
+def test_the_model_eyes_pupil_is_what_the_paper_used(d: Dimensions, eye: Solids) -> None:
+    tube = eye["model eye tube"]
+    end = tube.bounding_box()[5]
+    widths = [hole_mm(tube, z) for z in np.linspace(end - 1.1, end - 0.01, 9)]
+    assert min(widths) == pytest.approx(d.bought.eye_pupil_mm, abs=0.02)
+
+
+def hole_mm(body: Manifold, z: float) -> float:
+    """Width of the hole in the middle of a slice, from its corners."""
+    middle = min(body.slice(z).to_polygons(), key=lambda corners: np.abs(corners).max())
+    return 2 * float(np.hypot(*middle.T).max())
+
+
+# One file is the truth: what it says, the parts do
+
+
+def test_another_distance_is_another_spacer(d: Dimensions, changed: Change) -> None:
+
+    other = changed("diffuser_to_sensor_um = 6000", "diffuser_to_sensor_um = 5000")
+    parts = {name: solid(part) for name, part in assembly.head(other).items()}
+    assert in_air_mm(other, parts) == pytest.approx(5.0, abs=1e-4)
+    assert other.board_z_mm == pytest.approx(d.board_z_mm - 1)
+
+
+def test_another_iris_is_another_hole(changed: Change) -> None:
+    other = changed("iris_um = 3200", "iris_um = 1600")
+    assert hole_mm(solid(iris(other)), -0.1) == pytest.approx(1.6, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes"),
+    [
+        ("ring_mm = 10.04", "ring_mm = 13.47"),
+        ("ring_mm = 10.04", "axis = [3, 3]\nleds = [18, 19, 20, 26, 28, 34, 35, 36]"),
+        ("field_deg = 33.4", "field_deg = 45"),
+    ],
+)
+def test_another_ring_or_field_is_another_cap(changed: Change, was: str, becomes: str) -> None:
+
+    other = changed(was, becomes)
+    half_deg = relay_of(other.path, other.path.optics).led_cone_deg(other.path.optics.field_deg) / 2
+    inside, outside = seen_through(other, solid(led_cap(other)), half_deg)
+    assert {i for i, part in enumerate(inside) if part == 1} == set(ring(other.path.ring))
+    assert max(outside) == 0
+    length = other.led_y_mm - other.cap_end_y_mm
+    assert other.led_hole_mm / 2 / length == pytest.approx(tan(radians(half_deg)))

@@ -1,0 +1,82 @@
+"""What the assembly guide shows and says of the printed parts is what they are."""
+
+import csv
+import re
+from dataclasses import replace
+from math import cos, radians, sin, tan
+
+import pytest
+
+from device.optics.light_path import relay_of
+from hardware.parts.dimensions import Dimensions
+from hardware.parts.pictures import PICTURES
+from hardware.parts.printed import camera_cover, led_cover, plate_lid, retaining_ring, tube_flange
+from tests.house import ROOT, text
+
+pytestmark = pytest.mark.parts
+
+
+@pytest.mark.parametrize("name", list(PICTURES))
+def test_a_picture_is_todays(d: Dimensions, name: str) -> None:
+    """`make part-pictures` makes it what it should be."""
+    assert PICTURES[name](d) == (ROOT / "hardware" / "pictures" / f"parts-{name}.svg").read_text(encoding="utf-8")
+
+
+def test_another_light_path_is_another_picture(d: Dimensions) -> None:
+    optics = d.path.optics.model_copy(update={"diffuser_to_sensor_um": 9000})
+    other = replace(d, path=d.path.model_copy(update={"optics": optics}))
+    assert PICTURES["section"](d) != (drawn := PICTURES["section"](other))
+    assert "9 mm in air" in drawn
+
+
+def lit(d: Dimensions, azimuth_deg: float) -> int:
+    """How many LEDs of the ring reach the tilted plate with light of the field's edge, seen from the plate's middle."""
+    edge = radians(relay_of(d.path, d.path.optics).led_cone_deg(d.path.optics.field_deg) / 2)
+    slope_x, slope_z = (tan(edge) * part(radians(azimuth_deg)) for part in (cos, sin))
+    count = 0
+    for x, z in d.ring_places_mm:
+        off, long = z - d.plate_z_mm, d.path.relay.splitter_to_iris_mm
+        end = (long - off) / (1 + slope_z)
+        along = off + slope_z * end
+        count += (x + slope_x * end) ** 2 + 2 * along**2 <= (d.path.relay.splitter_mm / 2) ** 2
+    return count
+
+
+def test_the_guide_says_the_figures_of_the_models(d: Dimensions) -> None:
+    leds = [lit(d, azimuth) for azimuth in range(0, 360, 15)]
+    spacer, glass = d.board_z_mm - d.cell_rear_z_mm, d.image_z_mm - d.path.optics.diffuser_to_sensor_um / 1000
+    figures = [
+        f"**sensor spacer**, {spacer:.2f} mm thick", f"glass in between takes {glass:.2f} mm",
+        f"than {-tube_flange.tube_z_mm(d)[1]:g} mm. Its axis is {d.lens_y_mm:.2f} mm above",
+        f"holes is {d.led_hole_mm:.2f} mm wide and {d.led_y_mm - d.cap_end_y_mm:.2f} mm long",
+        f"edge of the field {sum(leds) / len(leds) / 8:.2f} of it",
+        f"film**, {d.bought.film_mm:g} mm,",
+        f"the diffuser ({d.bought.diffuser_mm:g} mm, {d.bought.diffuser_thick_mm:g} mm",
+        f"the plate ({d.bought.plate_thick_mm:g} mm", f"over its board ({d.bought.image_above_board_mm:g} mm)",
+    ]  # fmt: skip
+    said = " ".join(text("hardware/assembly.md").split())
+    assert [figure for figure in figures if figure not in said] == []
+    assert (min(leds), max(leds)) == (4, 8)
+    assert "four LEDs of eight" in said
+    wide = replace(d, path=d.path.model_copy(update={"relay": d.path.relay.model_copy(update={"splitter_mm": 50.8})}))
+    assert min(lit(wide, azimuth) for azimuth in range(0, 360, 15)) == 8
+
+
+def test_the_screws_on_the_bill_hold_and_do_not_stand_up(d: Dimensions) -> None:
+    """Each is longer than what it joins by at least its own width, and by less than its thread is deep."""
+    back = d.led_y_mm + d.bought.led_high_mm + d.bought.led_board_thick_mm
+    board = d.board_z_mm + d.bought.board_thick_mm
+    joins = {  # by what the guide calls them: what they join, how deep the thread is
+        "M2.5 x 20": (board + camera_cover.ROOM_MM + d.fit.wall_mm - d.cell_rear_z_mm, d.fit.insert_deep_mm),
+        "M3 x 16": (d.cell_rear_z_mm - d.cell_front_z_mm, d.fit.insert_deep_mm),
+        "M3 x 20": (back + led_cover.ROOM_MM + led_cover.ROOF_MM - d.cap_front_y_mm, d.fit.insert_deep_mm),
+        "M3 x 8": (tube_flange.PLATE_MM, d.fit.insert_deep_mm),
+        "M2 x 8": (plate_lid.THICK_MM, 6.0),
+        "M2 x 6": (retaining_ring.FLANGE_MM, 5.0),
+    }
+    with (ROOT / "hardware" / "parts.csv").open(encoding="utf-8", newline="") as lines:
+        bill = next(row["what_for"] for row in csv.DictReader(lines) if row["part"] == "screws")
+    for screw, (joined_mm, thread_mm) in joins.items():
+        wide_mm, long_mm = map(float, re.findall(r"[\d.]+", screw))
+        assert screw in bill
+        assert wide_mm <= long_mm - joined_mm + 0.3 <= thread_mm + 0.3, screw
