@@ -77,10 +77,12 @@ bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-ve
 		|| { rm -rf .bench-venv; echo "LenslessPiCam could not be installed (is there a network?): make bench leaves it out"; }
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready ## Write requirements.lock anew.
+lock: .venv/ready ## Write requirements.lock anew, and the part of it that a release needs.
 	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra test --group lock pyproject.toml -o requirements.lock
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+		--constraints requirements.lock pyproject.toml -o systemd/image/requirements.lock
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
 	@rm -rf .venv .bench-venv .other-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info

@@ -99,6 +99,20 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
 
 
+@app.command()
+def health(
+    at: Annotated[str, typer.Option(help="Address of the running instrument.")] = "http://127.0.0.1:8000",
+    look: Annotated[bool, typer.Option("--look", help="Also take a live picture, which shines for a moment.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list for a program.")] = False,
+) -> None:
+    """Ask the running instrument whether it could take a picture now; the exit status is 1 if a check fails."""
+    from services.health import probe
+
+    checks = probe.examine(at, look)
+    typer.echo(json.dumps(probe.as_json(checks), indent=1) if as_json else probe.table(checks))
+    raise typer.Exit(0 if all(check.ok for check in checks) else 1)
+
+
 @app.command("probe")
 def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")]) -> None:
     """Ask every part of a head whether it is there: camera, lamp and each of its LEDs, chips.

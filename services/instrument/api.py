@@ -46,7 +46,10 @@ from device.errors import (
 )  # fmt: skip
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
+from services.health.checks import judged
+from services.health.probe import as_json
 from services.instrument.exam import Exam
+from services.instrument.wellbeing import facts
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
@@ -248,8 +251,13 @@ def _state(app: FastAPI, exam: Exam) -> None:
 
     @app.get("/api/health")
     def health() -> dict[str, Any]:
-        """Whether it can take pictures now."""
-        return {"ok": exam.problem is None, "state": exam.state, "space_left": exam.store.space_left()}
+        """Whether it can take pictures now: every check with its value, its limit and what to do."""
+        known = facts(exam)
+        checks = judged(known)
+        return {
+            "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,
+            "checks": as_json(checks),
+        }  # fmt: skip
 
 
 def _live(app: FastAPI, exam: Exam) -> None:
