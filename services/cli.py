@@ -17,11 +17,14 @@ from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
 from services.instrument.once import Order, reconstruct_file, written
+from services.update.command import app as update_app
 
 app = typer.Typer(
     name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
     add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
+
+app.add_typer(update_app, name="update")
 
 SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
 

@@ -256,7 +256,7 @@ def _state(app: FastAPI, exam: Exam) -> None:
         checks = judged(known)
         return {
             "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,
-            "checks": as_json(checks),
+            "battery": known.battery if isinstance(known.battery, float) else None, "checks": as_json(checks),
         }  # fmt: skip
 
 

@@ -67,7 +67,7 @@ class BootChooser:
         elif slot == self.booted():
             self._commit(slot)
         else:
-            _write(self.reboot_word, TRY)
+            write_whole(self.reboot_word, TRY)
 
     def is_good(self, slot: str) -> bool:
         """False for a slot whose install was begun and not finished, or that was tried and did not do."""
@@ -83,7 +83,7 @@ class BootChooser:
         """RAUC's first step of an install; ValueError for the committed slot, which nobody may overwrite."""
         if slot == self.committed():
             raise ValueError(f"slot {slot} is the committed one: every boot that is not a try needs it")
-        _write(self._bad(slot), "")
+        write_whole(self._bad(slot), "")
 
     def _bad(self, slot: str) -> Path:
         return self.state / f"slot-{slot.lower()}-is-bad"
@@ -91,7 +91,7 @@ class BootChooser:
     def _commit(self, slot: str) -> None:
         now, next_try = PARTITIONS[slot], PARTITIONS[other(slot)]
         choice = f"[all]\ntryboot_a_b=1\nboot_partition={now}\n[tryboot]\nboot_partition={next_try}\n"
-        _write(self.autoboot, choice)
+        write_whole(self.autoboot, choice)
 
 
 def other(slot: str) -> str:
@@ -99,7 +99,7 @@ def other(slot: str) -> str:
     return "B" if slot == "A" else "A"
 
 
-def _write(path: Path, content: str) -> None:
+def write_whole(path: Path, content: str) -> None:
     """The file is the old one or the new one, also after a power cut."""
     part = path.with_name(f"{path.name}.part")
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
