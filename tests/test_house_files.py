@@ -260,7 +260,7 @@ def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update"])
 def test_what_updates_is_locked_in_and_called_with_words_that_exist(name: str) -> None:
-    """It runs as root, who owns RAUC: so without capabilities, and with a disk that is read-only but for its journal."""
+    """It runs as root, who owns RAUC: so without capabilities, and on a disk that is read-only but for its journal."""
     service = unit_of(f"systemd/{name}.service")["Service"]
     assert not unknown_words(service["ExecStart"].removeprefix("/opt/diffuscope/.venv/bin/"))
     assert not [key for key in HARDENING if service.get(key) != "yes"]

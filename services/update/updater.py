@@ -33,6 +33,7 @@ class Updater:
         self._chooser = chooser or BootChooser(state=settings.folder)
         self._rauc, self._journal = Rauc(settings.rauc), Journal(settings.folder)
         self.runs = runs or version("diffuscope")
+        self._told = (-1, "")
 
     def check(self, download: bool = False) -> channel.Offer | None:
         """What the channel offers that is newer than what runs, None if nothing; `download` fetches it already."""
@@ -128,9 +129,12 @@ class Updater:
         return web, channel.opened(web.small(channel.NAME), self._settings.keyring)
 
     def _progress(self, share: float, what: str) -> None:
-        if share >= self._journal.read().share + 0.01 or share == 0:
+        """Said and written down at every twentieth, and whenever something else begins."""
+        step = int(share * 20), what
+        if step != self._told:
+            self._told = step
             self._journal.write(share=share)
-        self._tell(f"{share:>4.0%}  {what}")
+            self._tell(f"{share:>4.0%}  {what}")
 
     def _quietly(self, share: float, what: str) -> None:
         log.info("%s %.0f %%", what, 100 * share)
