@@ -53,8 +53,8 @@ class Updater:
         Every refusal is an UpdateError of its own; the slot that runs, and the data, are never written.
         """
         settings = self._settings
+        gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
-            gate.refuse_while_trying(self._chooser)
             ill = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, said="", ill=ill)
             bundle = self._fetched(place)
@@ -107,7 +107,8 @@ class Updater:
         return entry, in_words(entry, self.runs, self._chooser.is_trying(), gate.is_under_way(self._settings.folder))
 
     def _wrong(self, forgiven: set[str]) -> list[Check]:
-        checks = probe.examine(self._settings.instrument, look="camera" not in forgiven)
+        settings = self._settings
+        checks = probe.examine(settings.instrument, look="camera" not in forgiven, patience_s=settings.answer_s)
         return [check for check in checks if check.of_release and not check.ok and check.name not in forgiven]
 
     def _fetched(self, place: Path | None) -> Path:

@@ -99,7 +99,8 @@ class Device:
         end = time.monotonic() + patience_s
         while machine.is_there("/"):
             failed = machine.run("systemctl", "show", "-p", "Result", "technician.service", check=False).strip()
-            assert time.monotonic() < end and failed in ("Result=success", ""), f"{failed}{machine.journal()}"
+            assert failed in ("Result=success", ""), f"{failed}{machine.journal()}"
+            assert time.monotonic() < end, f"it did not restart{machine.journal()}"
             time.sleep(0.1)
 
     def captures(self) -> dict[str, str]:

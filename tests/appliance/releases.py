@@ -39,7 +39,14 @@ class Workshop:
         run("unsquashfs", "-q", "-n", "-d", folder, bundle, "rootfs.img")
         return folder / "rootfs.img"
 
-    def small(self, name: str, version: str, compatible: str = "diffuscope-pi5", keys: Path | None = None) -> Path:
+    def small(
+        self,
+        name: str,
+        version: str,
+        compatible: str = "diffuscope-pi5",
+        keys: Path | None = None,
+        minimum: str = "0.9",
+    ) -> Path:
         """A bundle whose slot is a small filesystem with a number and noise: quick to write, and to check."""
         keys, folder, out = keys or self.keys, self.folder / f"{name}-parts", self.folder / f"{name}.raucb"
         (folder / "tree").mkdir(parents=True)
@@ -48,7 +55,7 @@ class Workshop:
         run("mksquashfs", folder / "tree", folder / "rootfs.img", "-quiet", "-no-progress", "-comp", "lz4")
         subprocess.run(["rm", "-r", str(folder / "tree")], check=True)
         (folder / "manifest.raucm").write_text(
-            f"[update]\ncompatible={compatible}\nversion={version}\ndescription=updates from 0.9 or newer\n\n"
+            f"[update]\ncompatible={compatible}\nversion={version}\ndescription=updates from {minimum} or newer\n\n"
             "[bundle]\nformat=plain\n\n[image.rootfs]\nfilename=rootfs.img\n"
         )
         signer = ("--cert", keys / "signer.crt", "--key", keys / "signer.key", "--keyring", keys / "ca.crt")
