@@ -67,7 +67,7 @@ class Bench:
         """RAUC's service, in the slot that the firmware booted."""
         words = [*self.rauc(*before), "service", f"--override-boot-slot={self.chooser.booted()}"]
         with (self.here / "service.log").open("ab") as log:
-            service = subprocess.Popen(words, stdout=log, stderr=log)
+            service = subprocess.Popen(words, stdout=log, stderr=log, start_new_session=True)
         try:
             end = time.monotonic() + 10
             while subprocess.run([*self.rauc(), "status"], capture_output=True).returncode:
@@ -131,13 +131,10 @@ def opened(here: Path, workshop: Workshop) -> Iterator[Bench]:
 
 
 def clear(bench: Bench) -> None:
-    """Clear what a killed RAUC leaves behind, as a restart of the computer would: its mount and the loop under it."""
+    """Clear what a killed RAUC leaves behind, as a restart of the computer would: its mount, and with it its loop."""
     for mounted in sorted((bench.here / "mnt").glob("*"), reverse=True):
         if os.path.ismount(mounted):
-            source = run("findmnt", "-n", "-o", "SOURCE", mounted).strip()
-            subprocess.run(["umount", "-l", str(mounted)], check=False)
-            if source.startswith("/dev/loop"):
-                subprocess.run(["losetup", "-d", source], check=False)
+            run("umount", "-l", mounted)
 
 
 def _conf(bench: Bench) -> str:

@@ -5,12 +5,14 @@ and boots the chosen slot's own image in a container, in which RAUC finds the de
 """
 
 import os
+import stat
 import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from signal import SIGKILL
 
 from tests.systemd.machine import CACHE, Machine, leader
 
@@ -65,7 +67,7 @@ class Device:
 
     @contextmanager
     def _running(self, root: Path, more: tuple[str, ...]) -> Iterator[Machine]:
-        loops = [f"--bind={path}" for path in sorted(Path("/dev").glob("loop[0-9]*"))]
+        loops = [f"--bind={path}" for path in _loop_devices()]
         words = [
             "systemd-nspawn", "--quiet", "-D", str(root), "--boot", "--register=no", "--keep-unit", "--private-network",
             "--volatile=overlay", "--console=pipe", "--machine=diffuscope-device", "--bind=/dev/loop-control", *loops,
@@ -76,7 +78,7 @@ class Device:
         log = self.folder / "console"
         with log.open("wb") as console:
             nspawn = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=console, stderr=console)
-        word = -1
+        word = pid = -1
         try:
             pid = leader(nspawn, log)
             machine = Machine(pid)
@@ -88,7 +90,8 @@ class Device:
                 machine.run("systemctl", "poweroff", "--force", check=False)
             nspawn.wait(60)
         finally:
-            nspawn.kill() if nspawn.poll() is None else None
+            if nspawn.poll() is None:
+                os.kill(pid if pid > 0 else nspawn.pid, SIGKILL)  # the first process inside: all others end with it
             nspawn.wait(20)
             if word >= 0:
                 self.tried = nspawn.returncode == 133 and "tryboot" in _read_at(word, "reboot-param")
@@ -109,6 +112,15 @@ class Device:
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
         sums = run("sha256sum", *paths).splitlines() if paths else []
         return {line.split(maxsplit=1)[1].removeprefix(str(folder)): line.split()[0] for line in sums}
+
+
+def _loop_devices() -> list[Path]:
+    """More than are in use: RAUC takes a free one for the bundle, and a container sees none that comes later."""
+    nodes = [Path(f"/dev/loop{number}") for number in range(64)]
+    for number, node in enumerate(nodes):
+        if not node.exists():
+            os.mknod(node, stat.S_IFBLK | 0o660, os.makedev(7, number))
+    return nodes
 
 
 def _read_at(folder: int, name: str) -> str:
