@@ -84,7 +84,7 @@ class Device:
             machine = Machine(pid)
             machine.until(lambda: machine.is_there("/run/systemd/private"))
             machine.run("mount", "--bind", "/run/cmdline", "/proc/cmdline")
-            word = os.open(f"/proc/{pid}/root/run/systemd", os.O_RDONLY | os.O_DIRECTORY)
+            word = os.open(Path("/proc") / str(pid) / "root" / "run" / "systemd", os.O_RDONLY | os.O_DIRECTORY)
             yield machine
             if nspawn.poll() is None:
                 machine.run("systemctl", "poweroff", "--force", check=False)
