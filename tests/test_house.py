@@ -257,7 +257,10 @@ def test_nothing_of_the_workshop_is_left_in_the_house() -> None:
     readable = [name for name in files() if Path(name).suffix not in (".png", ".jpg", ".npy", ".tiff", ".gz")]
     judge(leftovers, readable, {}, "clear it away")
     judge(workplace_words, [name for name in readable if not name.endswith(".py")], {}, "clear it away")
-    own = {"tests/test_house.py: session": "this file names what it looks for"}
+    own = {
+        "tests/test_house.py: session": "this file names what it looks for",
+        "tests/appliance/bench.py: session": "what D-Bus calls a bus that is not the whole computer's",
+    }
     judge(workplace_words_in_prose, python(""), own, "clear it away")
 
 

@@ -69,11 +69,12 @@ class Device:
     def _running(self, root: Path, more: tuple[str, ...]) -> Iterator[Machine]:
         loops = [f"--bind={path}" for path in _loop_devices()]
         words = [
-            "systemd-nspawn", "--quiet", "-D", str(root), "--boot", "--register=no", "--keep-unit", "--private-network",
+            "systemd-nspawn", "--quiet", "-D", str(root), "--register=no", "--keep-unit", "--private-network",
             "--volatile=overlay", "--console=pipe", "--machine=diffuscope-device", "--bind=/dev/loop-control", *loops,
             *(f"--bind={self.loops[slot]}:/dev/disk/by-partlabel/{name}" for slot, name in NAMES.items()),
             f"--bind={self.data}:/data", f"--bind={self.chooser}:/boot/chooser",
             f"--bind={self.folder / 'media'}:/media", f"--bind-ro={self.folder / 'cmdline'}:/run/cmdline", *more,
+            "/bin/sh", "-c", "mount --bind /run/cmdline /proc/cmdline && exec /lib/systemd/systemd",
         ]  # fmt: skip
         log = self.folder / "console"
         with log.open("wb") as console:
@@ -83,7 +84,6 @@ class Device:
             pid = leader(nspawn, log)
             machine = Machine(pid)
             machine.until(lambda: machine.is_there("/run/systemd/private"))
-            machine.run("mount", "--bind", "/run/cmdline", "/proc/cmdline")
             word = os.open(Path("/proc") / str(pid) / "root" / "run" / "systemd", os.O_RDONLY | os.O_DIRECTORY)
             yield machine
             if nspawn.poll() is None:
