@@ -1,5 +1,7 @@
 """Everything that a device refuses, with real RAUC: each a named error with its words, and nothing changed."""
 
+import hashlib
+import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +21,7 @@ from device.errors import (
     UpdateSourceGone,
     UpdateTooFar,
     UpdateUncommitted,
+    UpdateUnreachable,
     UpdateWrongDevice,
 )  # fmt: skip
 from services.records.store import RESERVE_BYTES
@@ -29,6 +32,7 @@ from tests.appliance import releases
 from tests.appliance.bench import Bench
 from tests.appliance.device import run
 from tests.appliance.releases import Workshop
+from tests.site import identity, served, signed
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(120)]
 
@@ -176,6 +180,28 @@ def test_a_version_that_is_being_tried_cannot_be_updated(bench: Bench, shelf: Sh
         with pytest.raises(UpdateFailed):  # nor by asking RAUC itself
             Rauc(bench.rauc()).install(third, lambda share, what: None)
     assert bench.version("A") == "1.0"
+
+
+def test_a_channel_is_followed_over_a_link_that_is_lost(bench: Bench, shelf: Shelf, tmp_path: Path) -> None:
+    """Asked by the timer, fetched in two halves, installed by a person."""
+    content = shelf.newer.read_bytes()
+    offer = {
+        "compatible": "diffuscope-pi5", "version": "2.0", "bundle": shelf.newer.name, "bytes": len(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }  # fmt: skip
+    certificate, key = identity(tmp_path)
+    with served(certificate, key) as site, bench.service():
+        site.files = {"channel.cms": signed(shelf.workshop.keys, json.dumps(offer).encode()), shelf.newer.name: content}
+        site.cuts = [10_000_000, 7_000_000]  # the channel itself is shorter
+        updater = bench.updater(channel=site.at, authority=certificate)
+        found = updater.check(download=True)
+        assert (found and found.version, site.asked) == ("2.0", ["all", "all", "bytes=7000000-"])
+        assert "Version 2.0 is offered" in updater.status()[1]
+        updater.install(None)
+        assert bench.updater("2.0", channel=site.at, authority=certificate).check() is None
+    assert bench.version("B") == "2.0"
+    with pytest.raises(UpdateUnreachable):
+        bench.updater(channel=site.at, authority=certificate).check()
 
 
 @pytest.mark.parametrize("date", ["2020-01-01", "2035-01-01"])

@@ -2,13 +2,9 @@
 
 import hashlib
 import json
-import ssl
 import subprocess
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
@@ -20,60 +16,21 @@ from services.update.gate import number, refuse_wrong
 from services.update.settings import UpdateSettings, load
 from services.update.sources import WAITS_S, Web, on_stick
 from tests.house import ROOT
-
-
-@dataclass
-class Site:
-    """A folder on a web server; `cuts` are the bytes after which it hangs up, one for each request to come."""
-
-    at: str
-    files: dict[str, bytes]
-    cuts: list[int] = field(default_factory=list)
-    asked: list[str] = field(default_factory=list)
-    knows_ranges: bool = True
+from tests.site import Site, identity, served, signed
 
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("keys")
     subprocess.run([ROOT / "systemd" / "image" / "keys", folder], check=True)
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", folder / "web.key", "-out",
-         folder / "web.crt", "-days", "30", "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost"],
-        check=True, capture_output=True,
-    )  # fmt: skip
+    identity(folder)
     return folder
 
 
 @pytest.fixture
 def site(keys: Path) -> Iterator[Site]:
-    known = Site("", {})
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            content = known.files.get(self.path.lstrip("/"))
-            known.asked.append(self.headers.get("Range", "all"))
-            if content is None:
-                self.send_error(404)
-                return
-            begin = int(known.asked[-1][6:-1]) if known.knows_ranges and known.asked[-1] != "all" else 0
-            self.send_response(206 if begin else 200)
-            self.send_header("Content-Length", str(len(content) - begin))
-            self.end_headers()
-            self.wfile.write(content[begin:][: known.cuts.pop(0) if known.cuts else None])
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(keys / "web.crt", keys / "web.key")
-    server.socket = context.wrap_socket(server.socket, server_side=True)
-    known.at = f"https://localhost:{server.server_port}"
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield known
-    server.shutdown()
-    server.server_close()
+    with served(keys / "web.crt", keys / "web.key") as site:
+        yield site
 
 
 def offer(content: bytes, version: str = "2.0") -> Offer:
@@ -139,12 +96,6 @@ def test_a_server_that_nobody_vouches_for_hints_at_the_clock(site: Site, tmp_pat
 def test_a_file_that_is_not_there_is_said_with_its_address(site: Site, keys: Path) -> None:
     with pytest.raises(UpdateUnreachable, match=r"channel\.cms: 404"):
         Web(site.at, keys / "web.crt", VirtualClock()).small("channel.cms")
-
-
-def signed(keys: Path, content: bytes) -> bytes:
-    words = ["openssl", "cms", "-sign", "-nodetach", "-binary", "-outform", "DER"]
-    signer = ["-signer", str(keys / "signer.crt"), "-inkey", str(keys / "signer.key")]
-    return subprocess.run([*words, *signer], input=content, check=True, capture_output=True).stdout
 
 
 def test_a_channel_is_believed_if_our_signer_signed_it(keys: Path, tmp_path: Path) -> None:
