@@ -13,6 +13,7 @@ from device.errors import (
     UpdateBusy,
     UpdateDamaged,
     UpdateDuringExam,
+    UpdateFailed,
     UpdateOlder,
     UpdatePowerLow,
     UpdateTooFar,
@@ -29,7 +30,13 @@ Version = tuple[int, ...]
 @contextmanager
 def alone(folder: Path) -> Iterator[None]:
     """One update at a time; UpdateBusy for the second. A killed one gives its place up."""
-    with (folder / ".lock").open("ab") as file:
+    try:
+        lock = (folder / ".lock").open("ab")
+    except OSError as error:
+        raise UpdateFailed(
+            f"{folder} cannot be written: {error.strerror}", "Call it as root, on the device."
+        ) from error
+    with lock as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -46,9 +53,18 @@ def is_under_way(folder: Path) -> bool:
         return True
 
 
+def is_trying(chooser: BootChooser) -> bool:
+    """Whether the version that runs has yet to be committed; UpdateWrongDevice on a computer that has no slots."""
+    try:
+        return chooser.is_trying()
+    except (OSError, ValueError) as error:
+        remedy = "Updates are for the device. On another computer, put the new version in as its README says."
+        raise UpdateWrongDevice(f"this computer has no slots: {error}", remedy) from error
+
+
 def refuse_while_trying(chooser: BootChooser) -> None:
     """UpdateUncommitted unless the committed slot runs: RAUC would write over the only slot that is known to work."""
-    if chooser.is_trying():
+    if is_trying(chooser):
         raise UpdateUncommitted(f"slot {chooser.booted()} runs and slot {chooser.committed()} is the committed one")
 
 

@@ -85,7 +85,7 @@ class Updater:
 
         systemd answers that failure with a restart, and the firmware with the version before.
         """
-        if not self._chooser.is_trying():
+        if not gate.is_trying(self._chooser):
             self._tell(f"Version {self.runs} is committed already.")
             return
         forgiven = set(FORGIVEN) & set(self._journal.write(version=self.runs, state="trying").ill)
@@ -104,7 +104,9 @@ class Updater:
     def status(self) -> tuple[Entry, str]:
         """How far the last update is, and that in words."""
         entry = self._journal.read()
-        return entry, in_words(entry, self.runs, self._chooser.is_trying(), gate.is_under_way(self._settings.folder))
+        return entry, in_words(
+            entry, self.runs, gate.is_trying(self._chooser), gate.is_under_way(self._settings.folder)
+        )
 
     def _wrong(self, forgiven: set[str]) -> list[Check]:
         settings = self._settings

@@ -21,6 +21,15 @@ NAMES = {"A": "root-a", "B": "root-b"}
 SLOT_MB, DATA_MB = 500, 1600
 FOLDERS = ("captures", "compiled", "update", "journal")
 
+# The kernel's words are the host's: ours are laid over them, and once more in the unit that has a /proc of its own.
+FIRST = """\
+mount --bind /run/cmdline /proc/cmdline
+place=/run/systemd/system/diffuscope-settle.service.d
+mkdir -p $place
+printf '[Service]\\nBindReadOnlyPaths=/run/cmdline:/proc/cmdline\\n' >$place/slot.conf
+exec /lib/systemd/systemd
+"""
+
 
 def run(*words: object, **options: object) -> str:
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, **options)  # type: ignore[call-overload]
@@ -74,7 +83,7 @@ class Device:
             *(f"--bind={self.loops[slot]}:/dev/disk/by-partlabel/{name}" for slot, name in NAMES.items()),
             f"--bind={self.data}:/data", f"--bind={self.chooser}:/boot/chooser",
             f"--bind={self.folder / 'media'}:/media", f"--bind-ro={self.folder / 'cmdline'}:/run/cmdline", *more,
-            "/bin/sh", "-c", "mount --bind /run/cmdline /proc/cmdline && exec /lib/systemd/systemd",
+            "/bin/sh", "-c", FIRST,
         ]  # fmt: skip
         log = self.folder / "console"
         with log.open("wb") as console:

@@ -14,7 +14,7 @@ from threading import Event, Thread
 import pytest
 
 from device.clock import SystemClock
-from device.errors import UpdateAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow
+from device.errors import UpdateAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow, UpdateWrongDevice
 from services.health.checks import Check
 from services.health.probe import as_json
 from services.update.updater import Updater
@@ -153,6 +153,14 @@ def test_a_boot_that_never_came_to_an_end_is_told_as_such(bench: Bench, page: Pa
     with bench.service():
         updater(bench, page, "1.0").restart()  # and it can be tried once more
     assert bench.boot() == "B"
+
+
+def test_a_computer_without_slots_is_told_so(bench: Bench, page: Page) -> None:
+    (bench.here / "cmdline").write_text("console=tty1 quiet\n")
+    device = updater(bench, page, "1.0")
+    for ask in (device.status, device.settle, device.restart):
+        with pytest.raises(UpdateWrongDevice, match="no slots"):
+            ask()
 
 
 def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) -> Page:
