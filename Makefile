@@ -5,7 +5,8 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-systemd test-other browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-systemd test-appliance test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers \
+	parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
@@ -34,6 +35,20 @@ test-systemd: .venv/ready ## Boot a real systemd in a container and try the unit
 	@tests/systemd/install
 	@$(BIN)/python -m pytest tests/systemd -rP
 	@$(BIN)/python -m pytest tests/test_house_files.py -k "systemd_has_nothing_to_say or exposed_as_little"
+
+# verity needs device-mapper where it is installed; FORMAT=plain is for trying out, on devices that were built with it.
+FORMAT ?= verity
+KEYS ?= out/keys
+
+bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORMAT=plain, ARCH=arm64.
+	@systemd/image/install
+	@[ -e "$(KEYS)/signer.key" ] || { echo "No keys in $(KEYS): making test keys there"; systemd/image/keys "$(KEYS)"; }
+	@systemd/image/bundle --keys "$(KEYS)" --format $(FORMAT) $(if $(ARCH),--arch $(ARCH)) \
+		-o out/diffuscope$(if $(ARCH),-$(ARCH)).raucb
+
+test-appliance: .venv/ready ## Update a device from version to version, with real RAUC and a real systemd; needs root.
+	@systemd/image/install
+	@$(BIN)/python -m pytest tests/appliance -rP
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install
@@ -99,10 +114,12 @@ test-parts: .parts-venv/ready ## Measure the printed parts: closed, thick enough
 	@.parts-venv/bin/python -m pytest tests/parts
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready ## Write requirements.lock anew, and that of the printed parts.
+lock: .venv/ready ## Write requirements.lock anew, the part of it that a release needs, and that of the printed parts.
 	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra test --group lock pyproject.toml -o requirements.lock
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+		--constraints requirements.lock pyproject.toml -o systemd/image/requirements.lock
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		hardware/parts/requirements.in -o $(PARTS_LOCK)
 

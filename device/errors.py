@@ -38,12 +38,28 @@ DiffuscopeError
 │   ├── Forged                   the request comes from a page that is not ours
 │   ├── WrongHost                the instrument was asked by a name that is not its own
 │   └── VisitFinished            the visit is finished
-└── StoreError                   the shelf
-    ├── StoreFull                no room left
-    ├── StoreDamaged             a kept file is not what was kept
-    ├── StickFull                the USB stick has no room
-    ├── StickGone                the USB stick is not there, or cannot be written
-    └── NotKept (LookupError)    no such capture
+├── StoreError                   the shelf
+│   ├── StoreFull                no room left
+│   ├── StoreDamaged             a kept file is not what was kept
+│   ├── StickFull                the USB stick has no room
+│   ├── StickGone                the USB stick is not there, or cannot be written
+│   └── NotKept (LookupError)    no such capture
+└── UpdateError                  another version is not installed
+    ├── UpdateBusy               one is under way
+    ├── UpdateUncommitted        the version that runs is itself being tried
+    ├── UpdateDuringExam         a picture is being taken
+    ├── UpdatePowerLow           the battery is less than half full
+    ├── UpdateAtRisk             captures cannot be read or written
+    ├── UpdateNowhere            no update was found where one was looked for
+    ├── UpdateUnreachable        the server that has it does not answer, or stopped
+    ├── UpdateSourceGone         the stick was pulled out
+    ├── UpdateForeign            nobody we trust has signed it
+    ├── UpdateDamaged            it is not whole
+    ├── UpdateWrongDevice        it is for another device
+    ├── UpdateOlder              it is not newer than what runs
+    ├── UpdateTooFar             it needs a version in between
+    ├── UpdateNoRoom             it does not fit
+    └── UpdateFailed             it could not be written, or did not do when it was tried
 """
 
 from typing import ClassVar
@@ -364,3 +380,121 @@ class NotKept(StoreError, LookupError):
 
     code = "store.unknown"
     default_remedy = "Choose a picture from the list."
+
+
+class UpdateError(DiffuscopeError):
+    """Another version cannot be installed; the one that runs stays."""
+
+    code = "update"
+
+
+class UpdateBusy(UpdateError):
+    """Another update is under way."""
+
+    code = "update.busy"
+    default_remedy = (
+        "An update is under way already. Wait until it is done; `diffuscope update status` says how far it is."
+    )
+
+
+class UpdateUncommitted(UpdateError):
+    """The version that runs is being tried and is not committed yet."""
+
+    code = "update.uncommitted"
+    default_remedy = (
+        "The version before this one must stay until this one has shown that it works. Wait some minutes, "
+        "then try again."
+    )
+
+
+class UpdateDuringExam(UpdateError):
+    """A picture is being taken."""
+
+    code = "update.exam"
+    default_remedy = "Finish the examination first, then start the update again."
+
+
+class UpdatePowerLow(UpdateError):
+    """The battery is less than half full."""
+
+    code = "update.power"
+    default_remedy = "Connect the charger, and start the update again when the battery is half full."
+
+
+class UpdateAtRisk(UpdateError):
+    """The captures on this device cannot be read or written as they should."""
+
+    code = "update.captures"
+    default_remedy = "Copy the pictures to a USB stick first, and call the technician."
+
+
+class UpdateNowhere(UpdateError):
+    """There is no update where it was looked for."""
+
+    code = "update.nowhere"
+    default_remedy = "Put in the USB stick that holds the update, a file whose name ends in .raucb."
+
+
+class UpdateUnreachable(UpdateError):
+    """The server that has the update does not answer, or stopped answering."""
+
+    code = "update.link"
+    default_remedy = "The connection was lost. What has arrived is kept: try again later, and it goes on from there."
+
+
+class UpdateSourceGone(UpdateError):
+    """What the update was read from is gone."""
+
+    code = "update.stick"
+    default_remedy = "Put the USB stick back in and leave it there until the update is done. Nothing has changed yet."
+
+
+class UpdateForeign(UpdateError):
+    """The update is not signed by anybody whom this device trusts."""
+
+    code = "update.foreign"
+    default_remedy = "Do not use this file. Get the update from the maker of the device."
+
+
+class UpdateDamaged(UpdateError):
+    """The update is not whole, or was changed on its way."""
+
+    code = "update.damaged"
+    default_remedy = "This file is damaged. Copy it to the stick again, or download it again."
+
+
+class UpdateWrongDevice(UpdateError):
+    """The update is for another kind of device."""
+
+    code = "update.device"
+    default_remedy = "Get the update for this device: the file's name says which one it is for."
+
+
+class UpdateOlder(UpdateError):
+    """The update is not newer than the version that runs."""
+
+    code = "update.older"
+    default_remedy = "Nothing needs to be done: this device has that version or a newer one."
+
+
+class UpdateTooFar(UpdateError):
+    """The update cannot be installed on a version as old as the one that runs."""
+
+    code = "update.step"
+    default_remedy = "Install the version in between first; the message names it."
+
+
+class UpdateNoRoom(UpdateError):
+    """There is no room for the update."""
+
+    code = "update.room"
+    default_remedy = "Copy pictures to a USB stick and remove old ones, then try again. Nothing that was kept is lost."
+
+
+class UpdateFailed(UpdateError):
+    """The update could not be written, or did not work when it was tried."""
+
+    code = "update.failed"
+    default_remedy = (
+        "This device works on with the version that it had. Try again; if it happens again, call the technician."
+    )

@@ -19,12 +19,15 @@ from device.spec import InstrumentSpec, load_head
 from device.values import Colour
 from services.instrument import calibrations
 from services.instrument.once import Order, reconstruct_file, written
+from services.update.command import app as update_app
 
 app = typer.Typer(
     name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
     add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
 app.add_typer(calibrations.app, name="calibrations")
+
+app.add_typer(update_app, name="update")
 
 SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
 
@@ -112,6 +115,20 @@ def reconstruct(
 
 def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
+
+
+@app.command()
+def health(
+    at: Annotated[str, typer.Option(help="Address of the running instrument.")] = "http://127.0.0.1:8000",
+    look: Annotated[bool, typer.Option("--look", help="Also take a live picture, which shines for a moment.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list for a program.")] = False,
+) -> None:
+    """Ask the running instrument whether it could take a picture now; the exit status is 1 if a check fails."""
+    from services.health import probe
+
+    checks = probe.examine(at, look)
+    typer.echo(json.dumps(probe.as_json(checks), indent=1) if as_json else probe.table(checks))
+    raise typer.Exit(0 if all(check.ok for check in checks) else 1)
 
 
 @app.command("probe")

@@ -97,7 +97,8 @@ def long_files(source: str) -> Iterator[Offence]:
 
 def test_files_and_functions_are_short() -> None:
     """A file over 400 lines or a function over 40 is asking to be two."""
-    judge(long_files, python("device", "services"), {}, "a long file is two")
+    allowed = {"device/errors.py: file": "one tree in one place: a list of leaves, which nobody reads through"}
+    judge(long_files, python("device", "services"), allowed, "a long file is two")
     judge(long_functions, python("device", "services"), {}, "a long function is two")
 
 
@@ -257,7 +258,10 @@ def test_nothing_of_the_workshop_is_left_in_the_house() -> None:
     readable = [name for name in files() if Path(name).suffix not in (".png", ".jpg", ".npy", ".tiff", ".gz")]
     judge(leftovers, readable, {}, "clear it away")
     judge(workplace_words, [name for name in readable if not name.endswith(".py")], {}, "clear it away")
-    own = {"tests/test_house.py: session": "this file names what it looks for"}
+    own = {
+        "tests/test_house.py: session": "this file names what it looks for",
+        "tests/appliance/bench.py: session": "what D-Bus calls a bus that is not the whole computer's",
+    }
     judge(workplace_words_in_prose, python(""), own, "clear it away")
 
 

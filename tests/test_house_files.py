@@ -21,6 +21,8 @@ from device.spec import load_head
 from services.cli import app
 from services.instrument.exam import BUDGET_S
 from services.instrument.watchdog import BEAT_S
+from services.update.settings import UpdateSettings
+from services.update.settings import load as load_settings
 from tests.house import BIN, ROOMS, ROOT, Offence, files, judge, nodes, python, text
 
 
@@ -126,7 +128,8 @@ def commands() -> dict[str, set[str]]:
     inner = [(f"{name} {second}", command) for name, outer in group.commands.items()
              for second, command in getattr(outer, "commands", {}).items()]  # fmt: skip
     return {
-        name: {"--help"}.union(*(p.opts for p in command.params)) for name, command in [*group.commands.items(), *inner]
+        name: {"--help"}.union(*(p.opts + p.secondary_opts for p in command.params))
+        for name, command in [*group.commands.items(), *inner]
     }
 
 
@@ -210,7 +213,8 @@ HARDENING = re.findall(
 )
 
 
-UNITS = [name for name in files() if re.fullmatch(r"systemd/[^/]+\.(service|socket)", name)]
+UNITS = [name for name in files() if re.fullmatch(r"systemd/[^/]+\.(service|socket|timer)", name)]
+IMAGE_SETTINGS = ROOT / "systemd" / "image" / "update.toml"
 BLANKER = "/usr/bin/python3 -I -S /opt/diffuscope/device/drivers/blank.py --device /dev/spidev0.0"
 
 
@@ -259,6 +263,24 @@ def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
     words = ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", *sorted(tmp_path.iterdir())]
     done = subprocess.run(words, capture_output=True, text=True)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update"])
+def test_what_updates_is_locked_in_and_called_with_words_that_exist(name: str) -> None:
+    """It runs as root, who owns RAUC: so without capabilities, and on a disk that is read-only but for its journal."""
+    service = unit_of(f"systemd/{name}.service")["Service"]
+    assert not unknown_words(service["ExecStart"].removeprefix("/opt/diffuscope/.venv/bin/"))
+    assert not [key for key in HARDENING if service.get(key) != "yes"]
+    assert (service["ProtectSystem"], service["CapabilityBoundingSet"]) == ("strict", "")
+    assert service["StateDirectory"] == UpdateSettings().folder.name
+
+
+def test_a_version_that_is_tried_has_its_patience_and_then_goes_back() -> None:
+    """The unit must not give up before the updater has said why, and its failure must restart the device."""
+    settle = unit_of("systemd/diffuscope-settle.service")
+    assert settle["Unit"]["FailureAction"] == "reboot"
+    assert float(settle["Service"]["TimeoutStartSec"]) >= load_settings(IMAGE_SETTINGS).patience_s + 120
+    assert settle["Service"]["ExecCondition"].endswith("/services/update/bootchooser.py trying")
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")

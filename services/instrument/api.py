@@ -61,6 +61,8 @@ from device.errors import (
 from device.head import kind_of
 from device.recon.model import field_radius_px
 from device.values import Capture, Eye
+from services.health.checks import judged
+from services.health.probe import as_json
 from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
@@ -69,6 +71,7 @@ from services.instrument.owner import Owner
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
 from services.instrument.visits_api import NAME, exports_router, visits_router
+from services.instrument.wellbeing import facts
 from services.records.people import People
 from services.records.protocol import Protocol, load_protocol
 from services.records.store import Store
@@ -332,11 +335,13 @@ def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
 
     @app.get("/api/health")
     def health() -> dict[str, Any]:
-        """Whether it can take pictures now, and what was found about the calibration."""
-        findings = owner.findings
+        """Whether it can take pictures now: every check with its limit and what to do; and how the calibration fits."""
+        known = facts(owner)
+        checks = judged(known)
         return {
-            "ok": owner.problem is None and not any(one.fails for one in findings), "state": owner.state,
-            "space_left": store.space_left(), "calibration": shown_findings(findings),
+            "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,
+            "battery": known.battery if isinstance(known.battery, float) else None, "checks": as_json(checks),
+            "calibration": shown_findings(owner.findings),
         }  # fmt: skip
 
 

@@ -153,6 +153,14 @@ class Store:
             mean_bytes = max(1, total_bytes // number) if number else ESTIMATE_BYTES
             return self._room_bytes() // mean_bytes
 
+    def try_out(self) -> None:
+        """Write a small file as a capture's would be, and remove it; StoreFull or StoreError if the disk refuses."""
+        trial = self.folder / ".trial"
+        with told(), disk.alone(self._lock):
+            shutil.rmtree(trial, ignore_errors=True)  # of a trial that was killed
+            disk.write_folder(trial, {"trial": b"written and removed"})
+            shutil.rmtree(trial)
+
     @contextmanager
     def _reading(self) -> Iterator[Session]:
         with told(), Session(self.engine) as session:

@@ -261,7 +261,10 @@ def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wai
     assert status["shape"] == [135, 240]
     assert status["problem"] is None
     assert status["field_px"] == pytest.approx(33.4 * 1.9478, rel=0.01)
-    assert old_rig.request("GET", "/api/health").json()["ok"] is True
+    assert old_rig.request("POST", "/api/captures", json=OD).status_code == 201  # others of this rig were damaged
+    health = old_rig.request("GET", "/api/health").json()
+    assert not [check for check in health["checks"] if not check["ok"]]
+    assert health["ok"] is True
     old_rig.world.faults.add("camera.missing")
     old_rig.exam.preview(0, wait_s=0.0)
     wait_until(lambda: old_rig.exam.problem is not None)

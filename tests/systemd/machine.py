@@ -140,7 +140,7 @@ def booted(folder: Path) -> Iterator[Machine]:
     with log.open("wb") as console:
         nspawn = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=console, stderr=console)
     try:
-        machine = Machine(_leader(nspawn, log))
+        machine = Machine(leader(nspawn, log))
         machine.until(lambda: machine.is_there("/run/systemd/private"))
         machine.until(
             lambda: machine.run("systemctl", "is-system-running", check=False).strip() in ("running", "degraded")
@@ -154,7 +154,7 @@ def booted(folder: Path) -> Iterator[Machine]:
         nspawn.wait(20)
 
 
-def _leader(nspawn: subprocess.Popen[bytes], log: Path) -> int:
+def leader(nspawn: subprocess.Popen[bytes], log: Path) -> int:
     """The container's first process: the child of nspawn that became systemd."""
     children = Path(f"/proc/{nspawn.pid}/task/{nspawn.pid}/children")
     end = time.monotonic() + 20

@@ -1,0 +1,148 @@
+"""Whether the instrument could take a picture now: a list of checks, each with its limit and what to do.
+
+A check is one function from `Facts` to a `Check`, and a place in `CHECKS`. The instrument gathers the facts about
+itself (`services/instrument/wellbeing.py`), because it alone holds the head; this file judges and touches nothing.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from device.errors import DiffuscopeError, StoreError
+
+PEOPLE_LEFT = 10  # a morning in a village, both eyes of each
+PRESS_P99_S = 6.0  # a picture's whole budget, its exposure and the writing
+HOTTEST_C = 80.0  # a Raspberry Pi slows down from here
+EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # nobody had this instrument before
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the list; `of_release` says that another version could be the cause, so an update is judged by it."""
+
+    name: str
+    ok: bool
+    value: str
+    limit: str
+    remedy: str
+    of_release: bool = False
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What an instrument knows of itself at one moment; None where it has no such part.
+
+    `battery` is a share, `press_s` how long the last presses took, newest first; `newest` when the last capture was.
+    """
+
+    state: str
+    problem: DiffuscopeError | None
+    lamp_is_dark: bool
+    calibration: DiffuscopeError | None
+    store: StoreError | None
+    captures_left: int
+    battery: DiffuscopeError | float | None
+    emptiest: float
+    head_c: DiffuscopeError | float | None
+    warmest_c: float
+    computer_c: float | None
+    now: datetime
+    clock_was_set: bool
+    newest: datetime | None
+    press_s: Sequence[float]
+
+
+def camera(facts: Facts) -> Check:
+    """The head is open, plans are made, and nothing has gone wrong since the last frame."""
+    value, remedy = facts.state, ""
+    if facts.problem is not None:
+        value, remedy = facts.problem.message, facts.problem.remedy
+    elif facts.state == "starting":
+        remedy = "The instrument is getting ready. Wait a minute."
+    return Check("camera", not remedy, value, "open, and nothing wrong", remedy, of_release=True)
+
+
+def lamp(facts: Facts) -> Check:
+    """It is dark at least once in as long as it may shine."""
+    value = "dark" if facts.lamp_is_dark else "does not go out"
+    return Check("lamp", facts.lamp_is_dark, value, "dark when nobody looks", STAY_AWAY, of_release=True)
+
+
+STAY_AWAY = "Keep every eye away from the device. Turn it off, and call the technician."
+
+
+def calibration(facts: Facts) -> Check:
+    """It belongs to this head and to this mode of its sensor."""
+    return _unless(facts.calibration, "calibration", "fits", "fits this head", of_release=True)
+
+
+def captures(facts: Facts) -> Check:
+    """The shelf takes a new file, and gives the newest capture back as it was kept."""
+    return _unless(facts.store, "captures", "safe", "can be written and read", of_release=True)
+
+
+def space(facts: Facts) -> Check:
+    """Room for the people of a morning."""
+    people = facts.captures_left // 2
+    ok = people >= PEOPLE_LEFT
+    return Check("space", ok, f"{people} people", f"at least {PEOPLE_LEFT}", "Copy captures away and make room.")
+
+
+def battery(facts: Facts) -> Check:
+    """Enough for the next pictures."""
+    limit = f"more than {facts.emptiest:.0%}"
+    if facts.battery is None or isinstance(facts.battery, DiffuscopeError):
+        return _unless(facts.battery, "battery", "none", limit)
+    return Check(
+        "battery",
+        facts.battery > facts.emptiest,
+        f"{facts.battery:.0%}",
+        limit,
+        "Charge the device before the next patient.",
+    )
+
+
+def heat(facts: Facts) -> Check:
+    """Neither the head nor the computer is too warm."""
+    limit = f"head {facts.warmest_c:.0f} C, computer {HOTTEST_C:.0f} C"
+    if isinstance(facts.head_c, DiffuscopeError):
+        return _unless(facts.head_c, "heat", "", limit)
+    warm = [(facts.head_c, facts.warmest_c, "head"), (facts.computer_c, HOTTEST_C, "computer")]
+    said = ", ".join(f"{name} {is_c:.0f} C" for is_c, _, name in warm if is_c is not None) or "not measured"
+    ok = all(is_c is None or is_c <= most_c for is_c, most_c, _ in warm)
+    return Check("heat", ok, said, limit, "Turn the device off, and let it cool in the shade.")
+
+
+def clock(facts: Facts) -> Check:
+    """Not before the newest capture, nor before there was such an instrument: dates on pictures depend on it."""
+    earliest = max(EARLIEST, facts.newest or EARLIEST)
+    how = "set by the network" if facts.clock_was_set else "never compared with another clock"
+    value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
+    return Check("clock", facts.now >= earliest, value, limit, "Set date and time before the next picture.")
+
+
+def speed(facts: Facts) -> Check:
+    """How long the last hundred presses took, the slowest but one in a hundred."""
+    if not facts.press_s:
+        return Check("speed", True, "no pictures yet", f"p99 {PRESS_P99_S:g} s", "")
+    slow_s = sorted(facts.press_s)
+    p50_s, p99_s = slow_s[len(slow_s) // 2], slow_s[int(0.99 * (len(slow_s) - 1))]
+    value = f"p50 {p50_s:.2f} s, p99 {p99_s:.2f} s of {len(slow_s)}"
+    remedy = "Turn the device off and on, and let it cool. If it stays slow, call the technician."
+    return Check("speed", p99_s <= PRESS_P99_S, value, f"p99 {PRESS_P99_S:g} s", remedy)
+
+
+def _unless(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
+    if error is None:
+        return Check(name, True, value, limit, "", of_release)
+    return Check(name, False, error.message, limit, error.remedy, of_release)
+
+
+CHECKS: tuple[Callable[[Facts], Check], ...] = (
+    camera, lamp, calibration, captures, space, battery, heat, clock, speed,
+)  # fmt: skip
+
+
+def judged(facts: Facts) -> list[Check]:
+    """Every check, in order; a check that is ok needs no remedy."""
+    return [check(facts) for check in CHECKS]

@@ -1,0 +1,64 @@
+"""`diffuscope update check|install|restart|settle|status`: what a technician, a timer and a boot call."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from device.clock import SystemClock
+from services.update.settings import PLACE, load
+from services.update.updater import Updater
+
+app = typer.Typer(help="Look for another version, install it, and see what became of it.", no_args_is_help=True)
+Settings = Annotated[Path, typer.Option(help="Where updates come from and when they are refused.")]
+
+
+def _updater(settings: Path) -> Updater:
+    return Updater(load(settings), SystemClock(), typer.echo)
+
+
+@app.command()
+def check(
+    settings: Settings = PLACE,
+    download: Annotated[bool, typer.Option("--download", help="Fetch it already, and install nothing.")] = False,
+) -> None:
+    """Ask the channel whether there is a newer version."""
+    updater = _updater(settings)
+    offer = updater.check(download)
+    typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.runs}.")
+
+
+@app.command()
+def install(
+    source: Annotated[
+        Path | None, typer.Argument(help="A bundle or a stick's folder; else any stick, else the channel.")
+    ] = None,
+    settings: Settings = PLACE,
+    restart: Annotated[bool, typer.Option(help="Restart at once to try it.")] = True,
+) -> None:
+    """Install a newer version beside the one that runs, and restart to try it."""
+    _updater(settings).install(source, restart)
+
+
+@app.command("restart")
+def restart_device(settings: Settings = PLACE) -> None:
+    """Restart to try what is installed and waits."""
+    _updater(settings).restart()
+
+
+@app.command()
+def settle(settings: Settings = PLACE) -> None:
+    """In a version that is being tried: commit it if it is well, else fail, which restarts into the one before."""
+    _updater(settings).settle()
+
+
+@app.command()
+def status(
+    settings: Settings = PLACE,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it for a program.")] = False,
+) -> None:
+    """Say which version runs and what became of the last update."""
+    entry, words = _updater(settings).status()
+    typer.echo(json.dumps(asdict(entry) | {"words": words}, indent=1) if as_json else words)

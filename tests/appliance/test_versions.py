@@ -1,0 +1,136 @@
+"""A device's life: 1.0 becomes 2.0, the broken 3.0 is tried and taken back, and no capture is lost on the way.
+
+Everything inside is what ships: the image of `systemd/image/bundle`, its units, RAUC, and `diffuscope update`.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.appliance import releases
+from tests.appliance.device import Device, made
+from tests.appliance.releases import BROKEN, IMPATIENT, Workshop
+from tests.systemd.machine import Machine
+
+pytestmark = [pytest.mark.systemd, pytest.mark.timeout(600)]
+
+PYTHON = "/opt/diffuscope/.venv/bin/python"
+DIFFUSCOPE = "/opt/diffuscope/.venv/bin/diffuscope"
+PRESS = """\
+import urllib.request as u
+body = '{"eye": "OD"}'.encode()
+print(u.urlopen(u.Request("http://127.0.0.1:8000/api/captures", body, {"Content-Type": "application/json"})).status)
+"""
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return releases.opened(tmp_path_factory.mktemp("workshop"))
+
+
+@pytest.fixture(scope="module")
+def bundles(workshop: Workshop) -> dict[str, Path]:
+    begin_s = time.monotonic()
+    broken = {"opt/diffuscope/services/instrument/serve.py": BROKEN, "etc/diffuscope/update.toml": IMPATIENT}
+    built = {"1.0": workshop.bundle("1.0"), "2.0": workshop.bundle("2.0"), "3.0": workshop.bundle("3.0", broken)}
+    print(f"three releases built in {time.monotonic() - begin_s:.0f} s")  # noqa: T201
+    return built
+
+
+@pytest.fixture(scope="module")
+def device(workshop: Workshop, bundles: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
+    with made(tmp_path_factory.mktemp("device"), workshop.image(bundles["1.0"])) as device:
+        yield device
+
+
+def slowly() -> bool:
+    """A question every half second: the device has better things to do than to answer."""
+    time.sleep(0.5)
+    return True
+
+
+def until_well(machine: Machine) -> None:
+    """Wait by asking the page, which is cheap; then let the command judge, once."""
+    asks = "import json, urllib.request as u; print(json.load(u.urlopen('http://127.0.0.1:8000/api/health'))['ok'])"
+    machine.until(lambda: slowly() and "True" in machine.run("python3", "-c", asks, check=False), 240)
+    print(machine.run(DIFFUSCOPE, "health", "--look"))  # noqa: T201
+
+
+def until_settled(device: Device, machine: Machine, state: str) -> None:
+    """Wait for the journal on the data partition to say so."""
+    path = device.data / "update" / "journal.json"
+    machine.until(lambda: slowly() and json.loads(path.read_text())["state"] == state, 240)
+
+
+def put_in(device: Device, bundle: Path) -> None:
+    """A stick with one update, and no other."""
+    stick = device.folder / "media" / "stick"
+    shutil.rmtree(stick, ignore_errors=True)
+    stick.mkdir()
+    shutil.copy(bundle, stick)
+
+
+def update(device: Device, machine: Machine) -> None:
+    """Install what is on the stick; the device then restarts by itself."""
+    begin_s = time.monotonic()
+    machine.run("systemd-run", "--quiet", "--no-block", "--unit=technician", DIFFUSCOPE, "update", "install")
+    device.restarts(machine)
+    print(f"installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+
+
+def status(machine: Machine) -> str:
+    return machine.run(DIFFUSCOPE, "update", "status")
+
+
+def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, bundles: dict[str, Path]) -> None:
+    put_in(device, bundles["2.0"])
+    with device.on() as machine:
+        until_well(machine)
+        assert [machine.run(PYTHON, "-c", PRESS).strip() for _ in range(2)] == ["201", "201"]
+        kept = device.captures()
+        assert len({name.split("/")[1] for name in kept}) == 2
+        update(device, machine)
+    assert (device.tried, device.autoboot()) == (True, ("A", "B"))
+    with device.on() as machine:
+        begin_s = time.monotonic()
+        assert device.booted == "B"
+        until_settled(device, machine, "committed")
+        print(f"2.0 committed {time.monotonic() - begin_s:.0f} s after its boot")  # noqa: T201
+        assert device.autoboot() == ("B", "A")
+        assert "Updated to 2.0" in status(machine)
+    assert device.captures() == kept
+
+
+def test_version_3_is_broken_is_tried_and_taken_back_with_every_capture(
+    device: Device, bundles: dict[str, Path]
+) -> None:
+    kept = device.captures()
+    assert kept
+    put_in(device, bundles["3.0"])
+    with device.on() as machine:
+        assert device.booted == "B"  # by itself, from now on
+        until_well(machine)
+        update(device, machine)
+    with device.on() as machine:
+        assert device.booted == "A"
+        assert "Version 3.0 is being tried" in status(machine)
+        put_in(device, bundles["2.0"])
+        said = machine.run("sh", "-c", f"{DIFFUSCOPE} update install 2>&1", check=False)
+        assert "the committed one" in said  # and it cannot be forced by asking RAUC itself either
+        shutil.copy(bundles["2.0"], device.data / "update" / "by-hand.raucb")
+        by_hand = machine.run("sh", "-c", "rauc install /var/lib/diffuscope-update/by-hand.raucb 2>&1", check=False)
+        assert "failed" in by_hand, by_hand
+        device.restarts(machine)
+    assert device.autoboot() == ("B", "A")
+    assert not device.tried
+    with device.on() as machine:
+        assert device.booted == "B"
+        said = status(machine)
+        assert "Version 2.0 runs. Version 3.0 was tried and was not well, so 2.0 is back: page: does not answer" in said
+        until_well(machine)
+        assert machine.run(PYTHON, "-c", PRESS).strip() == "201"
+    assert {name: digest for name, digest in device.captures().items() if name in kept} == kept

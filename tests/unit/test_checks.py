@@ -1,0 +1,64 @@
+"""Every check of health is well once, and driven to its failure once, with a remedy that can be read aloud."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+
+from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
+from services.health.checks import CHECKS, Facts, judged
+from services.health.probe import table
+
+NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
+WELL = Facts(
+    state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, battery=0.8,
+    emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
+    newest=datetime(2026, 11, 20, tzinfo=UTC), press_s=[1.5] * 100,
+)  # fmt: skip
+
+
+def test_an_instrument_that_is_well_passes_every_check() -> None:
+    assert [check.ok for check in judged(WELL)] == [True] * len(CHECKS)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("camera", {"problem": CameraMissing("the camera is gone")}),
+        ("camera", {"state": "starting"}),
+        ("lamp", {"lamp_is_dark": False}),
+        ("calibration", {"calibration": HeadMismatch("another head")}),
+        ("captures", {"store": StoreFull("0 bytes are free")}),
+        ("space", {"captures_left": 19}),
+        ("battery", {"battery": 0.04}),
+        ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
+        ("heat", {"head_c": 56.0}),
+        ("heat", {"computer_c": 85.0}),
+        ("heat", {"head_c": BusFault("the thermometer does not answer")}),
+        ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
+        ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
+        ("speed", {"press_s": [1.0] * 50 + [9.0] * 50}),
+    ],
+)
+def test_each_check_fails_alone_and_says_what_to_do(name: str, change: dict[str, Any]) -> None:
+    checks = judged(replace(WELL, **change))
+    failed = [check for check in checks if not check.ok]
+    assert [check.name for check in failed] == [name]
+    assert len(failed[0].remedy) > 20
+    assert failed[0].remedy.endswith(".")
+    assert failed[0].remedy in table(checks)
+
+
+def test_one_slow_press_in_a_hundred_is_forgiven() -> None:
+    assert all(check.ok for check in judged(replace(WELL, press_s=[1.0] * 99 + [30.0])))
+
+
+def test_parts_that_a_head_does_not_have_are_no_failure() -> None:
+    bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, press_s=[])
+    assert all(check.ok for check in judged(bare))
+
+
+def test_an_update_is_judged_by_what_a_release_can_break_and_not_by_a_battery() -> None:
+    names = {check.name for check in judged(WELL) if check.of_release}
+    assert names == {"camera", "lamp", "calibration", "captures"}
