@@ -5,8 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-systemd test-appliance test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers \
-	parts part-pictures test-parts lock clean
+.PHONY: help run test test-systemd test-appliance test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
