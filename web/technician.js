@@ -17,6 +17,7 @@ speak("en", TECHNICIAN);
 
 const store = createStore({
   view: "opening", // opening | door | overview | wizard | done
+  room: "calibration", // of the overview
   cal: null, // what the instrument says about calibration
   hasPin: true,
   pin: "",
@@ -136,6 +137,7 @@ const act = {
   },
 
   lock: () => tapped("/api/technician/lock", {}, toDoor),
+  enterRoom: (room) => set({ room }),
 
   named({ target }) {
     remember("technician", target.value);

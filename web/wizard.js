@@ -1,6 +1,7 @@
 // What the technician's page looks like for a given state: pure templates, no fetches, no decisions.
 
 import { drawing } from "./drawings.js";
+import { rooms } from "./rooms.js";
 import { html, nothing, svg } from "./vendor/lit-html.js";
 import { calendarDay, clockTime, number, t } from "./words.js";
 import { TECHNICIAN } from "./words_technician.js";
@@ -44,7 +45,7 @@ export function place(state, act) {
 const views = {
   opening: () => prompt("wait", t("tech.opening")),
   door: (state, act) => door(state, act),
-  overview: (state, act) => overview(state, act),
+  overview: (state, act) => rooms(state, act, overview),
   wizard: (state, act) => wizard(state, act),
   done: (state, act) => done(state, act),
 };

@@ -68,7 +68,8 @@ def technician_routes(app: FastAPI, owner: Owner, door: Door, rooms: Sequence[AP
         door.touch(token)
 
     app.include_router(_door(door, Depends(acting)))
-    app.include_router(_calibration(owner, Depends(inside), Depends(acting)))
+    app.include_router(_sights(owner, Depends(inside)))
+    app.include_router(_acts(owner, Depends(acting)))
     for room in rooms:
         app.include_router(room, dependencies=[Depends(inside)])
 
@@ -109,13 +110,33 @@ def _door(door: Door, acting: Any) -> APIRouter:
     return router
 
 
-def _calibration(owner: Owner, inside: Any, acting: Any) -> APIRouter:
+def _sights(owner: Owner, inside: Any) -> APIRouter:
     router = APIRouter(prefix="/api/calibration")
 
     @router.get("", dependencies=[inside])
     def state() -> dict[str, Any]:
         """What the wizard does, which steps are done, what it found, and which calibrations are kept."""
         return told(owner)
+
+    @router.get("/preview", dependencies=[inside])
+    def preview(after: int = Query(0, ge=0)) -> Response:
+        """The next raw picture after number `after`, with its levels; 204 when none comes in 2 s."""
+        wizard = owner.wizard
+        sight = wizard.look(after) if wizard is not None else None
+        if sight is None:
+            return Response(status_code=204)
+        age_ms = max(0, round((owner.house.clock.now_s() - sight.seen_s) * 1000))
+        headers = {
+            "X-Frame": str(sight.number), "X-Age-Ms": str(age_ms), "X-Exposure-Ms": f"{sight.exposure_s * 1000:.3g}",
+            "X-Brightest": f"{sight.brightest_dn:.0f}", "X-Mean": f"{sight.mean_dn:.1f}", "X-Full": f"{sight.full:.4f}",
+        }  # fmt: skip
+        return Response(sight.jpeg, media_type="image/jpeg", headers=headers)
+
+    return router
+
+
+def _acts(owner: Owner, acting: Any) -> APIRouter:
+    router = APIRouter(prefix="/api/calibration")
 
     @router.post("", dependencies=[acting])
     def start(start: Start) -> dict[str, Any]:
@@ -143,20 +164,6 @@ def _calibration(owner: Owner, inside: Any, acting: Any) -> APIRouter:
         """Go back to an earlier calibration."""
         owner.use(use.id)
         return told(owner)
-
-    @router.get("/preview", dependencies=[inside])
-    def preview(after: int = Query(0, ge=0)) -> Response:
-        """The next raw picture after number `after`, with its levels; 204 when none comes in 2 s."""
-        wizard = owner.wizard
-        sight = wizard.look(after) if wizard is not None else None
-        if sight is None:
-            return Response(status_code=204)
-        age_ms = max(0, round((owner.house.clock.now_s() - sight.seen_s) * 1000))
-        headers = {
-            "X-Frame": str(sight.number), "X-Age-Ms": str(age_ms), "X-Exposure-Ms": f"{sight.exposure_s * 1000:.3g}",
-            "X-Brightest": f"{sight.brightest_dn:.0f}", "X-Mean": f"{sight.mean_dn:.1f}", "X-Full": f"{sight.full:.4f}",
-        }  # fmt: skip
-        return Response(sight.jpeg, media_type="image/jpeg", headers=headers)
 
     return router
 

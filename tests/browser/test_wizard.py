@@ -81,7 +81,9 @@ def come_in(page: Page) -> None:
 
 
 def start(page: Page) -> None:
-    page.wait_for_selector("[data-view=overview]")
+    page.wait_for_selector("[data-view=overview], [data-view=done]")
+    if page.locator("#overview").count():  # the end of the last one, which this tablet has not seen
+        page.locator("#overview").tap()
     page.locator("#by").fill("Ada Lovelace")
     expect(page.locator("#start")).to_have_attribute("aria-disabled", "false", timeout=60_000)
     page.wait_for_timeout(700)  # a double tap must not start anything

@@ -285,24 +285,35 @@ def test_stopped_at_any_step_the_old_stays_and_what_is_measured_is_taken_up(shop
     assert shop.state()["in_force"]["id"] != old
 
 
-def test_back_to_an_earlier_one_and_forward_again(make_shop: MakeShop) -> None:
-    shop = make_shop(TINY + FLAWS + CHIPS)
+def test_back_to_an_earlier_one_and_away_from_a_damaged_one(make_shop: MakeShop, tmp_path: Path) -> None:
+    shop = make_shop(TINY + FLAWS + CHIPS, archive=True)
     shop.come_in()
     first, second = shop.calibrate(), shop.calibrate()
     assert first != second
     assert [one["id"] for one in shop.state()["kept"]] == [second, first]
-    for id in (first, second):
-        until(lambda: shop.state()["state"] == "idle")
-        said = shop.post("/api/calibration/use", {"id": id})
-        assert said["in_force"]["id"] == id
-        memory = shop.benches[-1].chips.memory
-        assert memory is not None
-        identity = memory.read()
-        assert identity is not None
-        assert identity.calibration_id == id  # the head itself says so from now on
-        assert shop.ask("POST", "/api/captures", {"eye": "OS"}).json()["calibration_id"] == id
+    until(lambda: shop.state()["state"] == "idle")
+    assert shop.post("/api/calibration/use", {"id": first})["in_force"]["id"] == first
+    memory = shop.benches[-1].chips.memory
+    assert memory is not None
+    identity = memory.read()
+    assert identity is not None
+    assert identity.calibration_id == first  # the head itself says so from now on
+    assert shop.ask("POST", "/api/captures", {"eye": "OS"}).json()["calibration_id"] == first
     assert shop.refused("/api/calibration/use", {"id": "0" * 16}) == (423, "calibration.missing")
     assert shop.refused("/api/calibration/use", {"id": "../shelf"}) == (422, "input")
+    shop.owner.close()
+
+    (tmp_path / "archive" / first / "psf0.npy").write_bytes(b"not what was kept")
+    anew = make_shop(archive=True)
+    assert anew.refused("/api/captures", {"eye": "OD"}) == (423, "calibration.damaged")
+    anew.post("/api/technician/unlock", {"pin": "1234"})
+    said = anew.state()
+    assert said["needed"]["code"] == "calibration.damaged"
+    assert {one["id"]: one["damaged"] is None for one in said["kept"]} == {first: False, second: True}
+    assert anew.refused("/api/calibration/use", {"id": first}) == (423, "calibration.damaged")
+    said = anew.post("/api/calibration/use", {"id": second})
+    assert said["needed"] is None
+    assert said["in_force"]["id"] == second
 
 
 def test_without_a_calibration_the_page_is_served_and_the_wizard_waits(make_shop: MakeShop) -> None:
@@ -323,23 +334,6 @@ def test_without_a_calibration_the_page_is_served_and_the_wizard_waits(make_shop
     id = shop.calibrate()
     assert shop.state()["needed"] is None
     assert shop.ask("POST", "/api/captures", {"eye": "OD"}).json()["calibration_id"] == id
-
-
-def test_a_damaged_one_is_said_and_an_earlier_one_can_be_used(make_shop: MakeShop, tmp_path: Path) -> None:
-    shop = make_shop(archive=True)
-    shop.come_in()
-    good, bad = shop.calibrate(), shop.calibrate()
-    shop.owner.close()
-    (tmp_path / "archive" / bad / "psf0.npy").write_bytes(b"not what was kept")
-    anew = make_shop(archive=True)
-    assert anew.refused("/api/captures", {"eye": "OD"}) == (423, "calibration.damaged")
-    anew.post("/api/technician/unlock", {"pin": "1234"})
-    said = anew.state()
-    assert said["needed"]["code"] == "calibration.damaged"
-    assert [one["damaged"] is None for one in said["kept"]] == [False, True]
-    assert anew.refused("/api/calibration/use", {"id": bad}) == (423, "calibration.damaged")
-    assert anew.post("/api/calibration/use", {"id": good})["needed"] is None
-    assert anew.ask("POST", "/api/captures", {"eye": "OD"}).json()["calibration_id"] == good
 
 
 def test_one_that_no_longer_fits_is_refused_until_a_new_one_is_measured(make_shop: MakeShop) -> None:

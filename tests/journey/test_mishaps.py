@@ -1,0 +1,101 @@
+"""`diffuscope calibrate` where something goes wrong at a step: words and a number, and the old calibration stays."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from device.calibration.archive import Archive
+from device.clock import VirtualClock
+from device.errors import CalibrationRefused, SettingError
+from device.spec import InstrumentSpec, load_head
+from services.instrument.calibrating import Wish, calibrate
+from tests.journey.conftest import SMALL_HEAD, Diffuscope
+
+SMALL = (
+    SMALL_HEAD.replace("rows = 270", "rows = 136").replace("cols = 480", "cols = 240").replace("20.16", "40.32")
+    .replace("haemorrhages = 3", 'kind = "point"')
+    + "\n[sim.sensor]\nprnu = 0.01\ndsnu_e = 2.0\n"
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, InstrumentSpec]:
+    path = tmp_path_factory.mktemp("mishaps") / "head.toml"
+    path.write_text(SMALL)
+    return path, load_head(path)
+
+
+def run(spec: InstrumentSpec, archive: Path, **mishaps: str) -> list[str]:
+    """What it says on its way."""
+    said: list[str] = []
+    clock = VirtualClock()
+    clock.sleep(len(list(archive.glob("*"))))  # another moment, another calibration
+    calibrate(spec, Wish(archive, None, "Ada", None, mishaps), clock, said.append, said.append)
+    return said
+
+
+@pytest.fixture(scope="module")
+def before(small: tuple[Path, InstrumentSpec], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An archive in which one calibration is in force."""
+    archive = tmp_path_factory.mktemp("before") / "archive"
+    run(small[1], archive)
+    return archive
+
+
+@pytest.mark.parametrize(
+    ("stand", "mishap", "words"),
+    [
+        ("cap", "lamp on", "the lamp was on in frame 1: green at 1"),
+        ("cap", "cap off", r"the dark frames are bright: \d+ of 4095 DN"),
+        ("cap", "other mode", r"frame 1 is \(68, 120\), this head gives \(136, 240\)"),
+        ("screen", "cap on", r"it is dark: -?\d+ DN in 3 s \(at least 81\)"),
+        ("screen", "lamp on", "the lamp was on in frame"),
+        ("screen", "finger", r"one part of the flat differs by \d+\.\d% from its surroundings"),
+        ("screen", "other mode", r"is \(68, 120\), this head gives"),
+        ("point", "too bright", r"\d"),
+        ("point", "too dark", r"it is dark: \d+ DN in 0.6 s \(at least \d+\)"),
+        ("point", "moving", r"the point source has moved by 1\.0 pixels by frame \d+"),
+        ("point", "cap on", "it is dark"),
+        ("point", "other mode", r"is \(68, 120\), this head gives"),
+    ],
+)
+def test_a_mishap_is_said_with_a_number_and_nothing_changes(
+    small: tuple[Path, InstrumentSpec], before: Path, stand: str, mishap: str, words: str
+) -> None:
+    archive = Archive(before)
+    old, kept = archive.current(), {path.name for path in (before / ".steps").glob("*.npz")}
+    with pytest.raises(CalibrationRefused, match=words) as caught:
+        run(small[1], before, **{stand: mishap})
+    assert re.search(r"\d", caught.value.message)
+    assert len(caught.value.remedy) > 20
+    assert archive.current() == old
+    assert len(archive.ids()) == 1
+    assert {path.name for path in (before / ".steps").glob("*.npz")} >= kept  # earlier steps stay
+
+
+def test_the_command_goes_on_after_a_mishap(
+    diffuscope: Diffuscope, small: tuple[Path, InstrumentSpec], tmp_path: Path
+) -> None:
+    quick = tmp_path / "head.toml"  # a tenth of the exposure: time is real here
+    quick.write_text(small[0].read_text().replace("[camera]", "[camera]\nexposure_s = 0.01\npreview_exposure_s = 0.01"))
+    words = ("calibrate", "--head", quick, "--archive", tmp_path / "archive")
+    failed = diffuscope(*words, "--mishap", "point=moving")
+    assert failed.returncode == 2
+    assert failed.stdout.splitlines() == ["darks: done", "flats: done"]
+    assert "error: the point source has moved by 1.0 pixels" in failed.stderr
+    assert "Fix source and head to one table" in failed.stderr
+    done = diffuscope(*words)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[:2] == [
+        "darks: measured before, taken up again", "flats: measured before, taken up again",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("stand", "mishap"), [("eye", "moving"), ("cap", "rain"), ("cap", "")])
+def test_a_mishap_that_nobody_knows_is_refused_with_those_that_there_are(
+    small: tuple[Path, InstrumentSpec], tmp_path: Path, stand: str, mishap: str
+) -> None:
+    with pytest.raises(SettingError) as caught:
+        run(small[1], tmp_path / "archive", **{stand: mishap})
+    assert "Choose from" in caught.value.remedy
