@@ -8,6 +8,7 @@ import libcamera
 import numpy as np
 import pytest
 
+from device.calibration.archive import Archive, Provenance
 from device.clock import SystemClock, VirtualClock
 from device.errors import BusFault, HeadMismatch, PowerLow, TooHot
 from device.head import Head, open_head
@@ -19,7 +20,7 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.plan import decide
 from device.sim.world import World
-from device.spec import BusSpec, ChainSpec, InstrumentSpec, LightSpec
+from device.spec import BusSpec, CalibrationTable, ChainSpec, InstrumentSpec, LightSpec
 from device.values import Glow, Identity, Image, Shot
 from tests.ports.conftest import small_head
 from tests.ports.emulators.memory import MemoryAllocator
@@ -50,8 +51,9 @@ def head() -> Iterator[Head]:
     opened.close()
 
 
-def opened_again() -> Head:
-    return open_head(real_parts(), SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
+def opened_again(calibration: CalibrationTable | None = None) -> Head:
+    spec = real_parts().model_copy(update={"calibration": calibration})
+    return open_head(spec, SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
 
 
 def plug_in() -> None:
@@ -107,6 +109,16 @@ def test_the_memory_of_another_head_is_refused_and_everything_is_closed_again(he
         opened_again()
     assert not libcamera.plugged[-1].held
     assert not wires().lit
+
+
+def test_the_calibration_of_another_serial_number_is_refused(head, tmp_path):
+    archive = Archive(tmp_path)
+    id = archive.keep(head.calibration, Provenance("DS-0001", SystemClock().wall(), "a technician", "0.1.0"))
+    head.chips.memory.write(Identity("DS-0002", id))
+    head.close()
+    plug_in()
+    with pytest.raises(HeadMismatch, match="DS-0002"):
+        opened_again(CalibrationTable(archive=tmp_path))
 
 
 def test_a_silent_bus_stops_the_head_from_opening(head):
