@@ -2,7 +2,7 @@
 // the picture that was kept, and how long pictures may take from now on. The table says all that the plot shows.
 
 import { html, render, svg } from "./vendor/lit-html.js";
-import { getCaptures, Refusal } from "./api.js";
+import { Refusal } from "./api.js";
 import { clockTime, number, t } from "./words.js";
 
 const WIDE = 720, HIGH = 400, LEFT = 64, RIGHT = 16, TOP = 16, BELOW = 56;
@@ -34,7 +34,7 @@ class AccuracyTime extends HTMLElement {
 
   async #load() {
     await this.#tried(async () => {
-      const [explored, captures] = await Promise.all([said("GET"), getCaptures(12)]);
+      const [explored, captures] = await Promise.all([said("GET"), lately()]);
       this.#set({ explored, captures, capture: this.#state.capture ?? captures[0] ?? null });
       this.#follow();
     });
@@ -97,6 +97,7 @@ class AccuracyTime extends HTMLElement {
 
 customElements.define("accuracy-time", AccuracyTime);
 
+const lately = async () => (await (await ask("GET", "/api/captures?limit=12")).json()).captures;
 const said = async (method, room = "explorer", body = undefined) => (await ask(method, `/api/technician/${room}`, body)).json();
 
 async function ask(method, path, body) {
@@ -154,7 +155,7 @@ function points({ explored, all, capture, captures }, act) {
     ${capture ? html`<label>${t("explore.capture")}
       <select @change=${act.pick}>${captures.map((one) => html`
         <option value=${one.id} ?selected=${one === capture}>
-          ${t(`eye.${one.eye}.short`)} ${clockTime(one.taken_at)}
+          ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}
         </option>`)}
       </select></label>` : html`<p class="muted">${t("explore.nothing")}</p>`}
     <div class="scrolls" tabindex="0" role="region" aria-label=${t("explore.table")}>

@@ -57,8 +57,9 @@ def head() -> Iterator[Head]:
     opened.close()
 
 
-def opened_again() -> Head:
-    return open_head(real_parts(), SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
+def opened_again(calibration: CalibrationTable | None = None) -> Head:
+    spec = real_parts().model_copy(update={"calibration": calibration})
+    return open_head(spec, SystemClock(), MemoryLedger(SystemClock()), MemoryAllocator())
 
 
 def plug_in() -> None:
@@ -178,6 +179,16 @@ def test_a_signed_file_of_another_head_is_refused_by_what_the_memory_says(tmp_pa
     assert f"{id} is in force in {there.root}, and head DS-0042 knows it" in capsys.readouterr().out
     with head_memory(spec, SystemClock()) as memory:
         assert memory.read() == Identity("DS-0042", id)
+
+
+def test_the_calibration_of_another_serial_number_is_refused(head, tmp_path):
+    archive = Archive(tmp_path)
+    id = archive.keep(head.calibration, Provenance("DS-0001", SystemClock().wall(), "a technician", "0.1.0"))
+    head.chips.memory.write(Identity("DS-0002", id))
+    head.close()
+    plug_in()
+    with pytest.raises(HeadMismatch, match="DS-0002"):
+        opened_again(CalibrationTable(archive=tmp_path))
 
 
 def test_a_silent_bus_stops_the_head_from_opening(head):
