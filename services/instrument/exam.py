@@ -241,7 +241,7 @@ class Exam:
         try:
             yield
         except DiffuscopeError as error:
-            log.warning("press failed: %s", error)
+            log.warning("press failed: %s", error, extra={"code": error.code})
             self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
             self._leave(press)
             press.answer.set_exception(error)
@@ -271,6 +271,8 @@ class Exam:
         self._tell_stage(shot.id, "keep", 0.9)
         kept = self.store.keep(capture, self._files(shot, capture, made), shot.press.errand.beside)
         self.bulletin.tell("kept", id=shot.id)
+        took_s = sum(report["seconds"].values())
+        log.info("a picture was kept after %.1f s, made by %s", took_s, report["method"], extra={"about": shot.id})
         self.fitness.kept(kept)
         return kept
 
@@ -362,7 +364,7 @@ class Exam:
         before = self.problem.code if self.problem else None
         self.problem = error
         if error is not None and error.code != before:
-            log.warning("preview: %s", error)
+            log.warning("no live picture: %s", error, extra={"code": error.code})
             self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
 
     def _tell_state(self) -> None:

@@ -1,6 +1,7 @@
 """Bring the parts together and serve them: socket first, so that a port in use is said before anything is opened."""
 
 import errno
+import logging
 import os
 import signal
 import socket
@@ -29,6 +30,8 @@ from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
 from services.records.protocol import Protocol
 from services.records.store import Store
+
+log = logging.getLogger(__name__)
 
 BACKLOG = 128
 HANDED_OVER = 3  # the file descriptor of sd_listen_fds(3)
@@ -99,6 +102,7 @@ def serve(
         door = Door(data / "technician.json", clock)
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
+        log.info("started, version %s", app.version)
         try:
             ready()
             _Server(config, house.bulletin).run(sockets=[address])
