@@ -13,7 +13,7 @@ OLDEST = 125
 
 
 def checked(name: str, value: Any) -> Any:
-    """The value as it is kept, or None, which empties the field; InputError says what it may be."""
+    """The value as it is kept; None, which is no answer, always may be. InputError says what else."""
     if name not in FIELDS:
         raise InputError(f"field: there is no field named {name[:40]!r}", "Reload the page and try again.")
     return None if value is None else FIELDS[name](value)
