@@ -366,4 +366,7 @@ def test_the_room_left_is_told_in_people(make_rig: Any) -> None:
     visit = begin(rig)
     used = sum(len(rig.store.read(made["id"], name)) for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
                for name in made["files"])  # fmt: skip
+    half = rig.request("GET", "/api/status").json()["people_left"]
+    assert half == 480_000_000 // (used // 2) // 4  # one who is here with two pictures will have four
+    post(rig, f"/api/visits/{visit['id']}/finish")
     assert rig.request("GET", "/api/status").json()["people_left"] == 480_000_000 // used
