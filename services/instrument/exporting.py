@@ -23,6 +23,7 @@ from services.records.store import Store
 from services.records.visit import Visit
 
 ROOTS = (Path("/media"), Path("/run/media"))
+OLDEST = (1980, 1, 1, 0, 0, 0)  # of a ZIP; a clock that was never set is older
 MOUNTS = Path("/proc/self/mounts")
 BLANKS = {r"\040": " ", r"\011": "\t", r"\012": "\n", r"\134": "\\"}  # how the kernel writes blanks in a path
 
@@ -94,10 +95,10 @@ def folder_name(visit: Visit) -> str:
 
 def zipped(name: str, files: Mapping[str, bytes], begun_at: datetime) -> bytes:
     """The files in one folder of a ZIP, dated by the visit; PNGs do not shrink, so nothing is pressed."""
-    out = io.BytesIO()
+    out, dated = io.BytesIO(), max(begun_at.timetuple()[:6], OLDEST)
     with zipfile.ZipFile(out, "w") as archive:
         for path, content in files.items():
-            archive.writestr(zipfile.ZipInfo(f"{name}/{path}", begun_at.timetuple()[:6]), content)
+            archive.writestr(zipfile.ZipInfo(f"{name}/{path}", dated), content)
     return out.getvalue()
 
 

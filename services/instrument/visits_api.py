@@ -152,7 +152,7 @@ def exports_router(people: People, store: Store, sticks: Sticks) -> APIRouter:
         """The USB sticks that are there now."""
         return {
             "folders": [
-                {"folder": str(stick.folder), "name": stick.folder.name, "free_bytes": stick.free_bytes}
+                {"id": str(stick.folder), "name": stick.folder.name, "free_bytes": stick.free_bytes}
                 for stick in sticks.present()
             ]
         }

@@ -13,7 +13,7 @@ OLDEST = 125
 
 
 def checked(name: str, value: Any) -> Any:
-    """The value as it is kept, or None, which empties the field; InputError says what it may be."""
+    """The value as it is kept; None, which is no answer, always may be. InputError says what else."""
     if name not in FIELDS:
         raise InputError(f"field: there is no field named {name[:40]!r}", "Reload the page and try again.")
     return None if value is None else FIELDS[name](value)
@@ -53,7 +53,8 @@ def _text(most: int) -> Judge:
 
 
 def _years(value: Any) -> Any:
-    return _one_of("<1", "1-5", "5-10", ">10", "unknown")(value) if isinstance(value, str) else _whole(100)(value)
+    """A number of years, or the words of a tile, such as "<1" or "5-10"."""
+    return _text(20)(value) if isinstance(value, str) else _whole(100)(value)
 
 
 def _yes_or_no(value: Any) -> Any:
@@ -73,12 +74,13 @@ def _moment(value: Any) -> Any:
 
 
 def _complaints(value: Any) -> Any:
-    if not isinstance(value, list) or not value or len(value) > len(COMPLAINTS):
+    """Some of those that are known; an empty list takes the answer back."""
+    if not isinstance(value, list) or len(value) > len(COMPLAINTS):
         raise _wrong(value, f"Choose from: {', '.join(COMPLAINTS)}.")
     chosen = [_one_of(*COMPLAINTS)(one) for one in value]
     if len(set(chosen)) < len(chosen) or ("none" in chosen and len(chosen) > 1):
         raise _wrong(value, "Choose each complaint once, and 'none' alone.")
-    return chosen
+    return chosen or None
 
 
 def _wrong(value: Any, remedy: str) -> InputError:

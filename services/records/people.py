@@ -68,20 +68,20 @@ class People:
             return visits.counts(session, day)
 
     def answer(self, key: str, id: str, name: str, value: Any) -> Visit:
-        """Write one answer down, or take it back (None); InputError if it cannot be one, VisitFinished if too late."""
+        """Write one answer down; None is none. InputError if it cannot be one, VisitFinished if too late.
+
+        Of what tells who somebody is nothing stays when it is taken back.
+        """
         value = answers.checked(name, value)
 
         def act(session: Session) -> str:
             person, now = self._open(session, id).person, schema.utc_text(self.clock.wall())
-            row: IdentifierRow | FieldRow
-            if name in answers.IDENTIFIERS:
-                row = IdentifierRow(person=person, name=name, value=json.dumps(value))
-            else:
-                row = FieldRow(visit=id, name=name, value=json.dumps(value), set_at=now)
-            row = session.merge(row)
-            if value is None:
-                session.flush()
-                session.delete(row)
+            if name not in answers.IDENTIFIERS:  # "nothing" is an answer too: no drops were given
+                session.merge(FieldRow(visit=id, name=name, value=json.dumps(value), set_at=now))
+            elif value is not None:
+                session.merge(IdentifierRow(person=person, name=name, value=json.dumps(value)))
+            elif (known := session.get(IdentifierRow, (person, name))) is not None:
+                session.delete(known)
             return id
 
         return self.get(self._once(key, f"answer {id} {name} {json.dumps(value)}", act))

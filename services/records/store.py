@@ -25,9 +25,10 @@ from device.errors import NotKept, SettingError, StoreDamaged, StoreError, Store
 from device.values import Capture
 from services.records import disk, schema
 from services.records.errand import Beside
-from services.records.schema import CaptureRow, FileRow, ShotRow
+from services.records.schema import CaptureRow, FileRow, ShotRow, VisitRow
 
 RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
+LATELY = 100  # visits by which the next ones are judged
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
@@ -132,14 +133,16 @@ class Store:
         return content
 
     def people_left(self, pictures: int) -> int:
-        """How many more visits will fit, judged by the mean size of those so far, or by `pictures` captures each."""
+        """How many more visits will fit: like the last hundred that were finished, or of `pictures` captures each."""
+        lately = select(VisitRow.id).where(VisitRow.finished_at.is_not(None)).order_by(VisitRow.begun_at.desc())
+        sizes = (
+            select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(ShotRow.visit)))
+            .join(ShotRow, ShotRow.capture == FileRow.capture_id)
+            .where(ShotRow.visit.in_(lately.limit(LATELY)))
+        )
         with self._reading() as session:
-            total_bytes, number = session.execute(
-                select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(ShotRow.visit))).join(
-                    ShotRow, ShotRow.capture == FileRow.capture_id
-                )
-            ).one()
-        return self._room_bytes() * number // max(1, total_bytes) if number else self.space_left() // pictures
+            total_bytes, number = session.execute(sizes).one()
+        return self._room_bytes() * number // total_bytes if total_bytes else self.space_left() // pictures
 
     def _room_bytes(self) -> int:
         return max(0, self._free_bytes(self.folder) - self._reserve_bytes)

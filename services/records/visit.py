@@ -100,7 +100,7 @@ def decided_after(slot: SlotState, new: Taken) -> Decided | None:
 
 def outcome(protocol: Protocol, fields: Mapping[str, Any], slots: Mapping[str, SlotState]) -> Outcome:
     """How a visit ends by the programme's rules, the most urgent first; never a disease, never "normal"."""
-    urgent = [words for complaint, words in URGENT.items() if complaint in fields.get("complaints", ())]
+    urgent = [words for complaint, words in URGENT.items() if complaint in (fields.get("complaints") or ())]
     if urgent:
         return Outcome("refer_today", f"See the doctor today: {' and '.join(urgent)}.")
     limit = protocol.programme.vision_limit

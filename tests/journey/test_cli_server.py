@@ -81,12 +81,20 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
 ) -> None:
     server = Server(head_file, tmp_path / "data", environment)
     with server.running() as process:
-        kept = [server.ask("POST", "/api/captures", {"eye": eye})["id"] for eye in ("OD", "OS")]
+        visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
+        server.ask("PATCH", f"/api/visits/{visit}", {"key": "1" * 16, "field": "age", "value": 54})
+        where = {"visit": visit, "key": "2" * 16}
+        kept = [server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"]]
+        kept.append(server.ask("POST", "/api/captures", {"eye": "OS"})["id"])
         second = diffuscope("run", "--head", head_file, "--port", server.port, "--data", tmp_path / "other")
         assert second.returncode == 2
         assert "cannot be served" in second.stderr
         assert f"--port {server.port + 1}" in second.stderr
         assert not (tmp_path / "other").exists()
+        wrong = tmp_path / "protocol.toml"
+        wrong.write_text("retakes = 2\n")
+        third = diffuscope("run", "--head", head_file, "--protocol", wrong)
+        assert (third.returncode, "protocol.toml" in third.stderr) == (2, True)
         with ThreadPoolExecutor(1) as aside:
             pressed = aside.submit(server.ask, "POST", "/api/captures", {"eye": "OD"})
             while server.ask("GET", "/api/status")["state"] != "busy" and not pressed.done():
@@ -97,6 +105,10 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
     with server.running() as process:
         listed = server.listed()
         assert listed[-2:] == kept[::-1]
+        (unfinished,) = server.ask("GET", "/api/visits?open=true")["visits"]  # where it was, to go on
+        assert (unfinished["id"], unfinished["fields"], unfinished["next_slot"]) == (visit, {"age": 54}, "R-nerve")
+        assert unfinished["slots"]["R-centre"]["capture"] == kept[0]
+        assert server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"] == kept[0]
         for id in listed:  # also a third, if it was killed after it had been kept
             for name in ("raw.tiff", "picture.png", "quick.jpg", "report.json"):
                 assert server.ask("GET", f"/api/captures/{id}/{name}")

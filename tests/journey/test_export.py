@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 
 from device.errors import StickFull, StickGone
 from services.instrument.api import create_app
-from services.instrument.exporting import Sticks, copied
+from services.instrument.exporting import Sticks, copied, zipped
 
 keys = (f"{number:016x}" for number in count(1))
 FILES = {"R-centre-1.png": b"p" * 5000, "visit.json": b"{}"}
@@ -75,9 +76,15 @@ def test_the_zip_holds_pictures_reports_and_sums_that_hold_and_no_name(rig: Any,
         assert secret not in answer.content
 
 
+def test_a_clock_that_was_never_set_does_not_stop_a_zip() -> None:
+    content = zipped("A", FILES, datetime(1970, 1, 1, tzinfo=UTC))
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert {info.date_time[0] for info in archive.infolist()} == {1980}
+
+
 def test_a_copy_on_a_stick_is_whole_and_an_earlier_one_stays(rig: Any, visit: Any, stick: Path) -> None:
     listed = rig.request("GET", "/api/exports").json()["folders"]
-    assert [(one["folder"], one["name"]) for one in listed] == [(str(stick), "USB STICK")]
+    assert [(one["id"], one["name"]) for one in listed] == [(str(stick), "USB STICK")]
     assert listed[0]["free_bytes"] > 0
     order = {"key": next(keys), "folder": str(stick)}
     at = f"/api/visits/{visit['id']}/export"
