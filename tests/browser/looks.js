@@ -72,15 +72,20 @@
     if (!el.contains(top)) faults.push(`covered: ${selector} by ${name(top)}`);
   }
 
-  const seen = (selector) => {
-    const el = document.querySelector(selector);
-    return el?.checkVisibility() ? el.getBoundingClientRect() : null;
-  };
-  const [stage, prompt, panel] = [".stage", ".prompt", ".panel"].map(seen);
-  const apart = (a, b) => !a || !b || a.top >= b.bottom || a.bottom <= b.top || a.left >= b.right || a.right <= b.left;
-  if (!apart(stage, prompt)) faults.push("the words beside the picture cover it");
-  if (!apart(prompt, panel)) faults.push("the words beside the picture lie over the controls");
-  if (stage?.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  if (document.querySelector(".exam")) {
+    const stage = document.querySelector(".stage").getBoundingClientRect();
+    const prompt = document.querySelector(".prompt").getBoundingClientRect();
+    if (prompt.top < stage.bottom) faults.push("the words under the picture cover it");
+    const below = document.querySelector(".panel").getBoundingClientRect();
+    if (prompt.bottom > below.top && prompt.right > below.left) faults.push("the words under the picture lie over the controls");
+    if (stage.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  } else if (document.querySelector(".prompt")) {
+    const stage = document.querySelector(".stage")?.getBoundingClientRect();
+    const prompt = document.querySelector(".prompt").getBoundingClientRect();
+    const apart = !stage || prompt.top >= stage.bottom || prompt.bottom <= stage.top || prompt.left >= stage.right;
+    if (!apart) faults.push("the words beside the picture cover it");
+    if (stage?.height < 140) faults.push(`the picture is only ${stage.height} high`);
+  }
 
   for (const role of ["main", "header", "h1", "[role=status]"]) {
     if (document.querySelectorAll(role).length !== 1) faults.push(`not exactly one ${role}`);
