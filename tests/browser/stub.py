@@ -70,6 +70,7 @@ class Stub:
     patched: list[tuple[str, Any]] = field(default_factory=list)
     kind: str = "simulated"
     problem: dict[str, str] | None = None
+    notices: list[str] = field(default_factory=list)
     swept: list[str] = field(default_factory=list)
     refuse: tuple[int, dict[str, str]] | None = None
     warnings: list[str] = field(default_factory=list)
@@ -171,7 +172,7 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
-                "controller": stub.controller and "a public name"}  # fmt: skip
+                "controller": stub.controller and "a public name", "notices": stub.notices}  # fmt: skip
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:
@@ -251,7 +252,7 @@ def _visits(app: FastAPI, stub: Stub) -> None:
 
     @app.get("/api/exports")
     def exports() -> dict[str, Any]:
-        return {"folders": [{"id": "usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
+        return {"folders": [{"folder": "/media/usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
 
 
 def _live(app: FastAPI, stub: Stub) -> None:

@@ -113,6 +113,14 @@ def test_the_problem_of_the_status_stands_on_every_screen_and_goes_by_itself(ope
     expect(page.locator(".state-bar")).to_have_count(0)
 
 
+def test_what_the_instrument_found_is_told_once_in_its_own_words(open_page: Open, stub: Stubbed) -> None:
+    stub.stub.notices = ["The camera is warmer than at its calibration. Pictures are still fine."]
+    page = open_page(stub.url)
+    expect(page.locator(".notices li")).to_have_text(re.compile("warmer than at its calibration"))
+    page.locator("[data-do=later]").tap()
+    expect(page.locator(".notices")).to_have_count(0)
+
+
 def test_too_much_light_for_one_eye_offers_the_other(open_page: Open, stub: Stubbed, complaints: Complaints) -> None:
     complaints.expect("423")
     stub.stub.refuse = (423, {"code": "light.limit", "message": "Enough.", "remedy": "Rest.", "n": 4})

@@ -307,7 +307,7 @@ def test_a_visit_is_copied_to_a_stick_and_saved_as_a_file(open_page: Open, stub:
     taken(page)
     page.goto(f"{stub.url}/#/visit/v142/film")
     tap(page, "#copy")
-    page.locator("[data-folder=usb-1]").tap()
+    page.locator("[data-folder='/media/usb-1']").tap()
     expect(page.get_by_role("note")).to_contain_text("Copied to USB stick BLUE.")
     expect(page.get_by_role("link", name="ZIP")).to_have_attribute("href", "/api/visits/v142/export.zip")
 

@@ -96,8 +96,8 @@ function away({ visit, folders, copied }, act) {
       <a class="button" href=${zipOf(visit.id)} download>${t("film.zip")}</a>
       <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
-        (folder) => html`<button type="button" data-folder=${folder.id ?? folder} @click=${() => act.copyTo(folder)}>
-          ${folder.name ?? folder}
+        (stick) => html`<button type="button" data-folder=${stick.folder} @click=${() => act.copyTo(stick)}>
+          ${stick.name}
         </button>`,
       )}
     </div>
