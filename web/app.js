@@ -106,8 +106,20 @@ async function refreshStatus() {
   set({ status: Object.freeze(status), doing: status.state });
   lower(({ from, told }) => from === "status" && told !== problem?.code);
   if (problem) raise({ ...problem, told: problem.code, from: "status" });
+  tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
   await holdControls();
+}
+
+const told = new Set(); // a finding that somebody has put off is not told again to this page
+
+// What the instrument found about itself that does not stop it, in its own words.
+function tellFindings(notices) {
+  lower(({ from, message }) => from === "finding" && !notices.includes(message));
+  for (const message of notices.filter((words) => !told.has(words))) {
+    told.add(message);
+    raise({ code: `finding.${told.size}`, level: "tell", rank: 99, message, buttons: ["later"], from: "finding" });
+  }
 }
 
 function tellSwept(swept) {

@@ -51,8 +51,6 @@ export const ENGLISH = {
   "find.none": "Nobody here yet.",
   "find.open": "To finish",
 
-  "person.title": "Person {number}",
-  "person.age": "{n} years",
   "sex.woman": "Woman",
   "sex.man": "Man",
   "sex.other": "Other",
@@ -328,7 +326,7 @@ export const ENGLISH = {
   "theme.dim": "Dim room",
   "theme.daylight": "Daylight",
   "menu.auto": "Take the picture by itself when ready",
-  "menu.technician": "For the technician",
+  "menu.technician": "For the technician: calibration",
   "menu.keys": "Keys",
   "menu.letters": "Use the letter and number keys",
   "key.take": "Space, Enter",

@@ -12,7 +12,7 @@ import { person } from "./screens/person.js";
 import { picture } from "./screens/picture.js";
 import { isExam, stage } from "./screens/stage.js";
 import { html, nothing } from "./vendor/lit-html.js";
-import { t } from "./words.js";
+import { has, t } from "./words.js";
 
 const SCREENS = { home, find, person, aim, picture, outcome, history, film, compare };
 
@@ -60,7 +60,7 @@ function header(state, act) {
       ${title(route, visit, act)}
       <p class="head-name">
         <span class="name">${status?.name ?? ""}</span>
-        <span class="state" data-state=${word}>${t(`doing.${word}`)}</span>
+        <span class="state" data-state=${word}>${t(has(`doing.${word}`) ? `doing.${word}` : "doing.busy")}</span>
         ${space === undefined || space === null ? nothing : html`<span class="space">${t("space", { n: space })}</span>`}
       </p>
       ${kindChip(shotOf(state)?.capture?.simulated ? "simulated" : status?.kind)}

@@ -160,7 +160,7 @@ export async function reopen() {
   resume(visit);
 }
 
-export async function copyTo(folder) {
-  const done = await politely(() => send("POST", at(get().route.visit, "export"), { folder: folder.id ?? folder }));
-  if (done) set({ copied: folder.name ?? folder });
+export async function copyTo({ folder, name }) {
+  const done = await politely(() => send("POST", at(get().route.visit, "export"), { folder }));
+  if (done) set({ copied: name });
 }

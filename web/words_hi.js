@@ -39,7 +39,6 @@ export const WORDS = {
   "find.none": "अभी कोई नहीं।",
   "find.open": "बाकी",
 
-  "person.title": "व्यक्ति {number}",
   "sex.woman": "महिला",
   "sex.man": "पुरुष",
   "sex.other": "अन्य",

@@ -45,7 +45,6 @@ export const WORDS = {
   "find.none": "இன்னும் யாரும் இல்லை.",
   "find.open": "முடிக்க வேண்டும்",
 
-  "person.title": "நபர் {number}",
   "sex.woman": "பெண்",
   "sex.man": "ஆண்",
   "sex.other": "பிற",

@@ -39,7 +39,6 @@ export const WORDS = {
   "find.none": "ఇంకా ఎవరూ లేరు.",
   "find.open": "మిగిలినది",
 
-  "person.title": "వ్యక్తి {number}",
   "sex.woman": "స్త్రీ",
   "sex.man": "పురుషుడు",
   "sex.other": "ఇతర",

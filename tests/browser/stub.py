@@ -23,7 +23,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 from fastapi.staticfiles import StaticFiles
 from PIL import Image
 
-from tests.browser.stub_visits import PROTOCOL, Visits, empty_slot
+from tests.browser.stub_visits import PROTOCOL, Visits
 
 WEB = Path(__file__).parents[2] / "web"
 ROWS, COLS, FIELD_PX = 540, 960, 260
@@ -62,6 +62,7 @@ class Stub:
 
     expose_s: float = 0.1
     refine_s: float = 0.3
+    hold: str | None = None  # a press waits before its "verdict" or its "keep" for as long as this says so
     verdicts: list[str | None] = field(default_factory=list)  # causes of the next pictures; None and none left: good
     aim: dict[str, Any] | None = field(default_factory=lambda: {"code": "ready", "fill": 0.9})
     controller: str | None = None
@@ -69,6 +70,7 @@ class Stub:
     patched: list[tuple[str, Any]] = field(default_factory=list)
     kind: str = "simulated"
     problem: dict[str, str] | None = None
+    notices: list[str] = field(default_factory=list)
     swept: list[str] = field(default_factory=list)
     refuse: tuple[int, dict[str, str]] | None = None
     warnings: list[str] = field(default_factory=list)
@@ -87,6 +89,10 @@ class Stub:
     def tell(self, kind: str, data: dict[str, Any]) -> None:
         self.events.append((kind, data))
 
+    async def release(self, what: str) -> None:
+        while self.hold == what:
+            await asyncio.sleep(0.02)
+
     def stage(self, name: str, stage: str, fraction: float, left_s: float) -> None:
         url = f"/api/captures/{name}/quick.jpg" if stage != "expose" else None
         self.tell("stage", {"id": name, "stage": stage, "url": url, "fraction": fraction, "left_s": left_s})
@@ -94,6 +100,32 @@ class Stub:
     def next_verdict(self) -> dict[str, Any]:
         code = self.verdicts.pop(0) if self.verdicts else None
         return {"word": "again" if code else "good", "code": code, "numbers": {}}
+
+    async def made(self, wish: dict[str, str]) -> dict[str, Any] | None:
+        """One picture, told step by step; nothing if the test that pressed is over."""
+        name = f"20261120T1000{self.presses:02d}-{wish['eye']}-stub"
+        verdict, shelf = self.next_verdict(), self.visits
+        self.tell("state", {"state": "busy"})
+        self.stage(name, "expose", 0.05, self.refine_s)
+        await asyncio.sleep(self.expose_s)
+        self.tell("state", {"state": "making"})
+        for step in range(5):
+            self.stage(name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, self.refine_s * (1 - step / 5))
+            if step == 2:
+                await self.release("verdict")
+                self.tell("verdict", {"id": name, **verdict})
+            await asyncio.sleep(self.refine_s / 5)
+            if step == 4:
+                await self.release("keep")
+            if self.visits is not shelf:
+                return None
+        self.stage(name, "keep", 1.0, 0)
+        self.captures.insert(0, self.capture(name, wish, verdict))
+        if wish.get("visit"):
+            self.visits.taken(wish["visit"], wish["slot"], name, verdict)
+        self.tell("kept", self.captures[0])
+        self.tell("state", {"state": "aim"})
+        return self.captures[0]
 
     def capture(self, name: str, wish: dict[str, Any], verdict: dict[str, Any]) -> dict[str, Any]:
         return {
@@ -140,7 +172,7 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
-                "controller": stub.controller and "a public name"}  # fmt: skip
+                "controller": stub.controller and "a public name", "notices": stub.notices}  # fmt: skip
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:
@@ -161,27 +193,8 @@ def _captures(app: FastAPI, stub: Stub) -> None:
             return JSONResponse(stub.refuse[1], stub.refuse[0])
         if stub.controller not in (None, x_controller):
             return JSONResponse(OTHER, 409)
-        name = f"20261120T1000{stub.presses:02d}-{wish['eye']}-stub"
-        verdict = stub.next_verdict()
-        shelf = stub.visits
-        stub.tell("state", {"state": "busy"})
-        stub.stage(name, "expose", 0.05, stub.refine_s)
-        await asyncio.sleep(stub.expose_s)
-        stub.tell("state", {"state": "making"})
-        for step in range(5):
-            stub.stage(name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, stub.refine_s * (1 - step / 5))
-            if step == 2:
-                stub.tell("verdict", {"id": name, **verdict})
-            await asyncio.sleep(stub.refine_s / 5)
-            if stub.visits is not shelf:
-                return JSONResponse(UNKNOWN, 404)  # a press of the test before: its shelf is gone
-        stub.stage(name, "keep", 1.0, 0)
-        stub.captures.insert(0, stub.capture(name, wish, verdict))
-        if wish.get("visit"):
-            stub.visits.taken(wish["visit"], wish["slot"], name, verdict)
-        stub.tell("kept", stub.captures[0])
-        stub.tell("state", {"state": "aim"})
-        return stub.captures[0]
+        made = await stub.made(wish)
+        return made or JSONResponse(UNKNOWN, 404)
 
     @app.get("/api/captures/{name}")
     def one(name: str) -> Any:
@@ -202,56 +215,44 @@ def _captures(app: FastAPI, stub: Stub) -> None:
 
 
 def _visits(app: FastAPI, stub: Stub) -> None:
-    visits = lambda: stub.visits  # noqa: E731  # a reset brings new ones
-
     @app.get("/api/protocol")
     def protocol() -> dict[str, Any]:
         return PROTOCOL
 
     @app.get("/api/visits")
     def listed(day: str | None = None, open: bool = False, q: str = "") -> dict[str, Any]:
-        return visits().listed(day, open, q)
+        return stub.visits.listed(day, open, q)
 
     @app.post("/api/visits", status_code=201)
     def begin(wish: dict[str, str]) -> dict[str, Any]:
-        known = visits().keys
+        known = stub.visits.keys
         if wish["key"] not in known:
-            known[wish["key"]] = visits().begin(wish.get("number"))
-        return visits().seen(known[wish["key"]])
+            known[wish["key"]] = stub.visits.begin(wish.get("number"))
+        return stub.visits.seen(known[wish["key"]])
 
     @app.get("/api/visits/{name}")
     def visit(name: str) -> Any:
-        return visits().seen(visits().kept[name]) if name in visits().kept else JSONResponse(UNKNOWN, 404)
+        found = stub.visits.kept.get(name)
+        return stub.visits.seen(found) if found else JSONResponse(UNKNOWN, 404)
 
     @app.patch("/api/visits/{name}")
     def patch(name: str, wish: dict[str, Any]) -> dict[str, Any]:
         stub.patched.append((wish["field"], wish["value"]))
-        visits().kept[name]["fields"][wish["field"]] = wish["value"]
-        return visits().seen(visits().kept[name])
+        stub.visits.kept[name]["fields"][wish["field"]] = wish["value"]
+        return stub.visits.seen(stub.visits.kept[name])
+
+    @app.post("/api/visits/{name}/export")
+    def export(name: str, wish: dict[str, Any]) -> dict[str, Any]:
+        return {"folder": wish["folder"], "files": 9}
 
     @app.post("/api/visits/{name}/{what}")
-    def change(name: str, what: str, wish: dict[str, Any]) -> Any:
-        visit = visits().kept[name]
-        if what == "could-not":
-            visit["slots"][wish["slot"]] |= {"state": "could_not", "reason": wish["reason"]}
-        elif what == "slots" and wish["capture"] is None:
-            visit["slots"][wish["slot"]] = empty_slot()
-        elif what == "slots":
-            slot = visit["slots"][wish["slot"]]
-            kept = next(capture for capture in stub.captures if capture["id"] == wish["capture"])
-            slot |= {"state": "taken", "capture": kept["id"], "verdict": kept["verdict"]}
-            slot["captures"] = [*{*slot["captures"], kept["id"]}]
-        elif what == "finish":
-            visits().finish(visit)
-        elif what == "reopen":
-            visit |= {"outcome": None, "finished_at": None, "undo_until": None}
-        elif what == "export":
-            return {"folder": wish["folder"], "files": 9}
-        return visits().seen(visit)
+    def change(name: str, what: str, wish: dict[str, Any]) -> dict[str, Any]:
+        verdicts = {capture["id"]: capture["verdict"] for capture in stub.captures}
+        return stub.visits.change(stub.visits.kept[name], what, wish, verdicts)
 
     @app.get("/api/exports")
     def exports() -> dict[str, Any]:
-        return {"folders": [{"id": "usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
+        return {"folders": [{"folder": "/media/usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
 
 
 def _live(app: FastAPI, stub: Stub) -> None:

@@ -75,6 +75,24 @@ class Visits:
         place["tries"] += 1
         place |= {"state": "taken", "capture": capture, "verdict": verdict, "reason": None}
 
+    def change(
+        self, visit: dict[str, Any], what: str, wish: dict[str, Any], verdicts: dict[str, Any]
+    ) -> dict[str, Any]:
+        """What somebody decided: a slot, the end of the visit, or that it is not the end."""
+        if what == "could-not":
+            visit["slots"][wish["slot"]] |= {"state": "could_not", "reason": wish["reason"]}
+        elif what == "slots" and wish["capture"] is None:
+            visit["slots"][wish["slot"]] = empty_slot()
+        elif what == "slots":
+            slot, name = visit["slots"][wish["slot"]], wish["capture"]
+            slot |= {"state": "taken", "capture": name, "verdict": verdicts[name]}
+            slot["captures"] = [*{*slot["captures"], name}]
+        elif what == "finish":
+            self.finish(visit)
+        elif what == "reopen":
+            visit |= {"outcome": None, "finished_at": None, "undo_until": None}
+        return self.seen(visit)
+
     def finish(self, visit: dict[str, Any]) -> None:
         urgent = {"sudden_loss", "pain"} & set(visit["fields"].get("complaints", []))
         poor = any(s["state"] == "could_not" for s in visit["slots"].values())

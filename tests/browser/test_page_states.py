@@ -36,7 +36,7 @@ def middle_pixel(page: Page, dx: float = 0.0) -> list[int]:
 
 
 def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.refine_s = 2.5
+    stub.stub.hold = "verdict"
     page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
     page.wait_for_selector(".stage[data-mark=quick]")
@@ -47,8 +47,11 @@ def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page:
     page.get_by_role("button", name="Zoom in").tap()
     assert zoom(page) == 2.25
     assert page.locator(".stage").get_attribute("data-mark") == "quick"
-    page.wait_for_timeout(500)
+    stub.stub.hold = "keep"
+    page.wait_for_selector("[data-phase=told]")
+    page.wait_for_timeout(300)
     assert page.locator("progress").evaluate("bar => bar.value") > bar
+    stub.stub.hold = None
     page.wait_for_selector(".stage[data-mark=final]")
     expect(page.get_by_role("status")).to_contain_text("Final picture, kept")
     assert zoom(page) == 2.25
@@ -129,11 +132,12 @@ def test_a_refusal_is_shown_in_the_instruments_own_words(
 
 
 def test_an_impatient_second_press_costs_the_eye_nothing(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.expose_s, stub.stub.refine_s = 1.2, 1.2
+    stub.stub.hold = "verdict"
     page = aiming(open_page, stub)
     page.locator(SHUTTER).dblclick()
     settled(page).locator(SHUTTER).tap(force=True)
     expect(page.get_by_role("status")).to_contain_text("still being made")
+    stub.stub.hold = None
     page.wait_for_selector(".stage[data-mark=final]")
     assert stub.stub.presses == 1
 

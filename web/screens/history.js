@@ -2,6 +2,7 @@
 
 import { zipOf } from "../api.js";
 import { people } from "./home.js";
+import { ending } from "./outcome.js";
 import { icon } from "../icons.js";
 import { choice, slotWords, thumb } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -58,7 +59,7 @@ export function film(state, act) {
   return html`
     <section class="film">
       <h2>${t("film.title", { number: visit.number })}</h2>
-      ${visit.outcome ? html`<p><b>${t(`outcome.${visit.outcome.code}`)}</b> · ${visit.outcome.sentence}</p>` : nothing}
+      ${visit.outcome ? html`<p>${ending(state).filter(Boolean).join(" · ")}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       <div class="ends">
         ${picked.length === 2
@@ -96,8 +97,8 @@ function away({ visit, folders, copied }, act) {
       <a class="button" href=${zipOf(visit.id)} download>${t("film.zip")}</a>
       <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
-        (folder) => html`<button type="button" data-folder=${folder.id ?? folder} @click=${() => act.copyTo(folder)}>
-          ${folder.name ?? folder}
+        (stick) => html`<button type="button" data-folder=${stick.folder} @click=${() => act.copyTo(stick)}>
+          ${stick.name}
         </button>`,
       )}
     </div>

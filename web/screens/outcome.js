@@ -13,8 +13,8 @@ export function outcome(state, act) {
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: visit.number })}</h2>
-      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${t(`outcome.${visit.outcome.code}`)}</p>
-      <p>${visit.outcome.sentence}</p>
+      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${ending(state)[0]}</p>
+      <p>${ending(state)[1]}</p>
       ${tiles(state, act)}
       <div class="ends">
         <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
@@ -42,6 +42,10 @@ function notYet(act, visit) {
   </section>`;
 }
 
+/** How it ends: the instrument's sentence, which is English; in another language that language's word comes before it. */
+export const ending = ({ visit, language }) =>
+  language === "en" ? [visit.outcome.sentence, ""] : [t(`outcome.${visit.outcome.code}`), visit.outcome.sentence];
+
 /** What the code says: number, date, outcome, telephone of the centre. Never a picture, a name or an age. */
 export function codeText({ visit, protocol }) {
   const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
@@ -58,14 +62,15 @@ function code({ size, path }) {
 }
 
 // Only on paper: the print style sheet shows this and nothing else.
-function slip({ visit, protocol, code: drawn }) {
+function slip(state) {
+  const { visit, protocol, code: drawn } = state;
   const phone = protocol?.programme?.centre_phone;
   const moment = visit.finished_at ?? visit.begun_at;
   return html`<section class="slip" aria-hidden="true">
     <p class="slip-number">${personWords(visit)}</p>
     <p>${calendarDay(moment)}, ${clockTime(moment)}</p>
-    <p class="slip-outcome">${t(`outcome.${visit.outcome.code}`)}</p>
-    <p>${visit.outcome.sentence}</p>
+    <p class="slip-outcome">${ending(state)[0]}</p>
+    <p>${ending(state)[1]}</p>
     ${phone ? html`<p>${t("outcome.phone", { phone })}</p>` : nothing} ${drawn ? code(drawn) : nothing}
   </section>`;
 }

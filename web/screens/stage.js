@@ -75,7 +75,8 @@ function promptOf(state) {
   const { route, note, doing, prompt: hint } = state;
   if (note) return ["wait", "wait", note];
   if (route.screen === "picture") return markOf(state);
-  if (doing === "starting" || doing === "busy") return ["wait", "wait", t(`aim.${doing}`)];
+  if (doing === "starting") return ["wait", "wait", t("aim.starting")];
+  if (doing !== "aim" && doing !== "making") return ["wait", "wait", t("aim.busy")];
   if (!hint || !has(`aim.${hint.code}`)) return ["plain", "ring", t("aim.prompt")];
   return [hint.code === "ready" ? "ready" : "plain", HINTS[hint.code] ?? "ring", t(`aim.${hint.code}`)];
 }
