@@ -30,6 +30,7 @@ FRAMES_OF = {
     "cap": 3 * MANY, "screen": SEARCH + len(LEVELS) * FRAMES + 2, "point": SEARCH + sum(n for _, n in BRACKETS),
 }  # fmt: skip
 RETRY_S = 1.0
+NOT_KEPT = "Free some space, or give the instrument a folder that it may write into, then measure this step again."
 
 
 @dataclass(frozen=True)
@@ -155,13 +156,19 @@ class Wizard:
         except CalibrationStopped:
             raise
         except DiffuscopeError as error:
-            log.warning("calibration: %s", error)
-            if not self._asked_since and not self._needed:
-                raise  # the exam can have the head back
-            with self._turn:
-                self._now.error = error
-                if not self._asked_since:  # it would only happen again: let the technician begin anew
-                    self._wish, self._now.state, self._now.stand = None, "begin", None
+            self._say(error)
+        except OSError as error:
+            self._say(StoreFull(f"what was measured cannot be kept: {error}", NOT_KEPT))
+
+    def _say(self, error: DiffuscopeError) -> None:
+        """Show it, and be ready for another attempt."""
+        log.warning("calibration: %s", error)
+        if not self._asked_since and not self._needed:
+            raise error  # the exam can have the head back
+        with self._turn:
+            self._now.error = error
+            if not self._asked_since:  # it would only happen again: let the technician begin anew
+                self._wish, self._now.state, self._now.stand = None, "begin", None
 
     def _measured(self, bench: Bench, wish: Wish) -> Kept:
         assert self._peephole is not None
@@ -169,12 +176,7 @@ class Wizard:
         job = job_of(bench, self.spec, wish, log.info)
         work = self.archive.root / WORK
         procedure = Procedure(job, self._peephole, operator, self.clock, work, bench.chips.thermometer)
-        try:
-            kept = self.archive.load(procedure.run(self.archive))
-        except DiffuscopeError:
-            raise
-        except OSError as error:
-            raise StoreFull(f"what was measured cannot be kept: {error}") from error
+        kept = self.archive.load(procedure.run(self.archive))
         note_in_head(bench, kept)
         return kept
 
