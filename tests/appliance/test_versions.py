@@ -63,7 +63,10 @@ def until_well(machine: Machine) -> None:
 def until_settled(device: Device, machine: Machine, state: str) -> None:
     """Wait for the journal on the data partition to say so."""
     path = device.data / "update" / "journal.json"
-    machine.until(lambda: slowly() and json.loads(path.read_text())["state"] == state, 240)
+    end_s = time.monotonic() + 300
+    while slowly() and json.loads(path.read_text())["state"] != state:
+        assert time.monotonic() < end_s, device.diary()
+        assert machine.is_there("/"), device.diary()
 
 
 def put_in(device: Device, bundle: Path) -> None:
