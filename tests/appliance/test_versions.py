@@ -105,6 +105,10 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         print(f"2.0 committed {time.monotonic() - begin_s:.0f} s after its boot")  # noqa: T201
         assert device.autoboot() == ("B", "A")
         assert "Updated to 2.0" in status(machine)
+        about = "/usr/share/diffuscope"
+        assert json.loads(machine.run("cat", f"{about}/release.json"))["version"] == "2.0"
+        inside = {part["name"] for part in json.loads(machine.run("cat", f"{about}/sbom.cdx.json"))["components"]}
+        assert {"numpy", "systemd", "rauc", "fastapi"} <= inside
     assert device.captures() == kept
 
 
