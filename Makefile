@@ -8,7 +8,7 @@ PORT ?= 8000
 .PHONY: help run test test-systemd test-appliance test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
-	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 16
+	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
 
 # The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
 PI_LOCK := tests/ports/emulators/requirements.lock

@@ -21,6 +21,7 @@ from device.spec import load_head
 from services.cli import app
 from services.instrument.exam import BUDGET_S
 from services.instrument.watchdog import BEAT_S
+from services.update.command import app as update_app
 from services.update.settings import UpdateSettings
 from services.update.settings import load as load_settings
 from tests.house import BIN, ROOMS, ROOT, Offence, files, judge, nodes, python, text
@@ -258,7 +259,7 @@ def test_every_end_every_boot_and_giving_up_call_the_same_blanker() -> None:
 def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
     """Any output is a failure: for unknown keys systemd-analyze only prints, and says that all is well."""
     for name in UNITS:  # the same units, with the program that this machine has
-        here = re.sub(r"/opt/diffuscope/\S+/diffuscope", str(BIN / "diffuscope"), text(name))
+        here = re.sub(r"/opt/diffuscope/\S+/(diffuscope|python)(?= )", rf"{BIN}/\1", text(name))
         (tmp_path / Path(name).name).write_text(here, encoding="utf-8")
     words = ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", *sorted(tmp_path.iterdir())]
     done = subprocess.run(words, capture_output=True, text=True)
@@ -269,7 +270,9 @@ def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
 def test_what_updates_is_locked_in_and_called_with_words_that_exist(name: str) -> None:
     """It runs as root, who owns RAUC: so without capabilities, and on a disk that is read-only but for its journal."""
     service = unit_of(f"systemd/{name}.service")["Service"]
-    assert not unknown_words(service["ExecStart"].removeprefix("/opt/diffuscope/.venv/bin/"))
+    called = service["ExecStart"].removeprefix("/opt/diffuscope/.venv/bin/python -m services.update ")
+    assert not unknown_words(f"diffuscope update {called}")
+    assert called.split()[0] in typer.main.get_group(update_app).commands
     assert not [key for key in HARDENING if service.get(key) != "yes"]
     assert (service["ProtectSystem"], service["CapabilityBoundingSet"]) == ("strict", "")
     assert service["StateDirectory"] == UpdateSettings().folder.name

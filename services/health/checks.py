@@ -4,6 +4,7 @@ A check is one function from `Facts` to a `Check`, and a place in `CHECKS`. The 
 itself (`services/instrument/wellbeing.py`), because it alone holds the head; this file judges and touches nothing.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -126,7 +127,7 @@ def speed(facts: Facts) -> Check:
     if not facts.press_s:
         return Check("speed", True, "no pictures yet", f"p99 {PRESS_P99_S:g} s", "")
     slow_s = sorted(facts.press_s)
-    p50_s, p99_s = slow_s[len(slow_s) // 2], slow_s[int(0.99 * (len(slow_s) - 1))]
+    p50_s, p99_s = (slow_s[math.ceil(share * len(slow_s)) - 1] for share in (0.5, 0.99))
     value = f"p50 {p50_s:.2f} s, p99 {p99_s:.2f} s of {len(slow_s)}"
     remedy = "Turn the device off and on, and let it cool. If it stays slow, call the technician."
     return Check("speed", p99_s <= PRESS_P99_S, value, f"p99 {PRESS_P99_S:g} s", remedy)

@@ -73,7 +73,7 @@ def table(checks: Sequence[Check]) -> str:
     lines = []
     for check in checks:
         mark = "ok  " if check.ok else "FAIL"
-        lines.append(f"{mark}  {check.name:<12} {check.value:<44} {check.limit}")
+        lines.append(f"{mark}  {check.name:<12} {check.value:<56}  {check.limit}")
         if not check.ok and check.remedy:
             lines.append(f"{'':<19}{check.remedy}")
     return "\n".join(lines)

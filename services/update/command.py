@@ -1,6 +1,7 @@
 """`diffuscope update check|install|restart|settle|status`: what a technician, a timer and a boot call."""
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ from typing import Annotated
 import typer
 
 from device.clock import SystemClock
+from device.errors import DiffuscopeError
 from services.update.settings import PLACE, load
 from services.update.updater import Updater
 
@@ -62,3 +64,12 @@ def status(
     """Say which version runs and what became of the last update."""
     entry, words = _updater(settings).status()
     typer.echo(json.dumps(asdict(entry) | {"words": words}, indent=1) if as_json else words)
+
+
+def main() -> None:
+    """Run the command line without the rest of `diffuscope`; an error of ours is a sentence and a remedy."""
+    try:
+        app(prog_name="python -m services.update")
+    except DiffuscopeError as error:
+        typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
+        sys.exit(2)

@@ -115,6 +115,11 @@ class Device:
             assert time.monotonic() < end, f"it did not restart{machine.journal()}"
             time.sleep(0.1)
 
+    def diary(self) -> str:
+        """The last lines of the journal on the data partition, also of a machine that is off."""
+        words = ["journalctl", "-D", str(self.data / "journal"), "--no-pager", "-n", "60"]
+        return subprocess.run(words, capture_output=True, text=True, check=False).stdout
+
     def captures(self) -> dict[str, str]:
         """Every file of every capture, with its SHA-256."""
         folder = self.data / "captures" / "captures"

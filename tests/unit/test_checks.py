@@ -54,6 +54,11 @@ def test_one_slow_press_in_a_hundred_is_forgiven() -> None:
     assert all(check.ok for check in judged(replace(WELL, press_s=[1.0] * 99 + [30.0])))
 
 
+def test_of_two_presses_the_slower_one_counts() -> None:
+    speed = judged(replace(WELL, press_s=[7.0, 2.0]))[-1]
+    assert (speed.ok, speed.value) == (False, "p50 2.00 s, p99 7.00 s of 2")
+
+
 def test_parts_that_a_head_does_not_have_are_no_failure() -> None:
     bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, press_s=[])
     assert all(check.ok for check in judged(bare))

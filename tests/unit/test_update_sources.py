@@ -3,6 +3,7 @@
 import hashlib
 import json
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -136,6 +137,12 @@ def test_settings_refuse_what_they_do_not_know(tmp_path: Path) -> None:
         (tmp_path / "update.toml").write_text(text)
         with pytest.raises(ValueError, match=r"update\.toml"):
             load(tmp_path / "update.toml")
+
+
+def test_what_judges_a_version_loads_none_of_what_it_judges() -> None:
+    asks = "import sys, services.update.command; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert not {"numba", "scipy", "pyfftw", "fastapi", "device.head", "device.recon"} & set(loaded.split())
 
 
 def test_sticks_are_looked_at_one_folder_deep(tmp_path: Path) -> None:
