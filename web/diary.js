@@ -58,7 +58,7 @@ function view(entries, failed, worst, act) {
       <label><input type="checkbox" .checked=${worst} @change=${act.worst} /> ${t("diary.worst")}</label>
     </div>
     ${failed ? html`<p class="bad" role="alert">${t("diary.failed")}</p>` : ""}
-    ${entries && !shown.length ? html`<p>${t("diary.empty")}</p>` : ""}
+    <p role="status">${entries && (shown.length ? t("diary.count", { n: shown.length }) : t("diary.empty"))}</p>
     <ol class="diary">${shown.map((one) => html`<li class=${one.level}>
       <p><time datetime=${one.at}>${calendarDay(one.at)}, ${clockTime(one.at)}</time>
         ${one.level in LEVELS ? html`<b>${LEVELS[one.level]} ${t(`diary.${one.level}`)}</b>` : ""} ${one.text}</p>

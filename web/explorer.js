@@ -151,28 +151,27 @@ function points({ explored, all, capture, captures }, act) {
   const rows = points.filter((one) => all || one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
     ${plot(points, budget, act, capture !== null)}
-    <label><input type="checkbox" .checked=${all} @change=${act.showAll} /> ${t("explore.all")}</label>
+    <div class="row">
+      <label><input type="checkbox" .checked=${all} @change=${act.showAll} /> ${t("explore.all")}</label>
+    </div>
     ${capture ? html`<label>${t("explore.capture")}
       <select @change=${act.pick}>${captures.map((one) => html`
         <option value=${one.id} ?selected=${one === capture}>
           ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}
         </option>`)}
       </select></label>` : html`<p class="muted">${t("explore.nothing")}</p>`}
-    <div class="scrolls" tabindex="0" role="region" aria-label=${t("explore.table")}>
     <table>
       <caption>${t("explore.table")}</caption>
       <thead><tr>
-        ${["method", "bin", "rounds", "seconds", "psnr", "see"].map((name) => html`<th scope="col">${t(`explore.${name}`)}</th>`)}
+        ${["method", "seconds", "psnr", "see"].map((name) => html`<th scope="col">${t(`explore.${name}`)}</th>`)}
       </tr></thead>
       <tbody>${rows.map((one) => html`<tr>
-        <th scope="row">${one.method}${one.pareto ? ` ★` : ""}</th>
-        <td>${one.bin}</td><td>${one.rounds}</td>
+        <th scope="row">${t("explore.again", one)}${one.pareto ? " ★" : ""}</th>
         <td>${number(one.seconds_median, 3)}</td><td>${number(one.psnr_db, 1)}</td>
         <td><button type="button" aria-disabled=${!capture} @click=${() => capture && act.see(one)}
           aria-label=${t("explore.see.one", one)}>${t("explore.see")}</button></td>
       </tr>`)}</tbody>
     </table>
-    </div>
   `;
 }
 
@@ -218,7 +217,7 @@ function compared({ capture, point, again, zoom }, act) {
       <figure>
         ${again ? html`<div class="compared zoom-${zoom}" tabindex="0" @scroll=${act.moved}>
             <img src=${again} alt=${t("explore.again.alt")} />
-          </div>` : html`<p role="status">${t("explore.making")}</p>`}
+          </div>` : html`<p>${t("explore.making")}</p>`}
         <figcaption>${t("explore.again", point)}</figcaption>
       </figure>
     </div>

@@ -1,0 +1,98 @@
+"""The technician's other rooms on the real server: health, accuracy against time, the diary."""
+
+import json
+import shutil
+import urllib.request
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Server
+from tests.browser.looks import SIZES, look_for_faults
+from tests.browser.test_wizard import HEAD, SMALL_PLANS, come_in
+
+pytestmark = pytest.mark.browser
+
+Open = Callable[..., Page]
+POINTS = [
+    {"method": "tikhonov", "bin": 1, "rounds": 0, "seconds_median": 0.020, "psnr_db": 27.1, "pareto": False},
+    {"method": "gradient", "bin": 2, "rounds": 0, "seconds_median": 0.004, "psnr_db": 28.0, "pareto": True},
+    {"method": "variation", "bin": 2, "rounds": 8, "seconds_median": 0.090, "psnr_db": 31.5, "pareto": True},
+]
+MEASURED = {"scene": "A scene", "measured_at": "2026-11-01T09:30:00+00:00", "budget_s": 0.26, "points": POINTS}
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A real server with one picture on its shelf, on which a frontier was measured before."""
+    folder = tmp_path_factory.mktemp("rooms")
+    (folder / "head.toml").write_text(HEAD.split("[calibration]")[0] + "[sim]\n")
+    server = Server(folder / "data", str(folder / "head.toml"))
+    if SMALL_PLANS.is_dir():
+        shutil.copytree(SMALL_PLANS, server.data / "plans")
+    (server.data / "explorer").mkdir(parents=True)
+    (server.data / "explorer" / "frontier.json").write_text(json.dumps(MEASURED))
+    server.start()
+    server.wait_until_ready()
+    body = json.dumps({"eye": "OD"}).encode()
+    press = urllib.request.Request(f"{server.url}/api/captures", body, {"Content-Type": "application/json"})
+    assert urllib.request.urlopen(press, timeout=90).status == 201
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def inside(open_page: Open, rooms: Server, complaints: object) -> Page:
+    page = open_page(f"{rooms.url}/technician", SIZES["portrait"])
+    come_in(page)
+    page.wait_for_timeout(700)
+    return page
+
+
+def enter(page: Page, room: str) -> None:
+    page.locator(f"[data-room={room}]").tap()
+    expect(page.locator(f"[data-room={room}]")).to_have_attribute("aria-current", "page")
+
+
+def faults(page: Page, ready: str) -> list[str]:
+    found = []
+    for name, (width, height) in SIZES.items():
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_selector(ready)
+        found += [f"{name}: {fault}" for fault in look_for_faults(page)]
+    return found
+
+
+def test_health_says_of_every_part_how_it_is(inside: Page) -> None:
+    enter(inside, "health")
+    checks = inside.locator("li[data-check]")
+    expect(checks).to_have_count(9)
+    assert {check.get_attribute("data-ok") for check in checks.all()} == {"true"}
+    assert faults(inside, "li[data-check]") == []
+
+
+def test_a_capture_is_seen_under_another_method_and_a_pace_is_chosen_to_stay(inside: Page) -> None:
+    enter(inside, "explorer")
+    expect(inside.locator("tbody tr")).to_have_count(2)  # the best for their time
+    inside.get_by_label("Also list what something better beats").tap()
+    expect(inside.locator("tbody tr")).to_have_count(3)
+    inside.locator("tbody tr", has_text="variation").get_by_role("button").tap()
+    again = inside.locator(".compared img").nth(1)
+    expect(again).to_be_visible(timeout=60_000)
+    assert again.evaluate("(picture) => picture.decode().then(() => picture.naturalWidth)") > 100
+    assert faults(inside, ".compared img >> nth=1") == []
+    inside.get_by_role("button", name="Best").tap()
+    expect(inside.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
+    inside.reload()
+    enter(inside, "explorer")
+    expect(inside.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
+
+
+def test_the_diary_tells_what_happened_in_sentences(inside: Page) -> None:
+    enter(inside, "diary")
+    expect(inside.locator(".diary li").first).to_be_visible()
+    said = inside.locator(".diary").inner_text()
+    assert "a picture was kept after" in said
+    assert "started, version" in said
+    assert faults(inside, ".diary li") == []
