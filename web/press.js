@@ -87,8 +87,8 @@ function kept(capture, key = byId(capture.id)?.key) {
   known.add(capture.id);
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.capture) return;
-  lock(); // the buttons have just changed under the finger
   const verdict = capture.verdict ?? shot.verdict;
+  if (verdict?.word !== "good" || shot.verdict?.word !== "good") lock(); // the buttons have just changed under the finger
   change(key, { id: capture.id, capture: Object.freeze(capture), verdict, over: true, stage: { ...shot.stage, fraction: 1 } });
   refreshVisit(shot.visit);
 }

@@ -339,7 +339,7 @@ def test_keys_go_the_whole_way(open_page: Open, stub: Stubbed) -> None:
     settled(page).keyboard.press("r")
     page.wait_for_selector("[data-screen=aim]")
     settled(page).keyboard.press("Enter")
-    page.wait_for_selector("[data-verdict=good]")
+    page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     settled(page).keyboard.press("n")
     expect(page.locator(SHUTTER)).to_contain_text("Nerve")
     page.keyboard.press("4")
