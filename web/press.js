@@ -87,10 +87,21 @@ function kept(capture, key = byId(capture.id)?.key) {
   known.add(capture.id);
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.capture) return;
-  lock(); // the buttons have just changed under the finger
   const verdict = capture.verdict ?? shot.verdict;
+  if (verdict?.word !== "good" || shot.verdict?.word !== "good") lock(); // the buttons have just changed under the finger
   change(key, { id: capture.id, capture: Object.freeze(capture), verdict, over: true, stage: { ...shot.stage, fraction: 1 } });
+  intoSlot(shot, capture.id, verdict);
   refreshVisit(shot.visit);
+}
+
+// The tile shows the picture at once; the visit that is loaded then has the last word.
+function intoSlot({ visit: id, slot: name }, capture, verdict) {
+  const { visit } = get();
+  const slot = visit?.id === id ? visit.slots[name] : null;
+  if (!slot || slot.captures.includes(capture)) return;
+  const captures = [...slot.captures, capture];
+  const taken = { ...slot, state: "taken", capture, captures, verdict, tries: slot.tries + 1 };
+  set({ visit: Object.freeze({ ...visit, slots: { ...visit.slots, [name]: taken } }) });
 }
 
 /** What the instrument says about shots, by the name of the event. */

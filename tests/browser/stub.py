@@ -258,7 +258,7 @@ def _visits(app: FastAPI, stub: Stub) -> None:
 def _live(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/preview")
     async def preview(after: int) -> Response:
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.25)  # four a second: drawing in software is what these tests wait for
         headers = {"X-Frame": str(after + 1), "X-Age-Ms": str(stub.preview_age_ms)}
         headers |= {"X-Aim": json.dumps(stub.aim)} if stub.aim else {}
         return Response(encoded("jpeg", 4, 3.0 * (after % 2)), media_type="image/jpeg", headers=headers)

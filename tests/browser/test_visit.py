@@ -19,8 +19,9 @@ def screen(page: Page) -> str:
     return page.locator(".page").get_attribute("data-screen") or ""
 
 
-def face(page: Page, slot: str) -> str:
-    return page.locator(f".tiles [data-slot='{slot}']").get_attribute("data-face") or ""
+def expect_face(page: Page, slot: str, face: str) -> None:
+    """What the tile of a slot shows: good, poor, making, could_not or empty."""
+    expect(page.locator(f".tiles [data-slot='{slot}']")).to_have_attribute("data-face", face)
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
@@ -49,17 +50,17 @@ def test_a_whole_visit_with_a_retake_and_a_could_not(open_page: Open, stub: Stub
     page.get_by_role("button", name="Menu").tap()
     faults["menu"] = look_for_faults(page)
     page.keyboard.press("Escape")
-    assert face(page, "R-centre") == "good"
+    expect_face(page, "R-centre", "good")
     tap(page, "#next")
 
     expect(page.locator(SHUTTER)).to_contain_text("Nerve")
     taken(page)
     expect(page.locator(".card")).to_contain_text("It moved. Rest your hand on the cheek.")
-    assert face(page, "R-nerve") == "poor", "the poor picture itself is shown, with a mark"
+    expect_face(page, "R-nerve", "poor")
     assert page.locator("[data-slot='R-nerve'] img").count() == 1
     tap(page, "#again")
     taken(page)
-    assert face(page, "R-nerve") == "good"
+    expect_face(page, "R-nerve", "good")
     tap(page, "#next")
 
     expect(page.locator(SHUTTER)).to_contain_text("Left eye")
@@ -73,7 +74,7 @@ def test_a_whole_visit_with_a_retake_and_a_could_not(open_page: Open, stub: Stub
     faults["why"] = look_for_faults(page)
     tap(page, "[data-reason=pupil]")
     expect(page.locator(SHUTTER)).to_contain_text("Left eye · Nerve")
-    assert face(page, "L-centre") == "could_not"
+    expect_face(page, "L-centre", "could_not")
 
     taken(page)
     expect(page.locator("#next")).to_contain_text("Finish")
@@ -153,7 +154,7 @@ def test_the_verdict_comes_before_the_picture_and_the_next_press_need_not_wait(o
     expect(page.locator(".card")).to_contain_text("Good picture. You can go on.")
     expect(page.locator("progress")).to_be_visible()
     tap(page, "#next")
-    assert face(page, "R-centre") == "making"
+    expect_face(page, "R-centre", "making")
     tap(page, SHUTTER)
     page.wait_for_selector("[data-phase=told]")
     assert stub.stub.presses == 2
@@ -339,7 +340,7 @@ def test_keys_go_the_whole_way(open_page: Open, stub: Stubbed) -> None:
     settled(page).keyboard.press("r")
     page.wait_for_selector("[data-screen=aim]")
     settled(page).keyboard.press("Enter")
-    page.wait_for_selector("[data-verdict=good]")
+    page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     settled(page).keyboard.press("n")
     expect(page.locator(SHUTTER)).to_contain_text("Nerve")
     page.keyboard.press("4")
