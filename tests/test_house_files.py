@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -107,6 +108,18 @@ def test_the_wheel_holds_what_the_instrument_needs_at_run_time(tmp_path: Path) -
     }
     needed |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
     assert needed - held == set()
+
+
+def test_a_release_holds_what_the_program_needs_and_nothing_that_was_not_tested() -> None:
+    """`make lock` writes both lists; one that is forgotten is found here, not by a device that does not start."""
+    whole, release = (
+        set(re.findall(r"^([a-z0-9.-]+==[^ ]+)", text(name), re.M))
+        for name in ("requirements.lock", "systemd/image/requirements.lock")
+    )
+    needed = tomllib.loads(text("pyproject.toml"))["project"]["dependencies"]
+    names = {re.split(r"[^A-Za-z0-9-]", wish)[0].lower() for wish in needed}
+    assert names <= {pin.split("==")[0] for pin in release}, "make lock"
+    assert release <= whole, "make lock"
 
 
 # READMEs
