@@ -142,9 +142,9 @@ def test_a_calibration_of_another_shape_than_the_head_is_not_even_kept(archive, 
     say("export", tmp_path / "one", "--archive", archive.root, "--key", key)
     head = ("--head", ROOT / "hardware/heads/sim.toml")
     said = refused("import", tmp_path / "one", "--archive", there, "--trust", f"{key}.pub", *head)
-    assert "has 24 x 32 pixels, the head's file 1080 x 1920" in said
+    assert "has 17 x 19 pixels, the head's file 1080 x 1920" in said
     assert not there.exists()
-    assert "has 24 x 32 pixels" in refused("use", archive.ids()[0], "--archive", archive.root, *head)
+    assert "has 17 x 19 pixels" in refused("use", archive.ids()[0], "--archive", archive.root, *head)
     assert archive.current() == archive.ids()[1]
 
 

@@ -31,7 +31,7 @@ def run(spec: InstrumentSpec, archive: Path, **mishaps: str) -> list[str]:
     said: list[str] = []
     clock = VirtualClock()
     clock.sleep(len(list(archive.glob("*"))))  # another moment, another calibration
-    calibrate(spec, Wish(archive, None, "Ada", None, mishaps), clock, said.append, said.append)
+    calibrate(spec, Wish(archive, None, "Ada", None, mishaps=mishaps), clock, said.append, said.append)
     return said
 
 
@@ -54,9 +54,9 @@ def before(small: tuple[Path, InstrumentSpec], tmp_path_factory: pytest.TempPath
         ("screen", "finger", r"one part of the flat differs by \d+\.\d% from its surroundings"),
         ("screen", "other mode", r"is \(68, 120\), this head gives"),
         ("point", "too bright", r"\d"),
-        ("point", "too dark", r"it is dark: \d+ DN in 0.6 s \(at least \d+\)"),
+        ("point", "too dark", r"the point source is too dark: \d+ DN at 0.6 s \(at least \d+\)"),
         ("point", "moving", r"the point source has moved by 1\.0 pixels by frame \d+"),
-        ("point", "cap on", "it is dark"),
+        ("point", "cap on", r"the point source is too dark: -?\d+ DN"),
         ("point", "other mode", r"is \(68, 120\), this head gives"),
     ],
 )

@@ -25,7 +25,7 @@ def book(build: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) ->
     with ExitStack() as undo:
         rig = build(tmp_path_factory.mktemp("openapi"), undo)
         rig.request("POST", "/api/visits", json={"key": "0" * 16})
-        app = create_app(rig.exam, names=("testserver",), sticks=Sticks(roots=()))
+        app = create_app(rig.owner, rig.door, names=("testserver",), sticks=Sticks(roots=()))
         yield schemathesis.openapi.from_asgi("/api/openapi.json", app).exclude(path_regex=STREAMS)
 
 

@@ -61,7 +61,9 @@ class Shop:
     def ask(self, method: str, path: str, body: Any = None) -> httpx.Response:
         async def told() -> httpx.Response:
             transport = httpx.ASGITransport(app=self.app)
-            async with httpx.AsyncClient(transport=transport, base_url="http://eye", cookies=self.cookies) as client:
+            async with httpx.AsyncClient(
+                transport=transport, base_url="http://eye.local", cookies=self.cookies
+            ) as client:
                 answer = await client.request(method, path, json=body, timeout=30)
                 self.cookies = client.cookies
                 return answer
