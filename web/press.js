@@ -106,9 +106,11 @@ function intoSlot({ visit: id, slot: name }, capture, verdict) {
 
 /** What the instrument says about shots, by the name of the event. */
 export const heardOfShots = {
-  stage({ id, stage: name, url, fraction, left_s: left }) {
+  stage({ id, key, visit, slot, stage: name, url, fraction, left_s: left }) {
     if (known.has(id)) return;
-    const shot = byId(id) ?? get().shots.find((one) => !one.id && !one.over);
+    // Only by its own key, or by its place after a reload: another screen's picture must never be taken for ours.
+    const own = (one) => one.key === key || (one.reloaded && one.visit === visit && one.slot === slot);
+    const shot = byId(id) ?? get().shots.find((one) => !one.id && !one.over && own(one));
     if (!shot || shot.over) return;
     // A bar that goes back tells people that something broke, so it never does.
     const stage = { name, fraction: Math.max(shot.stage.fraction, fraction ?? 0), left: left ?? 0 };
@@ -148,7 +150,8 @@ export async function openPicture(route) {
     if (capture) put([...get().shots, shotFrom(capture, route)]);
   } else if (["making", "busy"].includes(get().doing)) {
     const eye = eyeOf(get(), route.slot);
-    put([...get().shots, Object.freeze({ key: freshKey(), ...route, eye, id: null, stage: START, verdict: null })]);
+    const shot = { key: freshKey(), ...route, eye, id: null, stage: START, verdict: null, reloaded: true };
+    put([...get().shots, Object.freeze(shot)]);
   } else {
     go({ screen: "aim", visit: route.visit, slot: route.slot }, { replace: true });
   }

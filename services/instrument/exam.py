@@ -106,7 +106,7 @@ class Exam:
             if self._is_busy():
                 raise Busy("a picture is being taken")
             self.fitness.refuse()
-            self._press = Press(Future(), eye, errand)
+            self._press = Press(Future(), eye, errand, key)
             future = self._press.answer
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
             self._in_the_making += 1
@@ -216,7 +216,7 @@ class Exam:
         with self._answering(press):
             taken_at = self.clock.wall()
             id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
-            self._tell_stage(id, "expose", 0.1)
+            self._tell_stage(press, id, "expose", 0.1)
             begin_s = self.clock.now_s()
             frame, dark = self._expose((press.eye,))
             exposed = press, id, taken_at, frame, dark, self.clock.now_s() - begin_s
@@ -268,7 +268,7 @@ class Exam:
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
-        self._tell_stage(shot.id, "keep", 0.9)
+        self._tell_stage(shot.press, shot.id, "keep", 0.9)
         kept = self.store.keep(capture, self._files(shot, capture, made), shot.press.errand.beside)
         self.bulletin.tell("kept", id=shot.id)
         took_s = sum(report["seconds"].values())
@@ -313,7 +313,7 @@ class Exam:
 
     def _show_quick(self, shot: Exposed, image: Image) -> None:
         self._quick[shot.id] = picture.to_jpeg(image, QUICK_PX, shot.frame.simulated)
-        self._tell_stage(shot.id, "quick", 0.4, f"/api/captures/{shot.id}/quick.jpg")
+        self._tell_stage(shot.press, shot.id, "quick", 0.4, f"/api/captures/{shot.id}/quick.jpg")
 
     def _files(self, shot: Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
         shown = self._eye(made.picture)
@@ -373,6 +373,9 @@ class Exam:
             self.bulletin.tell("state", state=self._told)
             self._watchdog.status(self._told)
 
-    def _tell_stage(self, id: str, stage: str, fraction: float, url: str | None = None) -> None:
+    def _tell_stage(self, press: Press, id: str, stage: str, fraction: float, url: str | None = None) -> None:
+        """How far a picture is; it says whose press it is, for no page may take another's picture for its own."""
         self._watchdog.beat()
-        self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url)
+        self.bulletin.tell(
+            "stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url, key=press.key, **press.errand.facts
+        )

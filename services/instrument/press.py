@@ -22,11 +22,12 @@ class Preview:
 
 @dataclass(frozen=True)
 class Press:
-    """Who waits for a picture, of which eye, and what for."""
+    """Who waits for a picture, of which eye, and what for; `key` is the name that the page gave it."""
 
     answer: Future[Capture]
     eye: Eye
     errand: Errand
+    key: str | None
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,10 @@ class Stub:
         while self.hold == what:
             await asyncio.sleep(0.02)
 
-    def stage(self, name: str, stage: str, fraction: float, left_s: float) -> None:
+    def stage(self, wish: dict[str, str], name: str, stage: str, fraction: float, left_s: float) -> None:
         url = f"/api/captures/{name}/quick.jpg" if stage != "expose" else None
-        self.tell("stage", {"id": name, "stage": stage, "url": url, "fraction": fraction, "left_s": left_s})
+        whose = {part: wish.get(part) for part in ("key", "visit", "slot")}
+        self.tell("stage", {"id": name, "stage": stage, "url": url, "fraction": fraction, "left_s": left_s, **whose})
 
     def next_verdict(self) -> dict[str, Any]:
         code = self.verdicts.pop(0) if self.verdicts else None
@@ -106,11 +107,13 @@ class Stub:
         name = f"20261120T1000{self.presses:02d}-{wish['eye']}-stub"
         verdict, shelf = self.next_verdict(), self.visits
         self.tell("state", {"state": "busy"})
-        self.stage(name, "expose", 0.05, self.refine_s)
+        self.stage(wish, name, "expose", 0.05, self.refine_s)
         await asyncio.sleep(self.expose_s)
         self.tell("state", {"state": "making"})
         for step in range(5):
-            self.stage(name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, self.refine_s * (1 - step / 5))
+            self.stage(
+                wish, name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, self.refine_s * (1 - step / 5)
+            )
             if step == 2:
                 await self.release("verdict")
                 self.tell("verdict", {"id": name, **verdict})
@@ -119,7 +122,7 @@ class Stub:
                 await self.release("keep")
             if self.visits is not shelf:
                 return None
-        self.stage(name, "keep", 1.0, 0)
+        self.stage(wish, name, "keep", 1.0, 0)
         self.captures.insert(0, self.capture(name, wish, verdict))
         if wish.get("visit"):
             self.visits.taken(wish["visit"], wish["slot"], name, verdict)

@@ -121,7 +121,7 @@ def test_the_wizard_opens_itself_and_calibrates_with_every_mishap(
 ) -> None:
     complaints.expect("423", "403", "422")
     screener = open_page(workshop.url)
-    expect(screener.locator(".alert")).to_have_attribute("data-code", "calibration.missing")
+    expect(screener.locator(".state-bar")).to_have_attribute("data-code", "cal.missing")
     screener.context.close()
 
     page = open_page(f"{workshop.url}/technician")
