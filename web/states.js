@@ -1,4 +1,4 @@
-// Every state that the page can tell, as data: one table, one way to show it. The words stand in words.js under
+// Every state that the page can tell, as data: one table, one way to show it. The words stand in english.js under
 // "state.CODE" (English master); what stops stands in the prompt bar and in the shutter ("stop.CODE"), what only tells is a chip.
 
 import { get, set } from "./memory.js";
@@ -57,6 +57,8 @@ const SAME = {
   "head.hot": "heat.hot",
   "power.low": "batt.empty",
   "calibration.missing": "cal.missing",
+  "calibration.damaged": "cal.missing",
+  "calibration.old": "cal.missing",
   "calibration.mode": "cal.mismatch",
   "calibration.stale": "cal.mismatch",
   "head.mismatch": "cal.mismatch",

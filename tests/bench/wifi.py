@@ -6,12 +6,15 @@ when it is drawn: both read one clock. By itself: `make bench-wifi`.
 """
 
 import asyncio
+import json
 import re
+import secrets
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -113,6 +116,21 @@ def tablet(folder: Path) -> Iterator[Browser]:
         browser.close()
 
 
+def aiming_at(url: str) -> str:
+    """The address at which a tablet aims at a person who agreed."""
+
+    def said(method: str, path: str, **body: str) -> dict[str, str]:
+        content = json.dumps({"key": secrets.token_hex(8), **body}).encode()
+        headers = {"Content-Type": "application/json"}
+        asked = urllib.request.Request(f"{url}{path}", content, headers, method=method)
+        answer: dict[str, str] = json.load(urllib.request.urlopen(asked, timeout=30))
+        return answer
+
+    visit = said("POST", "/api/visits")["id"]
+    said("PATCH", f"/api/visits/{visit}", field="consent", value="agreed")
+    return f"{url}/#/visit/{visit}/aim/R-centre"
+
+
 def opened(browser: Browser, url: str, slower: int = 1) -> tuple[Page, float]:
     """The page at its live picture, on a processor that many times slower; and how long that took."""
     page = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True).new_page()
@@ -195,7 +213,7 @@ def main() -> None:
         try:
             server.wait_until_ready()
             relay = Relay(server.port)
-            url = f"http://{HERE}:{relay.port}"
+            url = aiming_at(f"http://{HERE}:{relay.port}")
             head("a tablet at the end of a bad link", "median", "p95/worst", "per s", "limit")
             with tablet(Path(place)) as browser:
                 ages(browser, relay, url, 8, None)

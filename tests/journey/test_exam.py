@@ -63,8 +63,9 @@ def test_that_it_was_simulated_is_in_the_record_the_report_and_the_picture(old_r
     assert (corner < 10).mean() > 0.3
 
 
-def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any) -> None:
+def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any, wait_until: Callable[..., None]) -> None:
     kept = old_rig.exam.press("OD").result(30)
+    wait_until(lambda: not old_rig.exam.fitness.due)  # which has the same workspace
     raw, _ = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
     dark, _ = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
     picture = old_rig.exam._reconstructor(raw, dark, simulated=True).picture
