@@ -28,7 +28,7 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports --ignore tests/parts
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
-	@$(BIN)/python -m pytest -n 2 --dist loadfile tests/browser
+	@$(BIN)/python -m pytest tests/browser
 
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
 	@tests/systemd/install
