@@ -46,7 +46,11 @@ sensor = { prnu = 0.01, dsnu_e = 2.0, hot_pixels = 0.0003 }
 """
 SMALL_PLANS = PLANS.with_name("browser-plans-small")
 SHAPES = [SIZES["tablet"], SIZES["portrait"], SIZES["phone"]]
-CUT = ("ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_INCOMPLETE_CHUNKED", "ERR_EMPTY_RESPONSE", "ERR_SOCKET")
+# A server that is killed cuts an answer off wherever it is.
+CUT = (
+    "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_INCOMPLETE_CHUNKED", "ERR_EMPTY_RESPONSE", "ERR_SOCKET",
+    "ERR_CONTENT_LENGTH_MISMATCH",
+)  # fmt: skip
 WORDS = {"cap": "The cap is on", "screen": "The screen is there", "point": "The point is there"}
 Open = Callable[..., Page]
 
