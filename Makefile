@@ -25,10 +25,12 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
+# A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
+# the summary names it, because it is then the test or the page that has to be mended.
 test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd" --ignore tests/browser --ignore tests/ports --ignore tests/parts
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
-	@$(BIN)/python -m pytest tests/browser
+	@$(BIN)/python -m pytest tests/browser --reruns 1 -rR
 
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
 	@tests/systemd/install

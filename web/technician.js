@@ -88,10 +88,14 @@ function heard(cal) {
   set({ cal: Object.freeze(cal), view });
 }
 
+async function doorNow() {
+  const { has_pin: hasPin, wait_s: wait } = await ask("/api/technician");
+  return { hasPin, wait, pin: "" };
+}
+
 async function toDoor() {
   try {
-    const { has_pin: hasPin, wait_s: wait } = await ask("/api/technician");
-    set({ view: "door", hasPin, wait, pin: "", error: null, lost: false, busy: false });
+    set({ view: "door", ...(await doorNow()), error: null, lost: false, busy: false });
   } catch (problem) {
     if (!(problem instanceof Refusal)) throw problem;
     set({ lost: true });
@@ -107,7 +111,10 @@ async function tapped(path, body, then = heard) {
   } catch (problem) {
     if (!(problem instanceof Refusal)) throw problem;
     if (problem.code === "technician.locked" && get().view !== "door") await toDoor();
-    else set({ error: { code: problem.code, message: problem.message, remedy: problem.remedy } });
+    else {
+      const wait = get().view === "door" ? await doorNow().catch(() => null) : null; // before a tap can count again
+      set({ ...wait, error: { code: problem.code, message: problem.message, remedy: problem.remedy } });
+    }
   } finally {
     set({ busy: false });
     lock();
@@ -130,10 +137,7 @@ const act = {
     const { pin, hasPin, wait } = get();
     if (wait > 0 || !pin) return;
     await tapped(hasPin ? "/api/technician/unlock" : "/api/technician/pin", { pin }, () => set({ view: "opening" }));
-    if (get().view === "opening") return look();
-    const door = await ask("/api/technician").catch(() => null);
-    set({ pin: "", ...(door && { wait: door.wait_s, hasPin: door.has_pin }) });
-    return undefined;
+    if (get().view === "opening") await look();
   },
 
   lock: () => tapped("/api/technician/lock", {}, toDoor),

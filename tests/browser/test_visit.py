@@ -4,6 +4,7 @@ import io
 
 import numpy as np
 import pytest
+import zxingcpp
 from PIL import Image
 from playwright.sync_api import Page, expect
 
@@ -210,9 +211,8 @@ def test_finish_can_be_undone_for_ten_seconds_and_the_code_holds_no_name(open_pa
 
 
 def qr_text(page: Page) -> str:
-    zxing = pytest.importorskip("zxingcpp", reason="zxing-cpp, which reads codes, is not installed")
     picture = Image.open(io.BytesIO(page.locator(".outcome > figure.code svg").screenshot())).convert("L")
-    return str(zxing.read_barcodes(np.asarray(picture))[0].text)
+    return str(zxingcpp.read_barcodes(np.asarray(picture))[0].text)
 
 
 def test_a_reload_at_every_screen_comes_back_where_it_was(open_page: Open, stub: Stubbed) -> None:

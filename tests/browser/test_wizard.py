@@ -228,6 +228,7 @@ def test_a_wrong_pin_waits_and_the_door_can_be_shut(workshop: Server, open_page:
     page.locator("#pin").fill("0000")
     page.keyboard.press("Enter")
     expect(page.locator(".alert")).to_have_attribute("data-code", "technician.pin")
+    expect(page.locator("#pin")).to_have_value("")
     expect(page.locator("#enter")).to_have_text("Open")
     page.wait_for_timeout(700)
     page.locator("#pin").fill("1111")  # the second wrong one costs two seconds, long enough to be seen
