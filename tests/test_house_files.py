@@ -208,6 +208,17 @@ def test_every_room_has_a_readme() -> None:
     assert not sorted(room for room in rooms if f"{room}/README.md" not in files()), "rooms without a README"
 
 
+@pytest.mark.parametrize("readme", readmes())
+def test_a_map_names_every_module_beside_it(readme: str) -> None:
+    """Tests are named after what they prove; everything else is found through the map."""
+    beside = [
+        Path(name) for name in files() if Path(name).parent == Path(readme).parent and name.endswith((".py", ".js"))
+    ]
+    named = text(readme)
+    ours = [path.name for path in beside if not path.name.startswith(("test_", "__", "conftest"))]
+    assert not [name for name in ours if not re.search(rf"\b{re.escape(Path(name).stem)}\b", named)]
+
+
 @pytest.mark.parametrize("room", [room for room in ROOMS if f"{room}/README.md" in files()])
 def test_a_map_names_every_folder(room: str) -> None:
     """A folder that is not on the map was put there without saying what for."""
