@@ -173,8 +173,10 @@ function heardAim(aim) {
 
 act.heardAim = ({ detail }) => heardAim(detail);
 act.heardLate = ({ detail: seconds }) => {
-  if (seconds >= LATE_S && get().link === "live") raise({ code: "link.slow", n: seconds, from: "page" });
-  else lower("link.slow");
+  if (seconds >= LATE_S && get().link === "live") {
+    raise({ code: "link.slow", n: seconds, from: "page" });
+    if (get().prompt) set({ prompt: null }); // nobody is ready by a picture of some seconds ago
+  } else lower("link.slow");
 };
 
 // ---- draw

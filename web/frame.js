@@ -14,6 +14,8 @@ import { isExam, stage } from "./screens/stage.js";
 import { html, nothing } from "./vendor/lit-html.js";
 import { has, t } from "./words.js";
 
+const PLENTY = 500; // weeks of screening
+
 const SCREENS = { home, find, person, aim, picture, outcome, history, film, compare };
 
 export function page(state, act) {
@@ -61,13 +63,16 @@ function header(state, act) {
       <p class="head-name">
         <span class="name">${status?.name ?? ""}</span>
         <span class="state" data-state=${word}>${t(has(`doing.${word}`) ? `doing.${word}` : "doing.busy")}</span>
-        ${space === undefined || space === null ? nothing : html`<span class="space">${t("space", { n: space })}</span>`}
+        ${space === undefined || space === null ? nothing : html`<span class="space">${room(space)}</span>`}
       </p>
       ${kindChip(shotOf(state)?.capture?.simulated ? "simulated" : status?.kind)}
       <button class="quiet" type="button" id="open-menu" @click=${act.openMenu}>${icon("menu")} ${t("menu")}</button>
     </header>
   `;
 }
+
+// A number is told when it matters: one of thousands changes with every picture, and nobody plans by it.
+const room = (people) => t(people > PLENTY ? "space.plenty" : "space", { n: people });
 
 function title(route, visit, act) {
   if (!route.visit || !visit) return html`<h1>${t("app.name")}</h1>`;

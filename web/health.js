@@ -36,7 +36,7 @@ function view({ ok, checks }) {
     <h2>${t("health.title")}</h2>
     <p role="status">${t(ok ? "health.well" : "health.ill")}</p>
     <ul class="checks">${checks.map((one) => html`<li data-check=${one.name} data-ok=${one.ok}>
-      <b>${one.ok ? "✓" : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
+      <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
       <small>${t("health.limit", { limit: one.limit })}</small>
       ${one.ok ? "" : html`<p class="bad">${one.remedy}</p>`}
     </li>`)}</ul>

@@ -46,7 +46,8 @@ export class EyeLive extends HTMLElement {
   set active(on) {
     if (on === this.#active) return;
     this.#active = on;
-    if (!on) this.#abort.abort();
+    if (on) this.#forget(); // what was seen before the last press is not what is there now
+    else this.#abort.abort();
     this.#draw();
     this.#run();
   }
@@ -69,6 +70,14 @@ export class EyeLive extends HTMLElement {
       this.#abort.abort();
     }
     this.#link = link;
+  }
+
+  #forget() {
+    this.#bitmap?.close();
+    this.#bitmap = null;
+    this.#empty.hidden = false;
+    delete this.dataset.frame;
+    this.#tellAge();
   }
 
   async #run() {

@@ -182,7 +182,6 @@ export const WORDS = {
   "compare.side": "साथ-साथ",
   "compare.blink": "एक के ऊपर एक",
   "compare.swap": "दूसरी दिखाएँ",
-  "compare.which": "तस्वीर {n}",
 
   "link.cut": "उत्तर से पहले संपर्क टूटा।",
   "link.cut.remedy": "संपर्क लौटने पर तस्वीरें देखें।",

@@ -194,7 +194,6 @@ export const WORDS = {
   "compare.side": "அருகருகே",
   "compare.blink": "ஒன்றன் மேல் ஒன்று",
   "compare.swap": "மற்றதைக் காட்டு",
-  "compare.which": "படம் {n}",
 
   "link.cut": "பதில் வருமுன் இணைப்பு அறுந்தது.",
   "link.cut.remedy": "இணைப்பு வந்ததும் படங்களைப் பார்க்கவும்.",

@@ -182,7 +182,6 @@ export const WORDS = {
   "compare.side": "పక్కపక్కన",
   "compare.blink": "ఒకదానిపై ఒకటి",
   "compare.swap": "రెండోది చూపు",
-  "compare.which": "చిత్రం {n}",
 
   "link.cut": "జవాబు రాకముందే లింక్ తెగింది.",
   "link.cut.remedy": "లింక్ వచ్చాక చిత్రాలు చూడండి.",

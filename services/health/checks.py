@@ -19,7 +19,10 @@ EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # nobody had this instrument before
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the list; `of_release` says that another version could be the cause, so an update is judged by it."""
+    """One line of the list; `of_release` says that another version could be the cause, so an update is judged by it.
+
+    Not `known`: nothing is wrong as far as can be told, but there was nothing to look at.
+    """
 
     name: str
     ok: bool
@@ -27,6 +30,7 @@ class Check:
     limit: str
     remedy: str
     of_release: bool = False
+    known: bool = True
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Facts:
     calibration: DiffuscopeError | None
     store: StoreError | None
     captures_left: int
+    people_left: int
     battery: DiffuscopeError | float | None
     emptiest: float
     head_c: DiffuscopeError | float | None
@@ -84,7 +89,7 @@ def captures(facts: Facts) -> Check:
 
 def space(facts: Facts) -> Check:
     """Room for the people of a morning."""
-    people = facts.captures_left // 2
+    people = facts.people_left
     ok = people >= PEOPLE_LEFT
     return Check("space", ok, f"{people} people", f"at least {PEOPLE_LEFT}", "Copy captures away and make room.")
 
@@ -92,8 +97,10 @@ def space(facts: Facts) -> Check:
 def battery(facts: Facts) -> Check:
     """Enough for the next pictures."""
     limit = f"more than {facts.emptiest:.0%}"
-    if facts.battery is None or isinstance(facts.battery, DiffuscopeError):
-        return _unless(facts.battery, "battery", "none", limit)
+    if facts.battery is None:
+        return Check("battery", True, "no gauge", limit, "", known=False)
+    if isinstance(facts.battery, DiffuscopeError):
+        return _unless(facts.battery, "battery", "", limit)
     return Check(
         "battery",
         facts.battery > facts.emptiest,
@@ -109,8 +116,10 @@ def heat(facts: Facts) -> Check:
     if isinstance(facts.head_c, DiffuscopeError):
         return _unless(facts.head_c, "heat", "", limit)
     warm = [(facts.head_c, facts.warmest_c, "head"), (facts.computer_c, HOTTEST_C, "computer")]
-    said = ", ".join(f"{name} {is_c:.0f} C" for is_c, _, name in warm if is_c is not None) or "not measured"
+    said = ", ".join(f"{name} {is_c:.0f} C" for is_c, _, name in warm if is_c is not None)
     ok = all(is_c is None or is_c <= most_c for is_c, most_c, _ in warm)
+    if not said:
+        return Check("heat", True, "not measured", limit, "", known=False)
     return Check("heat", ok, said, limit, "Turn the device off, and let it cool in the shade.")
 
 
@@ -125,12 +134,12 @@ def clock(facts: Facts) -> Check:
 def speed(facts: Facts) -> Check:
     """How long the last hundred presses took, the slowest but one in a hundred."""
     if not facts.press_s:
-        return Check("speed", True, "no pictures yet", f"p99 {PRESS_P99_S:g} s", "")
+        return Check("speed", True, "no pictures yet", f"at most {PRESS_P99_S:g} s", "", known=False)
     slow_s = sorted(facts.press_s)
     p50_s, p99_s = (slow_s[math.ceil(share * len(slow_s)) - 1] for share in (0.5, 0.99))
-    value = f"p50 {p50_s:.2f} s, p99 {p99_s:.2f} s of {len(slow_s)}"
+    value = f"half of {len(slow_s)} pictures within {p50_s:.1f} s, 99 of 100 within {p99_s:.1f} s"
     remedy = "Turn the device off and on, and let it cool. If it stays slow, call the technician."
-    return Check("speed", p99_s <= PRESS_P99_S, value, f"p99 {PRESS_P99_S:g} s", remedy)
+    return Check("speed", p99_s <= PRESS_P99_S, value, f"99 of 100 within {PRESS_P99_S:g} s", remedy)
 
 
 def _unless(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:

@@ -72,7 +72,7 @@ def table(checks: Sequence[Check]) -> str:
     """The list for people: what is well, what is not, and what to do."""
     lines = []
     for check in checks:
-        mark = "ok  " if check.ok else "FAIL"
+        mark = "FAIL" if not check.ok else "ok  " if check.known else "-   "
         lines.append(f"{mark}  {check.name:<12} {check.value:<56}  {check.limit}")
         if not check.ok and check.remedy:
             lines.append(f"{'':<19}{check.remedy}")

@@ -22,15 +22,19 @@ GLANCE_S = 0.02
 PRESSES = 100
 
 
-def facts(owner: Owner) -> Facts:
-    """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts."""
+def facts(owner: Owner, pictures: int) -> Facts:
+    """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts.
+
+    `pictures` is how many the protocol takes of a person.
+    """
     house, head = owner.house, owner.head
     chips, bus = head.chips if head is not None else Chips(), house.spec.bus
     newest, store = _shelf(house.store)
     battery, thermometer = chips.battery, chips.thermometer
     return Facts(
         state=owner.state, problem=owner.problem, lamp_is_dark=head is None or _goes_dark(head, house.clock),
-        calibration=_calibration(owner), store=store, captures_left=house.store.space_left(),
+        calibration=_calibration(owner), store=store,
+        captures_left=house.store.space_left(), people_left=house.store.people_left(pictures),
         battery=_told(lambda: battery.read().fraction) if battery else None, emptiest=bus.emptiest if bus else 0.0,
         head_c=_told(thermometer.read_c) if thermometer else None, warmest_c=bus.warmest_c if bus else 100.0,
         computer_c=int(COMPUTER_HEAT.read_text()) / 1000 if COMPUTER_HEAT.exists() else None,

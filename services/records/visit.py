@@ -110,7 +110,7 @@ def outcome(protocol: Protocol, fields: Mapping[str, Any], slots: Mapping[str, S
     blank = _without_pictures(protocol, slots)
     if blank:
         return Outcome("refer_picture", f"Refer: picture of {_eyes(blank)} not possible.")
-    return Outcome("send", "Send the pictures to the reader.")
+    return Outcome("send", "The pictures are kept. An eye specialist looks at them next.")
 
 
 def _sees_less(vision: Any, limit: Vision) -> bool:

@@ -12,8 +12,8 @@ from services.health.probe import table
 
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
 WELL = Facts(
-    state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, battery=0.8,
-    emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
+    state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
+    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
     newest=datetime(2026, 11, 20, tzinfo=UTC), press_s=[1.5] * 100,
 )  # fmt: skip
 
@@ -30,7 +30,7 @@ def test_an_instrument_that_is_well_passes_every_check() -> None:
         ("lamp", {"lamp_is_dark": False}),
         ("calibration", {"calibration": HeadMismatch("another head")}),
         ("captures", {"store": StoreFull("0 bytes are free")}),
-        ("space", {"captures_left": 19}),
+        ("space", {"people_left": 9}),
         ("battery", {"battery": 0.04}),
         ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
         ("heat", {"head_c": 56.0}),
@@ -56,12 +56,14 @@ def test_one_slow_press_in_a_hundred_is_forgiven() -> None:
 
 def test_of_two_presses_the_slower_one_counts() -> None:
     speed = judged(replace(WELL, press_s=[7.0, 2.0]))[-1]
-    assert (speed.ok, speed.value) == (False, "p50 2.00 s, p99 7.00 s of 2")
+    assert (speed.ok, speed.value) == (False, "half of 2 pictures within 2.0 s, 99 of 100 within 7.0 s")
 
 
 def test_parts_that_a_head_does_not_have_are_no_failure() -> None:
     bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, press_s=[])
-    assert all(check.ok for check in judged(bare))
+    checks = judged(bare)
+    assert all(check.ok for check in checks)
+    assert [check.name for check in checks if not check.known] == ["battery", "heat", "speed"]
 
 
 def test_an_update_is_judged_by_what_a_release_can_break_and_not_by_a_battery() -> None:

@@ -78,12 +78,20 @@ export function film(state, act) {
   `;
 }
 
+/** Which eye and place, and which of several tries. */
+function nameOf(state, id) {
+  const [slot, { captures }] = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id)) ?? [];
+  if (!slot) return "";
+  return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotWords(state, slot), n: captures.indexOf(id) + 1 });
+}
+
 function frame(state, act, { slot, id }) {
-  const { eye, part } = slotWords(state, slot);
   const on = state.picked.includes(id);
+  const used = state.visit.slots[slot].capture === id && state.visit.slots[slot].captures.length > 1;
   return html`<li>
     <button type="button" class="open" data-id=${id} @click=${() => act.openPicture(slot, id)}>
-      <span class="thumb">${thumb(id, act)}</span> <span>${eye} · ${part}</span>
+      <span class="thumb">${thumb(id, act)}</span> <span>${nameOf(state, id)}</span>
+      ${used ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing}
     </button>
     <button type="button" class="pick" aria-pressed=${on} @click=${() => act.pick(id)}>
       ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
@@ -127,20 +135,22 @@ export function compare(state, act) {
         })}
         ${blink
           ? html`<button class="primary" type="button" id="swap" @click=${act.swap}>
-              ${t("compare.swap")} (${t("compare.which", { n: front + 1 })})
+              ${t("compare.swap")}
             </button>`
           : nothing}
       </div>
       <div class="two">
         ${shown.map(
-          (id, i) => html`<eye-pic
-            class=${blink && i !== front ? "behind" : ""}
-            aria-label=${t("compare.which", { n: i + 1 })}
-            .head=${state.status}
-            .subject=${id}
-            .src=${act.finalOf(id)}
-            @looked=${act.linkZoom}
-          ></eye-pic>`,
+          (id, i) => html`<figure class=${blink && i !== front ? "behind" : ""}>
+            <figcaption>${nameOf(state, id)}</figcaption>
+            <eye-pic
+              aria-label=${nameOf(state, id)}
+              .head=${state.status}
+              .subject=${id}
+              .src=${act.finalOf(id)}
+              @looked=${act.linkZoom}
+            ></eye-pic>
+          </figure>`,
         )}
       </div>
     </section>

@@ -54,24 +54,27 @@ export function find({ typed, visits }, act) {
         <h2>${t("find.title")}</h2>
         <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
         ${pad(act.typeNumber)}
-        <button class="primary" type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
+        <button class=${found.length ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
           ${t("find.start", { number: typed })}
         </button>
         <p class="muted">${t("find.scan")}</p>
       </div>
       <div>
-        <h2>${t("home.today")}</h2>
+        <h2>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
         ${found.length ? people(found, act.resume) : html`<p class="muted">${t("find.none")}</p>`}
       </div>
     </section>
   `;
 }
 
+/** A tick is for what needs nobody's care today. */
+export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "check");
+
 export function people(visits, open) {
   return html`
     <ul class="people">
       ${visits.map((visit) => {
-        const [name, word] = visit.outcome ? ["check", `outcome.${visit.outcome.code}`] : ["wait", "find.open"];
+        const [name, word] = visit.outcome ? [markOf(visit.outcome), `outcome.${visit.outcome.code}`] : ["wait", "find.open"];
         return html`<li>
           <button type="button" data-visit=${visit.id} @click=${() => open(visit)}>
             <span>${personWords(visit)}</span> <span class="muted">${clockTime(visit.begun_at)}</span>

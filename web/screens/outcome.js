@@ -1,5 +1,6 @@
 // Outcome: one sentence, the slip, the code, done. Undo for ten seconds instead of "are you sure?".
 
+import { markOf } from "./home.js";
 import { icon } from "../icons.js";
 import { personWords, tiles } from "../parts.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
@@ -13,7 +14,7 @@ export function outcome(state, act) {
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: visit.number })}</h2>
-      <p class="verdict">${icon(visit.outcome.code === "send" ? "check" : "warn")} ${ending(state)[0]}</p>
+      <p class="verdict">${icon(markOf(visit.outcome))} ${ending(state)[0]}</p>
       <p>${ending(state)[1]}</p>
       ${tiles(state, act)}
       <div class="ends">
@@ -21,6 +22,7 @@ export function outcome(state, act) {
         <button type="button" id="code" aria-expanded=${state.code !== undefined} @click=${act.showCode}>
           ${t("outcome.code")}
         </button>
+        <button type="button" id="film" @click=${() => act.go({ screen: "film", visit: visit.id })}>${t("outcome.film")}</button>
         ${left > 0
           ? html`<button type="button" id="undo" @click=${act.reopen}>${icon("again")} ${t("outcome.undo", { s: left })}</button>`
           : nothing}

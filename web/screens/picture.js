@@ -17,9 +17,14 @@ export function picture(state, act) {
     ${card(state, act, shot)} ${state.picture === "none" ? nothing : tools(state, act)} ${tiles(state, act)}
     ${chips(state, act)}
     <div class="actions">${actions(state, act, shot)}</div>
-    <button class="quiet finish" type="button" id="finish" @click=${act.finish}>${t("finish.now")}</button>
+    ${complete(state, shot)
+      ? nothing
+      : html`<button class="quiet finish" type="button" id="finish" @click=${act.finish}>${t("finish.now")}</button>`}
   `;
 }
+
+// Then the button for what comes next says Finish already.
+const complete = ({ route }, { verdict }) => verdict?.word === "good" && !route.capture && !nextSlot(route.slot);
 
 /** Tries in this slot, with the shot that is not kept yet. */
 function triesOf({ visit }, shot) {
@@ -33,13 +38,13 @@ const exhausted = (state, shot) =>
 // ---- the card
 
 function card(state, act, shot) {
-  if (!shot.verdict && !shot.over) return makingCard(shot);
+  if (!shot.verdict && !shot.over) return makingCard(state, shot);
   const side = state.states.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
   const [name, word, text] = verdictWords(state, shot);
   const warnings = shot.capture?.report?.warnings ?? [];
   return html`
     <div class="card" data-verdict=${shot.verdict?.word ?? "none"} data-code=${shot.verdict?.code ?? shot.failed?.code ?? ""}>
-      <h2 tabindex="-1" id="result-title">${icon(name)} ${word}</h2>
+      <h2 tabindex="-1" id="result-title">${icon(name)} ${word} ${which(state, shot)}</h2>
       <p>${text}</p>
       ${side ? html`<p class="ask">${wordsOf(side)} ${side.buttons.map((one) => does(side, one, act))}</p>` : nothing}
       ${shot.over ? nothing : html`${bar(shot)} <p class="muted">${t("make.goon")}</p>`}
@@ -68,13 +73,18 @@ function timer(state, act, shot) {
     : html`<button type="button" data-do="timer" @click=${() => act.stateDo("timer")}>${icon("wait")} ${t("do.timer")}</button>`;
 }
 
-function makingCard(shot) {
+function which(state, shot) {
+  const { eye, part } = slotWords(state, shot.slot);
+  return html`<small>${eye} · ${part}</small>`;
+}
+
+function makingCard(state, shot) {
   const left = Math.round(shot.stage.left); // 0: not known, and then nothing is promised
   const words = { expose: "make.expose", keep: "make.keep" };
   const promise = left >= 1 ? t("make.left", { n: left }) : shot.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
-      <h2>${t(words[shot.stage.name] ?? "make.refine")}</h2>
+      <h2>${t(words[shot.stage.name] ?? "make.refine")} ${which(state, shot)}</h2>
       <p class="muted">${promise}</p>
       ${bar(shot)}
     </div>
