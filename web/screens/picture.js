@@ -44,7 +44,10 @@ function card(state, act, shot) {
   const warnings = shot.capture?.report?.warnings ?? [];
   return html`
     <div class="card" data-verdict=${shot.verdict?.word ?? "none"} data-code=${shot.verdict?.code ?? shot.failed?.code ?? ""}>
-      <h2 tabindex="-1" id="result-title">${icon(name)} ${word} ${which(state, shot)}</h2>
+      <div class="heading">
+        <h2 tabindex="-1" id="result-title">${icon(name)} ${word}</h2>
+        ${which(state, shot)}
+      </div>
       <p>${text}</p>
       ${side ? html`<p class="ask">${wordsOf(side)} ${side.buttons.map((one) => does(side, one, act))}</p>` : nothing}
       ${shot.over ? nothing : html`${bar(shot)} <p class="muted">${t("make.goon")}</p>`}
@@ -75,7 +78,7 @@ function timer(state, act, shot) {
 
 function which(state, shot) {
   const { eye, part } = slotWords(state, shot.slot);
-  return html`<small>${eye} · ${part}</small>`;
+  return html`<p class="muted">${eye} · ${part}</p>`;
 }
 
 function makingCard(state, shot) {
@@ -84,7 +87,10 @@ function makingCard(state, shot) {
   const promise = left >= 1 ? t("make.left", { n: left }) : shot.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
-      <h2>${t(words[shot.stage.name] ?? "make.refine")} ${which(state, shot)}</h2>
+      <div class="heading">
+        <h2>${t(words[shot.stage.name] ?? "make.refine")}</h2>
+        ${which(state, shot)}
+      </div>
       <p class="muted">${promise}</p>
       ${bar(shot)}
     </div>
