@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.browser.axe import axe_faults
 from tests.browser.conftest import Server
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.test_wizard import HEAD, SMALL_PLANS, come_in
@@ -61,7 +62,7 @@ def faults(page: Page, ready: str) -> list[str]:
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_selector(ready)
         found += [f"{name}: {fault}" for fault in look_for_faults(page)]
-    return found
+    return found + axe_faults(page)
 
 
 def test_health_says_of_every_part_how_it_is(inside: Page) -> None:
