@@ -22,7 +22,8 @@ RUN = """async ([theme, runOnly]) => {
     found = await axe.run(document, { resultTypes: ["violations"], runOnly });
   } while (root.dataset.theme !== theme);
   root.dataset.theme = chosen;
-  return found.violations.flatMap(({ id, help, nodes }) => nodes.map(({ html }) => `${theme}: ${id}: ${help}: ${html}`));
+  const said = ({ id, help, nodes }) => nodes.map(({ html }) => `${theme}: ${id}: ${help}: ${html}`);
+  return found.violations.flatMap(said);
 }"""
 
 

@@ -6,7 +6,7 @@ from playwright.sync_api import Page, expect
 from tests.browser.axe import axe_faults
 from tests.browser.stub import Stubbed
 from tests.browser.test_states import STOPS, TELLS, over, tell
-from tests.browser.walk import SHUTTER, Open, aiming, settled, taken, tap
+from tests.browser.walk import SHUTTER, Open, aiming, taken, tap
 
 pytestmark = pytest.mark.browser
 
