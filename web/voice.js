@@ -14,7 +14,7 @@ export function voiceFor(tag) {
 }
 
 /** Call `then` whenever the tablet has found more voices: browsers look for them after the page is there. */
-export const onVoices = (then) => window.speechSynthesis?.addEventListener("voiceschanged", then);
+export const onVoices = (then, signal) => window.speechSynthesis?.addEventListener("voiceschanged", then, { signal });
 
 let current = null; // also keeps the sentence from being forgotten by the browser while it is spoken
 
