@@ -326,8 +326,7 @@ export const ENGLISH = {
   "voice.language": "The person speaks",
   "voice.more": "More to say",
   "voice.draft": "These sentences are drafts: not yet checked by a speaker.",
-  "say.consent":
-    "We want to take pictures of your eyes. A light comes for a moment. It does not hurt. You may say no. May we?",
+  "say.consent": "We want to take pictures of your eyes. A light comes for a moment. It does not hurt. You may say no. May we?",
   "say.centre": "Look straight ahead.",
   "say.nerve": "Look a little towards your nose.",
   "say.still": "Please hold still.",
