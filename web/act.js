@@ -3,14 +3,13 @@
 import { fileOf, getFolders, askForControls } from "./api.js";
 import { get, remember, set, shotOf } from "./memory.js";
 import { typedBy } from "./parts.js";
-import { freshPicture, take, unlocked } from "./press.js";
+import { cue, freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
-import { today } from "./screens/history.js";
 import { codeText } from "./screens/outcome.js";
 import { lower, raise } from "./states.js";
 import { EyePic, homeBox } from "./viewer.js";
 import * as visits from "./visit.js";
-import { learn, t } from "./words.js";
+import { learn, t, today } from "./words.js";
 
 const $ = (selector) => document.querySelector(selector);
 const here = () => get().route;
@@ -176,6 +175,11 @@ const settings = {
   setLetters({ target }) {
     remember("letters", target.checked ? "on" : "off");
     set({ letters: target.checked });
+  },
+  setSound({ target }) {
+    remember("sound", target.checked ? "on" : "off");
+    set({ sound: target.checked });
+    cue("good");
   },
   setAuto({ target }) {
     remember("auto", target.checked ? "on" : "off");

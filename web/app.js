@@ -6,13 +6,12 @@ import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
 import { get, set, store } from "./memory.js";
-import { buzz, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
+import { cue, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
 import { follow, go } from "./routes.js";
-import { today } from "./screens/history.js";
 import { lower, raise } from "./states.js";
 import { render } from "./vendor/lit-html.js";
 import { politely, refreshList, refreshVisit, saveRest } from "./visit.js";
-import { learn, t } from "./words.js";
+import { learn, t, today } from "./words.js";
 
 const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
 const HOLD_BEATS = 4; // the controls are lent for ten seconds
@@ -38,7 +37,23 @@ async function arrive(route) {
   if (!same) requestAnimationFrame(() => focusOn(route.screen));
 }
 
+// What Home does not need, by the screens that do. A file that a lost link kept back is asked for again when the link is back.
+const FILES = { history: () => import("./screens/history.js"), aloud: () => import("./screens/aloud.js") };
+const LATER = { history: "history", film: "history", compare: "history", person: "aloud", aim: "aloud" };
+
+async function bring(screen) {
+  const name = LATER[screen];
+  if (!name || get().later[name]) return;
+  try {
+    const module = await FILES[name]();
+    set({ later: Object.freeze({ ...get().later, [name]: module }) });
+  } catch (problem) {
+    if (!(problem instanceof TypeError)) throw problem;
+  }
+}
+
 async function load(route) {
+  bring(route.screen);
   if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });
@@ -166,7 +181,7 @@ function heardAim(aim) {
   if (aim.code !== was?.code && now - promptedAt >= READ_MS) {
     promptedAt = now;
     set({ prompt: Object.freeze(aim) });
-    if (aim.code === "ready") buzz(15);
+    if (aim.code === "ready") cue("ready");
   }
   if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
 }

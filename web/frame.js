@@ -5,7 +5,6 @@ import { icon } from "./icons.js";
 import { shotOf } from "./memory.js";
 import { chips, personWords, standing, stateBar } from "./parts.js";
 import { aim } from "./screens/aim.js";
-import { compare, film, history } from "./screens/history.js";
 import { find, home } from "./screens/home.js";
 import { outcome } from "./screens/outcome.js";
 import { person } from "./screens/person.js";
@@ -16,13 +15,14 @@ import { has, t } from "./words.js";
 
 const PLENTY = 500; // weeks of screening
 
-const SCREENS = { home, find, person, aim, picture, outcome, history, film, compare };
+const SCREENS = { home, find, person, aim, picture, outcome };
 
 export function page(state, act) {
-  const screen = SCREENS[state.route.screen](state, act);
+  const { later, route } = state;
+  const screen = (SCREENS[route.screen] ?? later.history?.[route.screen])?.(state, act) ?? nothing;
   const exam = isExam(state);
   return html`
-    <div class="page" data-screen=${state.route.screen} data-phase=${phase(state)} data-link=${state.link}>
+    <div class="page" data-screen=${route.screen} data-phase=${phase(state)} data-link=${state.link}>
       ${header(state, act)}
       <main class=${exam ? "exam" : "sheet"}>
         ${stage(state, act)}
@@ -31,7 +31,7 @@ export function page(state, act) {
           : html`<div class="standing" role="status">${top(state, act)}</div>
               ${chips(state, act)} ${screen}`}
       </main>
-      ${menu(state, act)}
+      ${menu(state, act)} ${later.aloud?.sheet(state) ?? nothing}
     </div>
   `;
 }
@@ -92,7 +92,7 @@ function kindChip(kind) {
 
 // ---- menu
 
-function menu({ theme, letters, auto, status }, act) {
+function menu({ theme, letters, auto, sound, status }, act) {
   return html`
     <dialog id="menu" aria-labelledby="menu-title">
       <h2 id="menu-title">${t("menu")}</h2>
@@ -105,6 +105,7 @@ function menu({ theme, letters, auto, status }, act) {
         )}
       </div>
       <label><input type="checkbox" id="auto" .checked=${auto} @change=${act.setAuto} /> ${t("menu.auto")}</label>
+      <label><input type="checkbox" id="sound" .checked=${sound} @change=${act.setSound} /> ${t("menu.sound")}</label>
       <h3>${t("menu.keys")}</h3>
       <label><input type="checkbox" id="letters" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
       <dl>

@@ -1,44 +1,79 @@
-// How the instrument is: every check of its own with what was found, its limit, and what to do about it.
+// How the instrument is: every check of its own with what was found, its limit, and what to do about it. What fails comes
+// first, is told to a screen reader, and is read aloud by a tap: people mend things with their hands and eyes elsewhere.
 
-import { html, render } from "./vendor/lit-html.js";
+import { icon } from "./icons.js";
+import { html, nothing, render } from "./vendor/lit-html.js";
+import { onVoices, speak, voiceFor } from "./voice.js";
 import { t } from "./words.js";
 
 const ASK_MS = 5000;
 
 class InstrumentHealth extends HTMLElement {
   #timer = 0;
+  #gone = null;
+  #health = null; // what the instrument said last; null when it said nothing
+  #large = ""; // the check that could not be heard and is shown large instead
 
   connectedCallback() {
+    this.#gone = new AbortController();
+    onVoices(() => this.#draw(), this.#gone.signal);
     this.#ask();
   }
 
   disconnectedCallback() {
     clearTimeout(this.#timer);
+    this.#gone.abort();
   }
 
   async #ask() {
     try {
       const answer = await fetch("/api/health", { cache: "no-store" });
-      render(answer.ok ? view(await answer.json()) : failed(), this);
+      this.#health = answer.ok ? await answer.json() : null;
     } catch {
-      render(failed(), this);
+      this.#health = null;
     }
+    this.#draw();
     if (this.isConnected) this.#timer = setTimeout(() => this.#ask(), ASK_MS);
   }
+
+  #draw() {
+    render(this.#health ? view(this.#health, this.#large, this.#say) : failed(), this);
+  }
+
+  #say = async ({ name, remedy }) => {
+    this.#large = "";
+    this.#draw();
+    const heard = await speak(t("health.aloud", { name: t(`health.${name}`), remedy }), "en");
+    if (heard) return;
+    this.#large = name;
+    this.#draw();
+  };
 }
 
 customElements.define("instrument-health", InstrumentHealth);
 
 const failed = () => html`<p class="bad" role="alert">${t("health.failed")}</p>`;
 
-function view({ ok, checks }) {
+function view({ ok, checks }, large, say) {
+  const lines = (which) => checks.filter((one) => one.ok === which).map((one) => line(one, large === one.name, say));
   return html`
     <h2>${t("health.title")}</h2>
-    <p role="status">${t(ok ? "health.well" : "health.ill")}</p>
-    <ul class="checks">${checks.map((one) => html`<li data-check=${one.name} data-ok=${one.ok}>
-      <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
-      <small>${t("health.limit", { limit: one.limit })}</small>
-      ${one.ok ? "" : html`<p class="bad">${one.remedy}</p>`}
-    </li>`)}</ul>
+    <div role="status" aria-atomic="false">
+      <p>${t(ok ? "health.well" : "health.ill")}</p>
+      ${ok ? nothing : html`<ul class="checks">${lines(false)}</ul>`}
+    </div>
+    <ul class="checks">${lines(true)}</ul>
   `;
+}
+
+const line = (one, large, say) => html`<li data-check=${one.name} data-ok=${one.ok}>
+  <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
+  <small>${t("health.limit", { limit: one.limit })}</small>
+  ${one.ok ? nothing : html`<p class="bad" ?data-large=${large}>${one.remedy}</p> ${loud(one, say)}`}
+</li>`;
+
+function loud(one, say) {
+  const able = voiceFor("en") !== null;
+  const words = t(able ? "health.say" : "health.read", { name: t(`health.${one.name}`) });
+  return html`<button type="button" @click=${() => say(one)}>${icon(able ? "loud" : "read")} <span>${words}</span></button>`;
 }

@@ -23,6 +23,8 @@ const PATHS = {
   wait: svg`<circle cx="12" cy="12" r="9"></circle><path d="M12 7v5l3.5 2"></path>`,
   menu: svg`<path d="M4 7h16M4 12h16M4 17h16"></path>`,
   person: svg`<circle cx="12" cy="8" r="4"></circle><path d="M4 21c0-4.5 3.5-7 8-7s8 2.5 8 7"></path>`,
+  loud: svg`<path d="M4 9.5v5h3.5L12 18.5v-13L7.5 9.5zM15.5 9a4.5 4.5 0 0 1 0 6M18 6.5a8 8 0 0 1 0 11"></path>`,
+  read: svg`<path d="M12 6.5C10 5 7 4.5 3.5 4.5v13c3.5 0 6.5.5 8.5 2 2-1.5 5-2 8.5-2v-13c-3.5 0-6.5.5-8.5 2zM12 6.5v13"></path>`,
   camera: svg`<circle cx="12" cy="13" r="3.5"></circle>
     <path d="M4 8h3.5L9 5.5h6L16.5 8H20a1 1 0 0 1 1 1v9a1 1 0 0 1-1 1H4a1 1 0 0 1-1-1V9a1 1 0 0 1 1-1z"></path>`,
   nolink: svg`<path

@@ -43,6 +43,11 @@ export const store = createStore({
   copied: null,
   undoUntil: 0,
   now: 0, // set every second while something counts down
+  later: Object.freeze({}), // modules that Home does not need, by name
+  aloud: null, // what can be said to the person: {tag, words, able}; see aloud.js
+  saying: null, // {key, why}: the sentence, and why nobody could hear it
+  voice: remembered("voice", ""), // the language that people speak here, where it is not the screen's
+  sound: remembered("sound", "on") === "on",
   theme: remembered("theme", "dim"),
   letters: remembered("letters", "on") === "on",
   auto: remembered("auto", "off") === "on",

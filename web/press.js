@@ -26,9 +26,13 @@ export function unlocked() {
   return true;
 }
 
-/** A short vibration, where there is one and somebody has touched the page; others are complained about by browsers. */
-export function buzz(pattern) {
-  if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(pattern);
+const BUZZ = { ready: 15, taken: 30, good: 15, poor: [30, 60, 30] };
+
+/** A tone and a short vibration beside the words, once somebody has touched the page: browsers complain about earlier ones. */
+export function cue(name) {
+  if (!navigator.userActivation?.hasBeenActive) return;
+  navigator.vibrate?.(BUZZ[name]);
+  if (get().sound) import("./sound.js").then(({ play }) => play(name), () => {}); // no link: the words say so
 }
 
 const put = (shots) => set({ shots: Object.freeze(shots.slice(-SHOTS)) });
@@ -60,7 +64,7 @@ async function makePicture(visit, slot) {
   lower(({ from }) => from === "press");
   put([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: START, verdict: null, over: false })]);
   go({ screen: "picture", visit, slot });
-  buzz(30);
+  cue("taken");
   try {
     kept(await send("POST", "/api/captures", { eye, key, visit, slot }), key);
   } catch (problem) {
@@ -121,9 +125,10 @@ export const heardOfShots = {
   verdict({ id, ...verdict }) {
     const shot = byId(id);
     if (!shot || shot.over) return;
-    if (shot.verdict?.word !== verdict.word) lock();
     change(shot.key, { verdict: Object.freeze(verdict) });
-    if (verdict.word === "again") buzz([30, 60, 30]);
+    if (shot.verdict?.word === verdict.word) return;
+    lock();
+    cue(verdict.word === "again" ? "poor" : "good");
   },
 
   kept(capture) {

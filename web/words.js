@@ -25,9 +25,11 @@ export function speak(tag, table) {
 /** Load and use a language; "en-XA" is English stretched by 40 %, in which no text of the page can hide. */
 export async function learn(tag) {
   if (tag === "en-XA") speak(tag, stretched());
-  else if (LANGUAGES[tag]?.draft) speak(tag, (await import(`./words_${tag}.js`)).WORDS);
-  else speak("en", {});
+  else speak(LANGUAGES[tag] ? tag : "en", await tableOf(tag));
 }
+
+/** The words of a language, loaded when they are first asked for. */
+export const tableOf = async (tag) => (LANGUAGES[tag]?.draft ? (await import(`./words_${tag}.js`)).WORDS : ENGLISH);
 
 const ACCENTS = { a: "á", e: "é", i: "í", o: "ó", u: "ú", A: "Á", E: "É", I: "Í", O: "Ó", U: "Ú", n: "ñ", c: "ç" };
 
@@ -64,6 +66,15 @@ export function clockTime(iso) {
 export function calendarDay(iso) {
   return new Intl.DateTimeFormat(language, { day: "numeric", month: "short", year: "numeric" }).format(new Date(iso));
 }
+
+/** What a language is called in the reader's own. */
+export const languageName = (tag) => new Intl.DisplayNames(language, { type: "language" }).of(tag);
+
+const two = (value) => String(value).padStart(2, "0");
+
+/** A day as the instrument writes it, such as 2026-11-20. */
+export const dayName = (date) => `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}`;
+export const today = () => dayName(new Date());
 
 export function isToday(iso) {
   return new Date(iso).toDateString() === new Date().toDateString();

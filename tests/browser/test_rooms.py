@@ -4,17 +4,24 @@ import json
 import shutil
 import urllib.request
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
+from services.health.checks import CHECKS, Check, judged
+from tests.browser.axe import axe_faults
 from tests.browser.conftest import Server
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.test_wizard import HEAD, SMALL_PLANS, come_in
+from tests.unit.test_checks import DRIVEN, WELL
 
 pytestmark = pytest.mark.browser
 
 Open = Callable[..., Page]
+VOICES = Path(__file__).with_name("voices.js")
 POINTS = [
     {"method": "tikhonov", "bin": 1, "rounds": 0, "seconds_median": 0.020, "psnr_db": 27.1, "pareto": False},
     {"method": "gradient", "bin": 2, "rounds": 0, "seconds_median": 0.004, "psnr_db": 28.0, "pareto": True},
@@ -61,7 +68,7 @@ def faults(page: Page, ready: str) -> list[str]:
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_selector(ready)
         found += [f"{name}: {fault}" for fault in look_for_faults(page)]
-    return found
+    return found + axe_faults(page)
 
 
 def test_health_says_of_every_part_how_it_is(inside: Page) -> None:
@@ -70,6 +77,50 @@ def test_health_says_of_every_part_how_it_is(inside: Page) -> None:
     expect(checks).to_have_count(9)
     assert {check.get_attribute("data-ok") for check in checks.all()} == {"true"}
     assert faults(inside, "li[data-check]") == []
+
+
+def test_every_check_is_driven_to_its_failure_and_its_remedy_is_read_aloud(
+    open_page: Open, rooms: Server, complaints: object
+) -> None:
+    """The real checks judge spoiled facts; the page tells their words to a screen reader, and says them at a tap."""
+    page = open_page("about:blank", SIZES["portrait"])
+    page.context.add_init_script(path=VOICES)
+    told: list[Check] = judged(WELL)
+    page.route("**/api/health", lambda route: route.fulfill(json=answer(told)))
+    page.goto(f"{rooms.url}/technician")
+    come_in(page)
+    page.wait_for_timeout(700)
+    assert {name for name, _ in DRIVEN} == {check.name for check in told}
+    said = []
+    for name, change in DRIVEN:
+        told = judged(replace(WELL, **change))
+        (failed,) = (check for check in told if not check.ok)
+        enter(page, "calibration")
+        enter(page, "health")
+        line = page.get_by_role("status").locator("li[data-ok=false]")
+        expect(line).to_have_attribute("data-check", name)
+        expect(line).to_contain_text(failed.remedy)
+        expect(page.locator("li[data-ok=true]")).to_have_count(len(CHECKS) - 1)
+        line.get_by_role("button").tap()
+        said.append({"text": f"{name.capitalize()}. {failed.remedy}".replace("Captures", "Pictures"), "lang": "en-GB"})
+    assert [one for one in page.evaluate("spoken") if "lang" in one] == said
+    assert faults(page, "li[data-ok=false]") == []
+
+
+def test_a_remedy_that_no_voice_can_say_is_shown_large(open_page: Open, rooms: Server, complaints: object) -> None:
+    page = open_page(f"{rooms.url}/technician", SIZES["phone"])
+    page.route("**/api/health", lambda route: route.fulfill(json=answer(judged(replace(WELL, battery=0.04)))))
+    come_in(page)
+    page.wait_for_timeout(700)
+    enter(page, "health")
+    page.get_by_role("button", name="This tablet has no voice. Show large: Battery").tap()
+    remedy = page.get_by_text("Charge the device before the next patient.")
+    expect(remedy).to_have_css("font-size", "40.5px")
+    assert faults(page, "li[data-ok=false]") == []
+
+
+def answer(checks: list[Check]) -> dict[str, Any]:
+    return {"ok": all(check.ok for check in checks), "checks": [asdict(check) for check in checks]}
 
 
 def test_a_capture_is_seen_under_another_method_and_a_pace_is_chosen_to_stay(inside: Page) -> None:

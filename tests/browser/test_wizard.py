@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from device.calibration.archive import Archive
+from tests.browser.axe import axe_faults
 from tests.browser.conftest import PLANS, Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
 
@@ -117,7 +118,7 @@ def faults_in_all_shapes(page: Page, *in_view: str) -> list[str]:
         page.wait_for_timeout(100)
         found += [f"{width}: {fault}" for fault in look_for_faults(page, *in_view)]
     page.set_viewport_size(dict(zip(("width", "height"), SIZES["tablet"], strict=True)))  # type: ignore[arg-type]
-    return found
+    return found + axe_faults(page)
 
 
 def test_the_wizard_opens_itself_and_calibrates_with_every_mishap(

@@ -16,31 +16,29 @@ WELL = Facts(
     battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
     newest=datetime(2026, 11, 20, tzinfo=UTC), press_s=[1.5] * 100,
 )  # fmt: skip
+DRIVEN: list[tuple[str, dict[str, Any]]] = [
+    ("camera", {"problem": CameraMissing("the camera is gone")}),
+    ("camera", {"state": "starting"}),
+    ("lamp", {"lamp_is_dark": False}),
+    ("calibration", {"calibration": HeadMismatch("another head")}),
+    ("captures", {"store": StoreFull("0 bytes are free")}),
+    ("space", {"people_left": 9}),
+    ("battery", {"battery": 0.04}),
+    ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
+    ("heat", {"head_c": 56.0}),
+    ("heat", {"computer_c": 85.0}),
+    ("heat", {"head_c": BusFault("the thermometer does not answer")}),
+    ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
+    ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
+    ("speed", {"press_s": [1.0] * 50 + [9.0] * 50}),
+]
 
 
 def test_an_instrument_that_is_well_passes_every_check() -> None:
     assert [check.ok for check in judged(WELL)] == [True] * len(CHECKS)
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("camera", {"problem": CameraMissing("the camera is gone")}),
-        ("camera", {"state": "starting"}),
-        ("lamp", {"lamp_is_dark": False}),
-        ("calibration", {"calibration": HeadMismatch("another head")}),
-        ("captures", {"store": StoreFull("0 bytes are free")}),
-        ("space", {"people_left": 9}),
-        ("battery", {"battery": 0.04}),
-        ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
-        ("heat", {"head_c": 56.0}),
-        ("heat", {"computer_c": 85.0}),
-        ("heat", {"head_c": BusFault("the thermometer does not answer")}),
-        ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
-        ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
-        ("speed", {"press_s": [1.0] * 50 + [9.0] * 50}),
-    ],
-)
+@pytest.mark.parametrize(("name", "change"), DRIVEN)
 def test_each_check_fails_alone_and_says_what_to_do(name: str, change: dict[str, Any]) -> None:
     checks = judged(replace(WELL, **change))
     failed = [check for check in checks if not check.ok]

@@ -8,11 +8,9 @@ import { has, t } from "../words.js";
 
 export function aim(state, act) {
   const { eye, part } = slotWords(state, state.route.slot);
-  const field = state.route.slot.split("-")[1];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
-    ${tiles(state, act)} ${has(`look.${field}`) ? html`<p class="muted look">${t(`look.${field}`)}</p>` : nothing}
-    ${chips(state, act)}
+    ${tiles(state, act)} ${state.later.aloud?.toSay(state) ?? nothing} ${chips(state, act)}
     <div class="actions">${shutter(state, act)}</div>
     <button class="quiet finish" type="button" id="finish" @click=${act.finish}>${t("finish.now")}</button>
   `;

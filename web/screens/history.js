@@ -1,4 +1,4 @@
-// History: the people of a day, the pictures of a person, and two pictures compared with the same zoom.
+// History: the people of a day, the pictures of a person, and two pictures compared with the same zoom. Loaded when first opened.
 
 import { zipOf } from "../api.js";
 import { people } from "./home.js";
@@ -6,7 +6,7 @@ import { ending } from "./outcome.js";
 import { icon } from "../icons.js";
 import { choice, slotWords, thumb } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, t } from "../words.js";
+import { calendarDay, dayName, t, today } from "../words.js";
 
 const KEEP = {
   all: () => true,
@@ -40,15 +40,11 @@ export function history(state, act) {
   `;
 }
 
-const two = (value) => String(value).padStart(2, "0");
-const dayName = (date) => `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())}`;
 const shifted = (day, days) => {
   const date = new Date(`${day}T12:00`);
   date.setDate(date.getDate() + days);
   return dayName(date);
 };
-
-export const today = () => dayName(new Date());
 
 // ---- one person's pictures
 

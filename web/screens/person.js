@@ -29,13 +29,14 @@ const isDrops = (name) => name.startsWith("drops_");
 const sentAs = (name, one) => (isDrops(name) ? (one ? new Date().toISOString() : null) : one);
 
 export function person(state, act) {
-  const { visit } = state;
+  const { visit, later } = state;
   if (!visit) return nothing;
   const { fields, waiting = [] } = visit;
   const asked = QUESTIONS.filter(([name]) => name !== "diabetes_years" || fields.diabetes === "yes");
   return html`
     <section class="person">
       <h2>${t("consent")}</h2>
+      ${later.aloud?.toAsk(state) ?? nothing}
       ${choice({
         label: t("consent"),
         field: "consent",
