@@ -21,7 +21,7 @@ from tests.house import ROOT
 from tests.unit.test_archive import WHO, calibration
 
 OLD, NEW = (replace(calibration(black_dn), dark_dn=None, bad=None) for black_dn in (64.25, 65.0))
-KILLS = 100
+KILLS = {"keep": 100, "take_in": 40, "use": 40}  # keeping writes the most files
 NURSERY = """
 import os, sys
 from pathlib import Path
@@ -89,15 +89,15 @@ def prepared(place: Path, word: str) -> None:
         archive.keep(OLD, WHO)
 
 
-@pytest.mark.parametrize("word", ["keep", "take_in", "use"])
-def test_a_hundred_kills_leave_the_old_or_the_new_one_whole(word, tmp_path, record_property):
+@pytest.mark.parametrize("word", KILLS)
+def test_kills_leave_the_old_or_the_new_one_whole(word, tmp_path, record_property):
     new_key(tmp_path / "key", "Service centre")
     elsewhere, place, sent = Archive(tmp_path / "elsewhere"), tmp_path / "here", tmp_path / "sent"
     export(elsewhere.files(elsewhere.add(NEW, WHO)), sent, tmp_path / "key")
     draw, seen = random.Random(word), Counter()
     with nursery(place, sent, tmp_path / "key.pub") as process:
         longest_s = 0.01
-        for _ in range(KILLS):
+        for _ in range(KILLS[word]):
             prepared(place, word)
             child = born(process, word)
             time.sleep(draw.uniform(0, longest_s))
@@ -113,7 +113,7 @@ def test_a_hundred_kills_leave_the_old_or_the_new_one_whole(word, tmp_path, reco
             seen["torn" if list(place.glob(".part*")) else "no debris"] += 1
             seen["with it" if NEW.id in (kept if word == "take_in" else {in_force}) else "as before"] += 1
     record_property(word, dict(seen))
-    assert seen["killed"] >= KILLS // 2
+    assert seen["killed"] >= KILLS[word] // 2
     assert seen["as before"]
     assert seen["with it"]
     assert word == "use" or seen["torn"]

@@ -16,7 +16,7 @@ from services.instrument.api import create_app
 from services.instrument.exporting import Sticks
 
 STREAMS = "/api/(events|preview)$"  # they wait for news: tests/journey/test_api.py reads them
-EXAMPLES = 10
+EXAMPLES = 6  # of every address, in each mode: about 500 requests
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,8 @@ from services.instrument.paper.bench import Bench
 from services.instrument.paper.report import EXPERIMENTS
 from services.instrument.paper.trainer import magnification
 
+pytestmark = pytest.mark.paper
+
 BENCH = Bench(merged=2)
 
 

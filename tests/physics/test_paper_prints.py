@@ -9,6 +9,8 @@ from services.instrument.paper.bench import Bench
 from services.instrument.paper.printed import edge_signs
 from services.instrument.paper.report import EXPERIMENTS
 
+pytestmark = pytest.mark.paper
+
 BENCH = Bench(merged=2)
 
 

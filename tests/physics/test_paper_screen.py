@@ -8,6 +8,8 @@ import pytest
 from services.instrument.paper.bench import Bench
 from services.instrument.paper.report import EXPERIMENTS
 
+pytestmark = pytest.mark.paper
+
 BENCH = Bench(merged=2)
 
 
