@@ -107,6 +107,7 @@ def written_to_one_journal(machine: Machine, kept: Path, who: dict[str, bytes]) 
     first = machine.run("journalctl", "-b", "--no-pager", "-o", "cat", "-D", "/var/log/journal")
     assert "Journal started" in first
     assert "This device is diffuscope-" in first
+    assert "Unknown key" not in first, "journald has something to say about journald.conf"
 
 
 def test_networkmanager_and_avahi_understand_what_they_are_given(board: Board) -> None:
