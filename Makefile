@@ -5,10 +5,10 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-paper test-systemd test-appliance test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
-	@sed -nE 's/^([a-z-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
+	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
 
 # The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
 PI_LOCK := tests/ports/emulators/requirements.lock
@@ -45,7 +45,7 @@ FORMAT ?= verity
 KEYS ?= out/keys
 
 bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORMAT=plain, ARCH=arm64.
-	@systemd/image/install
+	@systemd/image/install $(ARCH)
 	@[ -e "$(KEYS)/signer.key" ] || { echo "No keys in $(KEYS): making test keys there"; systemd/image/keys "$(KEYS)"; }
 	@systemd/image/bundle --keys "$(KEYS)" --format $(FORMAT) $(if $(ARCH),--arch $(ARCH)) \
 		-o out/diffuscope$(if $(ARCH),-$(ARCH)).raucb
@@ -53,6 +53,9 @@ bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORM
 test-appliance: .venv/ready ## Update a device from version to version, with real RAUC and a real systemd; needs root.
 	@systemd/image/install
 	@$(BIN)/python -m pytest tests/appliance -rP
+
+test-arm64: .venv/ready ## Run the solver's tests on an emulated 64-bit ARM, as root; half an hour and more, not in CI.
+	@tests/arm64/run
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
 	@tests/browser/install

@@ -238,7 +238,7 @@ HARDENING = re.findall(
 )
 
 
-UNITS = [name for name in files() if re.fullmatch(r"systemd/[^/]+\.(service|socket|timer)", name)]
+UNITS = [name for name in files() if re.fullmatch(r"systemd/(image/card/luks/)?[^/]+\.(service|socket|timer)", name)]
 IMAGE_SETTINGS = ROOT / "systemd" / "image" / "update.toml"
 BLANKER = "/usr/bin/python3 -I -S /opt/diffuscope/device/drivers/blank.py --device /dev/spidev0.0"
 

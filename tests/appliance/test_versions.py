@@ -96,6 +96,13 @@ def only_root(machine: Machine) -> None:
     assert "idle" not in machine.run("runuser", "-u", "nobody", "--", *asks, check=False)
 
 
+def who_it_is(device: Device) -> dict[str, bytes]:
+    """The identity that the device made of itself; and all boots so far wrote one journal, under its number."""
+    files = {path.name: path.read_bytes() for path in (device.data / "identity").iterdir()}
+    assert [path.name for path in (device.data / "journal").iterdir()] == [files["machine-id"].decode()]
+    return files
+
+
 def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, bundles: dict[str, Path]) -> None:
     put_in(device, bundles["2.0"])
     with device.on() as machine:
@@ -103,6 +110,7 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         assert [machine.run(PYTHON, "-c", PRESS).strip() for _ in range(2)] == ["201", "201"]
         kept = device.captures()
         assert len({name.split("/")[1] for name in kept}) == 2
+        who = who_it_is(device)
         update(device, machine)
     assert (device.tried, device.autoboot()) == (True, ("A", "B"))
     with device.on() as machine:
@@ -118,6 +126,7 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         inside = {part["name"] for part in json.loads(machine.run("cat", f"{about}/sbom.cdx.json"))["components"]}
         assert {"numpy", "systemd", "rauc", "fastapi"} <= inside
     assert device.captures() == kept
+    assert who_it_is(device) == who
 
 
 def test_version_3_is_broken_is_tried_and_taken_back_with_every_capture(

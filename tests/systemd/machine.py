@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from signal import SIGKILL
 
 from tests.house import ROOT, files
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope" / "systemd"
-PACKAGES = "systemd,systemd-sysv,dbus,python3-minimal,libpython3-stdlib"
+PACKAGES = "systemd,systemd-sysv,dbus,udev,python3-minimal,libpython3-stdlib,network-manager,avahi-daemon,qrencode"
 UNIT = "diffuscope.service"
 START = """\
 #!/opt/diffuscope/.venv/bin/python
@@ -85,7 +86,7 @@ def root() -> Path:
     """A Debian of the same release as this machine's, made once and kept outside the checkout."""
     release = dict(line.split("=", 1) for line in Path("/etc/os-release").read_text().splitlines() if "=" in line)
     name = release["VERSION_CODENAME"]
-    made = CACHE / f"{name}-1"
+    made = CACHE / f"{name}-2"
     if not made.is_dir():
         part = CACHE / f"{name}.part"
         shutil.rmtree(part, ignore_errors=True)
@@ -131,27 +132,54 @@ def installed(opt: Path) -> list[str]:
 @contextmanager
 def booted(folder: Path) -> Iterator[Machine]:
     """A machine with our units installed as systemd/README.md says; what it changes is gone when it is switched off."""
-    opt, log = folder / "opt", folder / "console"
+    opt = folder / "opt"
     opt.mkdir()
-    words = [
-        "systemd-nspawn", "--quiet", "-D", str(root()), "--boot", "--register=no", "--keep-unit", "--private-network",
-        "--volatile=overlay", "--console=pipe", "--machine=diffuscope-test", *installed(opt),
-    ]  # fmt: skip
-    with log.open("wb") as console:
-        nspawn = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=console, stderr=console)
+    with switched_on(root(), folder / "console", *installed(opt)) as machine:
+        _install(machine)
+        yield machine
+
+
+@contextmanager
+def switched_on(tree: Path, console: Path, *more: str) -> Iterator[Machine]:
+    """A container that boots `tree` under a layer in memory; `more` are nspawn's words, `console` what it says."""
+    nspawn = _begun(tree, console, more)
     try:
-        machine = Machine(leader(nspawn, log))
+        machine = Machine(leader(nspawn, console))
         machine.until(lambda: machine.is_there("/run/systemd/private"))
         machine.until(
             lambda: machine.run("systemctl", "is-system-running", check=False).strip() in ("running", "degraded")
         )
-        _install(machine)
         yield machine
         machine.run("systemctl", "poweroff", "--force")
         nspawn.wait(20)
     finally:
         nspawn.terminate()
         nspawn.wait(20)
+
+
+def pulled_out(tree: Path, console: Path, when: Callable[[], bool], *more: str) -> None:
+    """Boot the same, and pull the plug as soon as `when` holds."""
+    nspawn = _begun(tree, console, more)
+    try:
+        first = leader(nspawn, console)
+        end = time.monotonic() + 30
+        while not when():
+            assert time.monotonic() < end, f"it never happened: {console.read_text()}"
+            time.sleep(0.001)
+        os.kill(first, SIGKILL)  # the first process inside: all others end with it
+        nspawn.wait(20)
+    finally:
+        nspawn.terminate()
+        nspawn.wait(20)
+
+
+def _begun(tree: Path, console: Path, more: tuple[str, ...]) -> subprocess.Popen[bytes]:
+    words = [
+        "systemd-nspawn", "--quiet", "-D", str(tree), "--boot", "--register=no", "--keep-unit", "--private-network",
+        "--volatile=overlay", "--console=pipe", "--machine=diffuscope-test", *more,
+    ]  # fmt: skip
+    with console.open("wb") as said:
+        return subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
 
 
 def leader(nspawn: subprocess.Popen[bytes], log: Path) -> int:

@@ -77,6 +77,44 @@ def test_it_runs_as_nobody_in_particular_and_without_a_network(running: Machine)
     assert [link.split(":")[0].strip() for link in links] == ["lo"]
 
 
+def test_a_stick_can_be_written_by_the_instrument_and_by_nobody_else(running: Machine) -> None:
+    """One that comes while it runs, one that was there before; a memory disk stands for FAT, which needs a kernel."""
+    place = "/run/systemd/system/diffuscope-stick@sda1.service.d"
+    disk = "ExecStart=/usr/bin/mount -t tmpfs -o nosuid,nodev,noexec,gid=stick,mode=0770 stick /media/stick-sda1"
+    running.run("mkdir", "-p", place)
+    lines = f"[Service]\nExecStart=\nExecStart=/usr/bin/mkdir -p /media/stick-sda1\n{disk}\n"
+    running.run("sh", "-c", f"printf '{lines}' > {place}/disk.conf && systemctl daemon-reload")
+    running.run("systemctl", "start", "diffuscope-stick@sda1.service")
+    for name in ("came-later", "was-there-before"):
+        inside = ["nsenter", "-t", str(running.main_pid()), "-m"]
+        who = re.findall(r"^Uid:\s+(\d+)", running.run("cat", f"/proc/{running.main_pid()}/status"), re.M)[0]
+        touch = ["touch", f"/media/stick-sda1/{name}"]
+        running.run(*inside, "setpriv", f"--reuid={who}", f"--regid={who}", "--groups=stick", *touch)
+        running.run("systemctl", "restart", UNIT)
+    assert running.run("ls", "/media/stick-sda1").split() == ["came-later", "was-there-before"]
+    stranger = ["setpriv", "--reuid=nobody", "--clear-groups", "ls", "/media/stick-sda1"]
+    assert running.run(*stranger, check=False) == ""
+    options = running.run("findmnt", "-n", "-o", "OPTIONS", "/media/stick-sda1")
+    assert {"nosuid", "nodev", "noexec"} <= set(options.strip().split(","))
+    running.run("systemctl", "stop", "diffuscope-stick@sda1.service")
+    assert not running.is_there("/media/stick-sda1")
+
+
+def test_the_rule_mounts_a_usb_stick_and_lets_go_of_it(machine: Machine) -> None:
+    """udev's own reading of the rule: of a device that says that it is a USB stick, and of one that is none."""
+    claims = 'KERNEL=="loop0", ENV{ID_BUS}="usb", ENV{ID_FS_TYPE}="vfat"'
+    machine.run("sh", "-c", f"mkdir -p /run/udev/rules.d && echo '{claims}' > /run/udev/rules.d/89-claims.rules")
+    machine.run("cp", "/opt/diffuscope/systemd/image/stick.rules", "/run/udev/rules.d/90-diffuscope-stick.rules")
+    asked = "udevadm test --action={} /sys/class/block/{} 2>&1"
+    assert "diffuscope-stick@loop0.service" in machine.run("sh", "-c", asked.format("add", "loop0"))
+    gone = machine.run("sh", "-c", asked.format("remove", "loop0"))
+    assert "systemctl --no-block stop diffuscope-stick@loop0.service" in gone
+    none = machine.run("sh", "-c", asked.format("add", "loop1"))
+    assert "diffuscope-stick@" not in none
+    said = [line for line in (gone + none).splitlines() if "stick.rules:" in line and " RUN " not in line]
+    assert not said, "udev has something to say about the rule"
+
+
 def test_an_idle_instrument_outlives_its_watchdog(running: Machine) -> None:
     pid = running.main_pid()
     time.sleep(12)  # longer than WatchdogSec

@@ -1,0 +1,127 @@
+"""What makes a card is read here as those read it for whom it is: the firmware, rpi-image-gen, the technician.
+
+No Raspberry Pi and no archive of Raspberry Pi's is needed; what a real program can read is tried with it in
+`tests/systemd/` and `tests/appliance/`.
+"""
+
+import configparser
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from device.spec import load_head
+from services.identity.certificates import ADDRESS, NETWORKS, SHARED
+from tests.house import ROOT, text
+
+CARD = "systemd/image/card"
+LAYERS = {"layer/diffuscope.yaml": "diffuscope", "image/diffuscope-card.yaml": "diffuscope-card"}
+# Of rpi-image-gen's own layers, those that are named here: as listed in its documentation in August 2026.
+THEIRS = {
+    "rpi5", "image-base", "debian-bookworm-arm64-multi", "rpi-debian-bookworm", "rpi-essential-base", "systemd-min",
+    "network-manager",
+}  # fmt: skip
+RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
+
+
+def metadata(name: str) -> dict[str, str]:
+    """The fields between METABEGIN and METAEND, continued lines joined."""
+    block = re.search(r"^# METABEGIN\n(.*?)^# METAEND$", text(f"{CARD}/{name}"), re.M | re.S)
+    assert block is not None, "no metadata"
+    lines = re.sub(r"\n# {2,}", " ", block[1]).splitlines()
+    rows = [re.fullmatch(r"# (X-Env-[\w-]+): *(.*)", line) for line in lines if line != "#"]
+    assert all(rows), "a line that rpi-image-gen cannot read"
+    return {row[1]: row[2] for row in rows if row}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_a_layer_says_of_itself_and_of_its_variables_what_rpi_image_gen_asks(name: str) -> None:
+    said = metadata(name)
+    assert said["X-Env-Layer-Name"] == LAYERS[name]
+    assert {"X-Env-Layer-Category", "X-Env-Layer-Desc", "X-Env-VarPrefix"} <= set(said)
+    assert re.fullmatch(r"\d+\.\d+\.\d+", said["X-Env-Layer-Version"])
+    assert set(said["X-Env-Layer-Requires"].split(",")) <= THEIRS
+    variables = {match[1] for key in said if (match := re.fullmatch(r"X-Env-Var-([a-z_]+)", key))}
+    for variable in variables:
+        about = {what: said[f"X-Env-Var-{variable}-{what}"] for what in ("Desc", "Required", "Valid", "Set")}
+        assert about["Required"] in ("y", "n")
+        assert about["Set"] in ("y", "n", "lazy", "force")
+        assert re.fullmatch(RULES, about["Valid"]), f"{variable}: {about['Valid']}"
+
+
+def test_the_layer_calls_scripts_that_are_there_with_variables_that_it_has() -> None:
+    said = metadata("layer/diffuscope.yaml")
+    body = yaml.safe_load(text(f"{CARD}/layer/diffuscope.yaml"))
+    assert body["mmdebstrap"]["packages"] == list(dict.fromkeys(body["mmdebstrap"]["packages"]))
+    hooks = "\n".join(body["mmdebstrap"]["customize-hooks"])
+    for script in re.findall(r"\$IGconf_diffuscope_checkout/(\S+)", hooks):
+        assert (ROOT / script).stat().st_mode & 0o111, f"{script} is not there, or cannot be run"
+    for variable in re.findall(r"\$IGconf_diffuscope_([a-z]+)", hooks):
+        assert f"X-Env-Var-{variable}" in said
+    assert text("pyproject.toml").split('version = "')[1].startswith(said["X-Env-Var-version"] + '"')
+
+
+def test_the_configuration_names_layers_that_exist() -> None:
+    named = yaml.safe_load(text(f"{CARD}/config/diffuscope.yaml"))
+    layers = {named["device"]["layer"], named["image"]["layer"], *named["layer"].values()}
+    assert layers <= {*LAYERS.values(), *THEIRS}
+    assert f"image {named['image']['name']}.img {{" in text(f"{CARD}/image/genimage.cfg")
+
+
+def test_config_txt_is_what_a_firmware_can_read_and_opens_what_the_head_needs() -> None:
+    lines = text(f"{CARD}/config.txt").splitlines()
+    for line in lines:
+        assert len(line) <= 98, "the firmware reads no more of a line"
+        assert re.fullmatch(r"|#.*|\[(all|boot_partition=\d)\]|[a-z0-9_]+=[\w=.,-]+", line), line
+    assert lines[-1] == "[all]", "whoever adds a line means all"
+    wanted = {"spi=on", "i2c_arm=on", "strict_gpiod", "watchdog=on"}
+    assert wanted <= {line.removeprefix("dtparam=") for line in lines}
+    head = re.search(r"heads\\/(\w+)\.toml/'", text(f"{CARD}/board"))
+    assert head is not None
+    spec = load_head(ROOT / f"hardware/heads/{head[1]}.toml")
+    assert spec.camera.backend == "picamera2"
+    assert f"dtoverlay={head[1]}" in lines
+    assert "camera_auto_detect=0" in lines
+
+
+def test_the_kernel_is_told_everything_on_one_line() -> None:
+    assert text(f"{CARD}/cmdline.txt").count("\n") == 1
+
+
+def test_the_access_point_is_off_and_has_no_password_of_its_own() -> None:
+    """One in a release would be the same on all devices; NetworkManager itself reads the file in tests/systemd."""
+    profile = configparser.ConfigParser(interpolation=None)
+    profile.read_string(text("systemd/image/access-point.nmconnection"))
+    assert profile["wifi-security"]["psk"] == "@WIFI@"
+    assert profile["wifi"]["ssid"] == "@NAME@"
+    assert profile["wifi-security"]["key-mgmt"] == "wpa-psk"
+    assert profile["connection"]["autoconnect"] == "false", "the page has no sign-in yet"
+    assert profile["ipv4"]["address1"] == f"{ADDRESS}/{NETWORKS[0].prefixlen}"
+
+
+def test_the_name_that_avahi_calls_is_the_one_in_the_certificate() -> None:
+    conf = configparser.ConfigParser()
+    conf.read_string(text("systemd/image/avahi-daemon.conf"))
+    assert f"{conf['server']['host-name']}.local" == SHARED
+
+
+def test_the_journal_is_small_beside_the_captures() -> None:
+    conf = configparser.ConfigParser()
+    conf.optionxform = str  # type: ignore[assignment, method-assign]  # keys of systemd are case-sensitive
+    conf.read_string(text("systemd/image/journald.conf"))
+    assert conf["Journal"]["Storage"] == "persistent"
+    assert int(conf["Journal"]["SystemMaxUse"].removesuffix("M")) <= 200
+
+
+def test_every_release_brings_what_the_table_of_the_image_says() -> None:
+    """A file beside the recipe that the recipe does not take along would be a promise."""
+    recipe = text("systemd/image/release")
+    beside = {path.name for path in (ROOT / "systemd/image").iterdir() if path.is_file()}
+    brought = {name for name in beside if f"$here/{name}" in recipe}
+    tools = {"README.md", "base", "bundle", "install", "keys", "release", "requirements.lock", "sbom.py", "wheels"}
+    assert beside - tools <= brought
+    assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
+        "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
+    }  # fmt: skip
+    assert Path(ROOT / "systemd/diffuscope-identity.service").exists()
