@@ -19,6 +19,7 @@ from device.errors import NotKept, StoreDamaged, StoreError, StoreFull
 from services.records import disk
 
 KEPT = 3
+LOGS = ("journal", "wal", "shm")  # SQLite would apply what is left of them to whatever lies beside them
 SLACK_BYTES = 10_000_000  # what the system may write meanwhile
 
 
@@ -69,12 +70,13 @@ class Snapshots:
         new = self.shelf.with_name(".shelf.part")
         shutil.copyfile(self.folder / name, new)
         _settle_file(new)
+        disk.settle(self.shelf.parent)
         aside = self._aside()
-        for present in (self.shelf, *(self.shelf.with_name(self.shelf.name + end) for end in ("-wal", "-shm"))):
+        for present in (self.shelf, *(self.shelf.with_name(f"{self.shelf.name}-{log}") for log in LOGS)):
             if present.exists():
                 present.rename(aside / present.name)
                 disk.settle(aside)
-                disk.settle(self.shelf.parent)  # the tables first: their log alone is nothing that could be opened
+                disk.settle(self.shelf.parent)  # the tables first: without them the shelf refuses to open
         new.rename(self.shelf)
         disk.settle(self.shelf.parent)
         return aside
