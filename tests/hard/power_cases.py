@@ -263,7 +263,7 @@ def judge_put_back(folder: Path, said: list[str]) -> str:
         Store(folder / "data").close()
     except StoreDamaged:
         assert not said
-        put_back(folder, said.append)
+        put_back(folder, lambda word: None)
         outcome = "refused"
     with Store(folder / "data") as store:
         listed = [one.id for one in store.captures()]
