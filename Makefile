@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -27,7 +27,7 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 
 # A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
 # the summary names it, because it is then the test or the page that has to be mended.
-test: .venv/ready browser buses ## Run every test that needs no Raspberry Pi.
+test: .venv/ready browser buses strace ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd and not paper" --ignore tests/browser --ignore tests/ports --ignore tests/parts
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest tests/browser --reruns 1 -rR
@@ -72,6 +72,9 @@ OTHER_PYTHON ?= python3.13
 
 test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.
 	@umockdev-wrapper .other-venv/bin/python -m pytest -m "not rig" tests/ports
+
+strace: ## Install strace (Debian package) where it is missing.
+	@tests/hard/install
 
 buses: ## Install umockdev (Debian packages) where it is missing.
 	@tests/ports/emulators/install

@@ -19,6 +19,7 @@ from device.spec import InstrumentSpec, load_head
 from device.values import Colour
 from services.instrument import calibrations
 from services.instrument.once import Order, reconstruct_file, written
+from services.records.command import app as snapshots
 from services.update.command import app as update_app
 
 app = typer.Typer(
@@ -28,6 +29,7 @@ app = typer.Typer(
 app.add_typer(calibrations.app, name="calibrations")
 
 app.add_typer(update_app, name="update")
+app.add_typer(snapshots, name="snapshots")
 
 SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
 

@@ -20,7 +20,7 @@ import typer
 from device import errors
 from device.spec import load_head
 from services.cli import app
-from services.instrument.exam import BUDGET_S
+from services.instrument.pace import BUDGET_S, LAST_S
 from services.instrument.watchdog import BEAT_S
 from services.update.command import app as update_app
 from services.update.settings import UpdateSettings
@@ -269,6 +269,11 @@ def test_the_watchdog_waits_for_several_beats_and_for_the_longest_round() -> Non
     assert float(service["WatchdogSec"]) >= max(3 * BEAT_S, 2 * BUDGET_S)
     assert service["WatchdogSignal"] == "SIGKILL"
     assert float(service["TimeoutStartSec"]) >= 180
+
+
+def test_whoever_stops_the_instrument_waits_for_the_longest_picture_that_can_be_chosen() -> None:
+    """And uvicorn's second, and one for the rest: a picture under way is finished and kept."""
+    assert float(unit_of("systemd/diffuscope.service")["Service"]["TimeoutStopSec"]) >= LAST_S + 2
 
 
 def test_every_end_every_boot_and_giving_up_call_the_same_blanker() -> None:

@@ -118,7 +118,7 @@ class Archive:
     def _alone(self) -> Iterator[None]:
         """Wait until no other process changes the archive; a killed one gives its place up. StoreError if none may."""
         try:
-            self.root.mkdir(parents=True, exist_ok=True)
+            _make_folder(self.root)
             with (self.root / ".lock").open("ab") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 yield
@@ -331,6 +331,14 @@ def write_synced(path: Path, content: bytes) -> None:
         out.write(content)
         out.flush()
         os.fsync(out.fileno())
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder, with those above it; their names are on the disk too, or a power cut takes all that is inside."""
+    if not folder.is_dir():
+        _make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync_folder(folder.parent)
 
 
 def sync_folder(folder: Path) -> None:

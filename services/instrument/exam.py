@@ -30,6 +30,7 @@ from services.instrument.bulletin import Bulletin
 from services.instrument.filing import QUICK_PX, as_json, capture_files
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
+from services.instrument.pace import BUDGET_S, LAST_S, SEATS
 from services.instrument.press import Exposed, Press, Preview
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
@@ -38,13 +39,11 @@ from services.records.store import Store
 
 log = logging.getLogger(__name__)
 
-BUDGET_S = 5.0
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
 RETRY_S = 1.0
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
-SEATS = 2  # pictures in the making at once: one that is refined, and one more that is exposed
 
 
 class Exam:
@@ -139,7 +138,7 @@ class Exam:
         with self._turn:
             self._closing = True
             self._turn.notify_all()
-        self._owner.join(timeout=SEATS * 2 * max(BUDGET_S, self._budget_s()))
+        self._owner.join(timeout=LAST_S)
         self.head.close()
 
     # What the owner does, alone
@@ -261,9 +260,11 @@ class Exam:
 
     def _make(self, shot: Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
-        made = self._reconstruct(shot)
+        budget_s = self._budget_s()
+        made = self._reconstruct(shot, budget_s)
         verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
         report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
+        report["budget_s"] = budget_s
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
@@ -288,14 +289,14 @@ class Exam:
         finally:
             light.off()
 
-    def _reconstruct(self, shot: Exposed) -> Reconstruction:
+    def _reconstruct(self, shot: Exposed, budget_s: float) -> Reconstruction:
         def show(stage: Stage) -> None:
             if not stage.last:
                 self._show_quick(shot, stage.picture)
 
         return self._reconstructor(
             shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
-            deadline=Deadline.after(self.clock, self._budget_s()), watch=show, between=self._let_in,
+            deadline=Deadline.after(self.clock, budget_s), watch=show, between=self._let_in,
         )  # fmt: skip
 
     def _let_in(self) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock, Thread
-from typing import Any, Literal
+from typing import Any
 
 from device.calibration.archive import write_synced
 from device.clock import Clock, SystemClock
@@ -25,12 +25,11 @@ from device.spec import InstrumentSpec, load_head
 from device.values import Calibration
 from services.instrument import frontier
 from services.instrument.apart import apart
+from services.instrument.pace import PACES_S, Pace
 from services.records import picture
 
 log = logging.getLogger(__name__)
 
-Pace = Literal["quick", "standard", "best"]
-PACES_S: dict[Pace, float] = {"quick": 1.0, "standard": 5.0, "best": 30.0}
 SCENE = Path(__file__).parents[2] / "device" / "sim" / "scenes" / "diabetic.toml"
 BUDGET_S = 0.26  # the paper's: it marks where this device's own choice stands
 REPEATS = 5

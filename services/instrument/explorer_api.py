@@ -10,7 +10,8 @@ from device.errors import CalibrationMissing
 from device.recon.reconstructor import Recipe
 from device.values import Calibration
 from services.instrument.diary import Diary
-from services.instrument.explorer import Explorer, Kept, Pace
+from services.instrument.explorer import Explorer, Kept
+from services.instrument.pace import Pace
 from services.records.store import Store
 
 

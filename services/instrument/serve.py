@@ -83,7 +83,7 @@ def serve(
     `names`, beside the computer's own, its addresses, and local ones.
     """
     clock = SystemClock()
-    with address, Store(data) as store, ExitStack() as undo:
+    with address, Store(data, clock=clock) as store, ExitStack() as undo:
         book = LightBook(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_of(spec, data))
         diary = undo.enter_context(closing(Diary(data / "diary")))
@@ -103,6 +103,8 @@ def serve(
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)
+        if store.swept:
+            log.warning("half-kept captures of the last run were moved to torn/: %s", ", ".join(store.swept))
         try:
             ready()
             _Server(config, house.bulletin).run(sockets=[address])

@@ -14,6 +14,7 @@ from device.head import Chips, Head
 from device.values import Capture
 from services.health.checks import Facts
 from services.instrument.owner import Owner
+from services.instrument.pace import BUDGET_S
 from services.records.store import Store
 
 COMPUTER_HEAT = Path("/sys/class/thermal/thermal_zone0/temp")
@@ -40,7 +41,8 @@ def facts(owner: Owner, pictures: int) -> Facts:
         computer_c=int(COMPUTER_HEAT.read_text()) / 1000 if COMPUTER_HEAT.exists() else None,
         now=house.clock.wall(), clock_was_set=CLOCK_WAS_SET.exists(),
         newest=newest[0].taken_at if newest else None,
-        press_s=[spent_s for one in newest if (spent_s := _press_s(one)) > 0],
+        presses=[(spent_s, spent_s - _budget_s(one)) for one in newest if (spent_s := _press_s(one)) > 0],
+        torn_bytes=list(house.store.torn().values()),
     )  # fmt: skip
 
 
@@ -87,3 +89,8 @@ def _shelf(store: Store) -> tuple[list[Capture], StoreError | None]:
 def _press_s(capture: Capture) -> float:
     """From the button to the kept picture; 0 where its report does not say."""
     return float(sum(capture.report.get("seconds", {}).values()))
+
+
+def _budget_s(capture: Capture) -> float:
+    """What it was allowed to take; reports did not say before a person could choose."""
+    return float(capture.report.get("budget_s", BUDGET_S))

@@ -66,6 +66,19 @@ def move_aside(stray: Path, refuge: Path) -> str:
     return name
 
 
+def size_bytes(place: Path) -> int:
+    """How much room a file, or all files below a folder, would give back."""
+    return sum(path.lstat().st_size for path in (place, *place.rglob("*")) if not path.is_dir())
+
+
+def remove(place: Path) -> None:
+    """Remove a file, or a folder with all that is in it."""
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink()
+
+
 @contextmanager
 def alone(lock: Path) -> Iterator[None]:
     """Wait until no other thread or process is in here with the same lock file; a killed one gives its place up.

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
@@ -255,19 +255,24 @@ def for_writing(engine: Engine) -> Engine:
     return engine.execution_options(writing=True)
 
 
-def migrate(engine: Engine) -> None:
+def migrate(engine: Engine, before: Callable[[str], None]) -> None:
     """Bring the tables to this version in one transaction, and leave tables of a newer version as they are.
 
     A newer version is met after an update was rolled back. It only added (README, "add a column"), so we can go on.
+    `before` hears the version of tables that are about to change; what it raises leaves them as they are.
     """
     config = migration_config()
     scripts = ScriptDirectory.from_config(config)
-    with for_writing(engine).begin() as connection:
-        known = {script.revision for script in scripts.walk_revisions()}
+    known = {script.revision for script in scripts.walk_revisions()}
+    with engine.connect() as connection:
         present = set(MigrationContext.configure(connection).get_current_heads())
-        if present <= known and present != set(scripts.get_heads()):
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+    if not present <= known or present == set(scripts.get_heads()):
+        return
+    for version in present:
+        before(version)
+    with for_writing(engine).begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
 
 
 def migration_config() -> Config:

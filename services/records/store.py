@@ -3,14 +3,17 @@
     shelf.sqlite                  what was kept: rows
     captures/<id>/<name>          and their files
     captures/.<id>.part/          being written; no row yet
-    torn/<id>/                    found half-kept at an opening: never listed, for the technician
+    torn/<id>/                    found half-kept at an opening: never listed, for the technician; gives its room up
+    snapshots/                    the tables as they were before each migration (snapshots.py)
 
 The row is the promise: it is written last, when every file it names is on the disk.
 """
 
 import hashlib
+import logging
 import re
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -21,11 +24,15 @@ from sqlalchemy import distinct, func, select, tuple_
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
+from device.clock import Clock, SystemClock
 from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
 from device.values import Capture
 from services.records import disk, schema
 from services.records.errand import Beside
 from services.records.schema import CaptureRow, FileRow, ShotRow, VisitRow
+from services.records.snapshots import Snapshots
+
+log = logging.getLogger(__name__)
 
 RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
 LATELY = 100  # visits by which the next ones are judged
@@ -47,6 +54,7 @@ class Store:
         *,
         reserve_bytes: int = RESERVE_BYTES,
         free_bytes: Callable[[Path], int] = disk.free_bytes,
+        clock: Clock | None = None,
     ) -> None:
         self.folder = folder
         self._captures, self._torn, self._lock = folder / "captures", folder / "torn", folder / ".lock"
@@ -54,11 +62,12 @@ class Store:
         with told(), ExitStack() as undo:
             disk.make_folder(self._captures)
             disk.make_folder(self._torn)
+            snapshots = Snapshots(folder / "shelf.sqlite", clock or SystemClock(), free_bytes)
             self.engine = schema.open_engine(folder / "shelf.sqlite")
             undo.callback(self.engine.dispose)
             with disk.alone(self._lock):  # a capture that another process is keeping is not a torn one
                 self._refuse_to_begin_anew()
-                schema.migrate(self.engine)
+                schema.migrate(self.engine, snapshots.make)
                 self.swept = self._sweep()
             undo.pop_all()
 
@@ -144,8 +153,13 @@ class Store:
             total_bytes, number = session.execute(sizes).one()
         return self._room_bytes() * number // total_bytes if total_bytes else self.space_left() // pictures
 
+    def torn(self) -> dict[str, int]:
+        """What lies in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
+        return {place.name: disk.size_bytes(place) for place in sorted(self._torn.iterdir())}
+
     def _room_bytes(self) -> int:
-        return max(0, self._free_bytes(self.folder) - self._reserve_bytes)
+        free_bytes = self._free_bytes(self.folder) + sum(self.torn().values())
+        return max(0, free_bytes - self._reserve_bytes)
 
     def space_left(self) -> int:
         """How many more captures will fit, judged by the mean size so far."""
@@ -188,9 +202,14 @@ class Store:
         return swept
 
     def _refuse_without_room(self, need_bytes: int) -> None:
-        free = self._free_bytes(self.folder)
-        if free < need_bytes + self._reserve_bytes:
-            raise StoreFull(f"{free} bytes are free; {need_bytes} and a reserve of {self._reserve_bytes} are needed")
+        """StoreFull, after what is torn gave its room up, the oldest first: a whole picture is worth more than half."""
+        torn = iter(self.torn())
+        while (free := self._free_bytes(self.folder)) < need_bytes + self._reserve_bytes:
+            if (name := next(torn, None)) is None:
+                wanted = f"{need_bytes} and a reserve of {self._reserve_bytes} are needed"
+                raise StoreFull(f"{free} bytes are free; {wanted}")
+            disk.remove(self._torn / name)
+            log.warning("the half-kept capture %s was removed: a new one needs its room", name)
 
     def _refuse_twice(self, *folders: Path) -> None:
         for folder in folders:
@@ -247,6 +266,8 @@ def told() -> Iterator[None]:
         raise kind(f"the disk refused: {error}") from error
     except DBAPIError as error:
         raise _KINDS.get(_sqlite_name(error), StoreError)(f"the database refused: {error.orig}") from error
+    except sqlite3.Error as error:
+        raise _KINDS.get(error.sqlite_errorname, StoreError)(f"the database refused: {error}") from error
 
 
 _KINDS: dict[str, type[StoreError]] = {

@@ -217,6 +217,30 @@ def test_too_little_room_is_refused_before_anything_is_written(tmp_path: Path) -
         assert [path.name for path in (tmp_path / "captures").iterdir()] == ["fits"]
 
 
+def test_what_is_torn_gives_its_room_to_a_new_picture_the_oldest_first(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nothing of it is removed before, however old it is; it counts as room that is left."""
+    size_bytes, torn = 20_000, ("20260301T120000-OD-aa", "20260301T120100-OD-bb", "20260301T120200-OD-cc")
+
+    def free_bytes(folder: Path) -> int:
+        return 60_000 - sum(path.stat().st_size for path in folder.rglob("*/*/*"))
+
+    with Store(tmp_path, reserve_bytes=0, free_bytes=free_bytes) as store:
+        for name in torn:
+            (tmp_path / "torn" / name).mkdir()
+            (tmp_path / "torn" / name / "raw.tiff").write_bytes(bytes(size_bytes))
+        assert store.torn() == dict.fromkeys(torn, size_bytes)
+        store.keep(capture("new"), {"raw.tiff": bytes(1_000)})
+        assert list(store.torn()) == [*torn[1:]]
+        assert store.space_left() == 59  # 19,000 bytes and the 40,000 that would be given
+        store.keep(capture("newer"), {"raw.tiff": bytes(40_000)})
+        assert store.torn() == {}
+        assert torn[0] in caplog.text
+        with pytest.raises(StoreFull):
+            store.keep(capture("too-much"), {"raw.tiff": bytes(30_000)})
+
+
 def test_the_room_left_is_counted_in_captures_like_those_so_far(tmp_path: Path) -> None:
     free = [50_000_000]
     with Store(tmp_path, reserve_bytes=10_000_000, free_bytes=lambda folder: free[0]) as store:

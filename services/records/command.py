@@ -1,0 +1,46 @@
+"""`diffuscope snapshots list|restore`: the way back, for a technician, from a migration that did harm."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from device.clock import SystemClock
+from device.errors import NotKept
+from services.records import disk
+from services.records.snapshots import Snapshots
+from services.records.store import told
+
+app = typer.Typer(help="The tables as they were before each migration, and the way back.", no_args_is_help=True)
+Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
+
+
+def _snapshots(data: Path) -> Snapshots:
+    if not (data / "captures").is_dir():
+        raise NotKept(f"{data} holds no captures", "Give the folder of the captures with --data.")
+    return Snapshots(data / "shelf.sqlite", SystemClock())
+
+
+@app.command("list")
+def list_them(data: Data) -> None:
+    """Name the snapshots, the oldest tables first."""
+    for name in _snapshots(data).names():
+        typer.echo(name)
+
+
+@app.command()
+def restore(
+    name: Annotated[str, typer.Argument(help="A snapshot, as `list` names it.")],
+    data: Data,
+    sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Put a snapshot in the place of the tables; stop the instrument first."""
+    snapshots = _snapshots(data)
+    with told(), disk.alone(data / ".lock"):
+        if name in snapshots.names() and (missing := snapshots.missing_from(name, data / "captures")):
+            typer.echo(f"{len(missing)} captures were kept since, from {missing[0]} on.")
+            typer.echo("At the next start they move to torn/; answers given since are in the tables put aside only.")
+        if not sure:
+            typer.confirm(f"Go back to {name}?", abort=True)
+        aside = snapshots.put_back(name)
+    typer.echo(f"The tables are those of {name}. What they replaced is in {aside}.")

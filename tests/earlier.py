@@ -1,0 +1,183 @@
+"""What each earlier version of the tables was written and read by: the very statements of that release, as text.
+
+They were noted down from the release itself and never change: a newer shelf must still answer them, for an update may
+be rolled back. A new version of the tables adds what its own release says, when the next one begins.
+"""
+
+import hashlib
+import json
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+from alembic import command
+
+from services.records import schema
+
+RAW = b"raw counts"
+OUTCOME = '{"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}'
+Row = tuple[object, ...]
+_CAPTURE = "captures.id, captures.eye, captures.taken_at, captures.simulated, captures.calibration_id, captures.report"
+_VISIT = "visits.id, visits.person, visits.day, visits.begun_at, visits.finished_at, visits.outcome"
+_FIELD = "fields.visit, fields.name, fields.value, fields.set_at"
+
+
+def shelf_of(folder: Path, version: str) -> Path:
+    """An empty shelf whose tables are of that version."""
+    (folder / "captures").mkdir(parents=True)
+    engine = schema.open_engine(folder / "shelf.sqlite")
+    config = schema.migration_config()
+    with schema.for_writing(engine).begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, version)
+    engine.dispose()
+    return folder
+
+
+class Release:
+    """The program of an earlier version, as the shelf sees it: it connects, writes something of number `n`, reads."""
+
+    def __init__(self, folder: Path, version: str) -> None:
+        self._folder = folder
+        self._versions = sorted(known for known in WRITES if known <= version)
+
+    def write(self, n: int) -> None:
+        """Everything that it ever writes, with names that end in `n`; a capture's file too."""
+        place = self._folder / "captures" / f"c{n}"
+        place.mkdir()
+        (place / "raw.tiff").write_bytes(RAW)
+        with self._connected() as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            for version in self._versions:
+                WRITES[version](connection, n)
+            connection.execute("COMMIT")
+        connection.close()
+
+    def read(self, n: int) -> list[list[Row]]:
+        """What each of its questions about number `n` is answered."""
+        with self._connected() as connection:
+            said = [connection.execute(*ask).fetchall() for version in self._versions for ask in READS[version](n)]
+        connection.close()
+        return said
+
+    def _connected(self) -> sqlite3.Connection:
+        connection = sqlite3.connect(self._folder / "shelf.sqlite", isolation_level=None)
+        for pragma in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+            connection.execute(f"PRAGMA {pragma}")
+        return connection
+
+
+def _write_captures(say: sqlite3.Connection, n: int) -> None:
+    say.execute(
+        "INSERT INTO captures (id, eye, taken_at, simulated, calibration_id, report) VALUES (?, ?, ?, ?, ?, ?)",
+        (f"c{n}", "OD", f"2026-03-01T12:00:{n:02}.000000+00:00", 1, "00ff", json.dumps({"verdict": {"n": n}})),
+    )
+    digest = hashlib.sha256(RAW).hexdigest()
+    say.execute(
+        "INSERT INTO files (capture_id, name, sha256, bytes) VALUES (?, ?, ?, ?)",
+        (f"c{n}", "raw.tiff", digest, len(RAW)),
+    )
+
+
+def _read_captures(n: int) -> list[tuple[str, Row]]:
+    since = (f"2026-03-01T12:00:{n + 1:02}.000000+00:00", "", 1, 0)
+    return [
+        (
+            f"SELECT {_CAPTURE} FROM captures WHERE (captures.taken_at, captures.id) < (?, ?)"
+            " ORDER BY captures.taken_at DESC, captures.id DESC LIMIT ? OFFSET ?",
+            since,
+        ),
+        (f"SELECT {_CAPTURE} FROM captures WHERE captures.id = ?", (f"c{n}",)),
+        (
+            "SELECT files.capture_id, files.name, files.sha256, files.bytes FROM files WHERE files.capture_id IN (?)"
+            " ORDER BY files.name",
+            (f"c{n}",),
+        ),
+    ]
+
+
+def _write_light(say: sqlite3.Connection, n: int) -> None:
+    say.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OD", n, 0.001))
+    say.execute(
+        "UPDATE light_doses SET dose_j_per_cm2=? WHERE light_doses.eye = ? AND light_doses.slot = ?", (n, "OD", n)
+    )
+    say.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OS", n, 0.001))
+    say.execute("DELETE FROM light_doses WHERE light_doses.eye = ? AND light_doses.slot = ?", ("OS", n))
+    if say.execute("UPDATE light_time SET now_s=?, observed_s=? WHERE light_time.id = ?", (1.0, 2.0, 1)).rowcount == 0:
+        say.execute("INSERT INTO light_time (id, boot, now_s, observed_s) VALUES (?, ?, ?, ?)", (1, "boot", 1.0, 2.0))
+
+
+def _read_light(n: int) -> list[tuple[str, Row]]:
+    return [
+        (
+            "SELECT light_doses.eye, light_doses.slot, light_doses.dose_j_per_cm2 FROM light_doses"
+            " WHERE light_doses.eye = ? AND light_doses.slot = ?",
+            ("OD", n),
+        ),
+        ("SELECT light_time.id, light_time.boot, light_time.now_s, light_time.observed_s FROM light_time", ()),
+    ]
+
+
+def _write_people(say: sqlite3.Connection, n: int) -> None:
+    now, visit, person = "2026-03-01T12:00:00.000000+00:00", f"v{n}", f"A{n}"
+    say.execute("DELETE FROM keys WHERE keys.done_at < ?", ("2026-01-01",))
+    if say.execute("UPDATE counters SET last=? WHERE counters.prefix = ?", (n, "A")).rowcount == 0:
+        say.execute("INSERT INTO counters (prefix, last) VALUES (?, ?)", ("A", n))
+    say.execute("INSERT INTO persons (number, made_at) VALUES (?, ?)", (person, now))
+    say.execute('INSERT INTO keys ("key", request, answer, done_at) VALUES (?, ?, ?, ?)', (f"{n:016}", "r", visit, now))
+    say.execute(
+        "INSERT INTO visits (id, person, day, begun_at, finished_at, outcome) VALUES (?, ?, ?, ?, ?, ?)",
+        (visit, person, "2026-03-01", now, None, None),
+    )
+    say.execute("INSERT INTO fields (visit, name, value, set_at) VALUES (?, ?, ?, ?)", (visit, "age", "50", now))
+    say.execute(
+        "UPDATE fields SET value=?, set_at=? WHERE fields.visit = ? AND fields.name = ?", ("51", now, visit, "age")
+    )
+    say.execute("INSERT INTO identifiers (person, name, value) VALUES (?, ?, ?)", (person, "name", '"x"'))
+    say.execute("DELETE FROM identifiers WHERE identifiers.person = ? AND identifiers.name = ?", (person, "name"))
+    say.execute("INSERT INTO shots (capture, visit, slot) VALUES (?, ?, ?)", (f"c{n}", visit, "R-centre"))
+    say.execute(
+        "INSERT INTO slots (visit, slot, capture, reason) VALUES (?, ?, ?, ?)", (visit, "L-centre", None, "pupil")
+    )
+    say.execute("UPDATE slots SET reason=? WHERE slots.visit = ? AND slots.slot = ?", ("pain", visit, "L-centre"))
+    say.execute(
+        "UPDATE visits SET finished_at=?, outcome=? WHERE visits.id = ?",
+        (now, OUTCOME, visit),
+    )
+
+
+def _read_people(n: int) -> list[tuple[str, Row]]:
+    visit, person = f"v{n}", f"A{n}"
+    return [
+        ('SELECT keys."key", keys.request, keys.answer, keys.done_at FROM keys WHERE keys."key" = ?', (f"{n:016}",)),
+        ("SELECT persons.number, persons.made_at FROM persons WHERE persons.number = ?", (person,)),
+        (f"SELECT {_VISIT} FROM visits WHERE visits.id = ?", (visit,)),
+        (
+            "SELECT fields.visit, fields.name, fields.value, fields.set_at FROM fields WHERE fields.visit IN (?)",
+            (visit,),
+        ),
+        (
+            "SELECT identifiers.person, identifiers.name, identifiers.value FROM identifiers"
+            " WHERE identifiers.person IN (?)",
+            (person,),
+        ),
+        (
+            "SELECT shots.visit, shots.slot, shots.capture, json_extract(captures.report, ?) AS json_extract_1"
+            " FROM shots JOIN captures ON captures.id = shots.capture WHERE shots.visit IN (?)"
+            " ORDER BY captures.taken_at, captures.id",
+            ("$.verdict", visit),
+        ),
+        ("SELECT slots.visit, slots.slot, slots.capture, slots.reason FROM slots WHERE slots.visit IN (?)", (visit,)),
+    ]
+
+
+WRITES: dict[str, Callable[[sqlite3.Connection, int], None]] = {
+    "r0001": _write_captures,
+    "r0002": _write_light,
+    "r0003": _write_people,
+}
+READS: dict[str, Callable[[int], list[tuple[str, Row]]]] = {
+    "r0001": _read_captures,
+    "r0002": _read_light,
+    "r0003": _read_people,
+}

@@ -1,0 +1,255 @@
+"""Power cuts: what a program wrote is noted down call by call, and cut off after each of them.
+
+A disk may forget whatever was not synced, any part of it, in any order. `Disk` is such a disk in memory: it follows the
+system calls that `strace` noted, and says what it could hold after a cut. See README.md for what it does not know.
+"""
+
+import random
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+CALLS = (
+    "openat,creat,write,pwrite64,writev,pwritev,pwritev2,lseek,ftruncate,truncate,fallocate,rename,renameat,renameat2,"
+    "link,linkat,symlink,symlinkat,unlink,unlinkat,rmdir,mkdir,mkdirat,fsync,fdatasync,copy_file_range,sendfile,mmap"
+)
+LINE = re.compile(r"\d+ +(\w+)\((.*)\) += (0x\w+|\d+)")
+WORD = re.compile(r'"((?:\\x..)*)"')
+OPENED = re.compile(r"\d+<((?:\\x..)*)>")
+OPEN = re.compile(r"^(?:AT_FDCWD|\d+)<((?:\\x..)*)>")
+DRAWS = 3
+SECTOR_BYTES = 512
+
+
+def noted(words: list[str], folder: Path, cwd: Path) -> list[str]:
+    """Run a program under strace; what it said, and the calls that did something below a folder, in order."""
+    if shutil.which("strace") is None:
+        raise RuntimeError("strace is missing; tests/hard/install installs it")
+    log, below = folder / "log", "".join(f"\\x{byte:02x}" for byte in bytes(folder))
+    trace = ["strace", "-f", "--seccomp-bpf", "-y", "-xx", "-s", "100000000", "-e", f"trace={CALLS}", "-o", str(log)]
+    subprocess.run([*trace, "-e", "signal=none", *words], cwd=cwd, stdout=subprocess.DEVNULL, check=True)
+    calls = (line for line in log.read_text("ascii").splitlines() if below in line or " write(1<" in line)
+    return [line for line in calls if " = -1 " not in line]
+
+
+def plain(escaped: str) -> bytes:
+    return bytes.fromhex(escaped.replace("\\x", ""))
+
+
+@dataclass(eq=False)
+class Thing:
+    """A file or a folder: what programs see, what is on the disk for certain, and what was done since."""
+
+    now: "bytearray | dict[str, Thing]"
+    sure: "bytes | dict[str, Thing]"
+    since: list[tuple[object, ...]] = field(default_factory=list)
+
+    def do(self, *change: object) -> None:
+        self.since.append(change)
+        _apply(self.now, change)
+
+    def sync(self) -> None:
+        self.sure = bytes(self.now) if isinstance(self.now, bytearray) else dict(self.now)
+        self.since.clear()
+
+
+def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> None:
+    match change, to:
+        case ("write", int(at), bytes(data)), bytearray():
+            to.extend(bytes(max(0, at - len(to))))
+            to[at : at + len(data)] = data
+        case ("length", int(length)), bytearray():
+            del to[length:]
+            to.extend(bytes(length - len(to)))
+        case ("name", str(name), Thing() as thing), dict():
+            to[name] = thing
+        case ("forget", str(name)), dict():
+            to.pop(name, None)
+        case ("rename", str(name), str(new), Thing() as thing), dict():  # one step, if it is within one folder
+            to[new] = thing
+            if to.get(name) is thing:
+                del to[name]
+        case _:
+            raise AssertionError(f"{change[0]} of a {type(to).__name__}")
+
+
+Survives = Callable[[Thing, tuple[object, ...]], tuple[object, ...] | None]
+
+
+class Disk:
+    """A folder on a disk that forgets; everything in it at the beginning is there for certain."""
+
+    def __init__(self, folder: Path, before: Path) -> None:
+        self._at = f"{folder}/"
+        self._root = _found(before)
+        self._places: dict[tuple[str, int], int] = {}
+        self.said = ""
+
+    def follow(self, line: str) -> bool:
+        """Do what a call did; whether it changed this disk, or was a word of the program."""
+        call, words, result = _parsed(line)
+        if call == "write" and words.startswith("1<"):
+            self.said += plain(WORD.findall(words)[0]).decode()
+            return True
+        paths = self._paths(call, words)
+        if not any(f"{path}/".startswith(self._at) for path in paths):
+            return False
+        return self._do(call, words, result, [f"{path}/".removeprefix(self._at).rstrip("/") for path in paths])
+
+    def _paths(self, call: str, words: str) -> list[str]:
+        if call in ("rename", "unlink", "rmdir", "mkdir", "openat", "unlinkat", "mkdirat", "renameat2"):
+            base = OPEN.match(words)
+            named = [plain(word).decode() for word in WORD.findall(words)]
+            return [
+                name if name.startswith("/") else f"{plain(base[1]).decode()}/{name}" for name in named if base or name
+            ]
+        return [plain(path).decode() for path in OPENED.findall(words)]
+
+    def _do(self, call: str, words: str, result: int, paths: list[str]) -> bool:
+        """Whether the call changed something."""
+        name = paths[0].rpartition("/")[2]
+        match call:
+            case "openat":
+                return self._open(paths[0], words, (paths[0], result))
+            case "mmap":
+                assert "PROT_WRITE" not in words or "MAP_SHARED" not in words or name.endswith("-shm"), words
+                return False
+            case "fsync" | "fdatasync":
+                self._thing(paths[0]).sync()
+            case "mkdir" | "mkdirat":
+                self._folder(paths[0]).do("name", name, Thing({}, {}))
+            case "unlink" | "rmdir" | "unlinkat":
+                self._folder(paths[0]).do("forget", name)
+            case "rename" | "renameat2":
+                self._rename(*paths)
+            case _:
+                return self._write(call, words, result, paths)
+        return True
+
+    def _write(self, call: str, words: str, result: int, paths: list[str]) -> bool:
+        place, thing = (paths[0], int(words.split("<")[0])), self._thing(paths[0])
+        match call:
+            case "lseek":
+                self._places[place] = result
+                return False
+            case "write" | "pwrite64":
+                data = plain(WORD.findall(words)[0])[:result]
+                at = int(words.rsplit(",", 1)[1]) if call == "pwrite64" else self._places.get(place, 0)
+                self._places[place] = at + result
+                thing.do("write", at, data)
+            case "sendfile":  # a whole copy of a file on this disk
+                source = self._thing(paths[1]).now
+                assert isinstance(source, bytearray)
+                assert result in (0, len(source)), words
+                thing.do("write", 0, bytes(source[:result]))
+            case "ftruncate":
+                thing.do("length", int(words.rsplit(",", 1)[1]))
+            case _:
+                raise AssertionError(f"this disk does not know {call}")
+        return True
+
+    def _open(self, path: str, words: str, place: tuple[str, int]) -> bool:
+        """A file that is opened may be made, or emptied."""
+        folder, name = self._folder(path), path.rpartition("/")[2]
+        assert isinstance(folder.now, dict)
+        made = name not in folder.now and "O_CREAT" in words
+        if made:
+            folder.do("name", name, Thing(bytearray(), b""))
+        thing = folder.now.get(name)
+        empties = thing is not None and "O_TRUNC" in words and bool(thing.now)
+        if thing is not None and empties:
+            thing.do("length", 0)
+        self._places[place] = len(thing.now) if thing is not None and "O_APPEND" in words else 0
+        return made or empties
+
+    def _rename(self, old: str, new: str) -> None:
+        thing, source, target = self._thing(old), self._folder(old), self._folder(new)
+        names = old.rpartition("/")[2], new.rpartition("/")[2]
+        if source is target:
+            source.do("rename", *names, thing)
+        else:
+            target.do("name", names[1], thing)
+            source.do("forget", names[0])
+
+    def _folder(self, path: str) -> Thing:
+        return self._thing(path.rpartition("/")[0])
+
+    def _thing(self, path: str) -> Thing:
+        thing = self._root
+        for name in filter(None, path.split("/")):
+            assert isinstance(thing.now, dict)
+            thing = thing.now[name]
+        return thing
+
+    def as_seen(self) -> dict[str, bytes | None]:
+        """What programs see now, by path; None is a folder."""
+        left: dict[str, bytes | None] = {}
+        _collect(self._root, "", lambda thing, change: change, left)
+        return left
+
+    def cuts(self, draw: random.Random) -> Iterator[dict[str, bytes | None]]:
+        """What could be on the disk if the power went now, by path; None is a folder.
+
+        All that was not synced is gone; nothing is; only names are left; only content; and draws of any part of it.
+        """
+        ways: list[Survives] = [
+            lambda thing, change: None,
+            lambda thing, change: change,
+            lambda thing, change: change if isinstance(thing.now, dict) else None,
+            lambda thing, change: change if isinstance(thing.now, bytearray) else None,
+        ]
+
+        def some(thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+            if draw.random() < 0.5:
+                return None
+            match change:
+                case ("write", at, bytes(data)) if draw.random() < 0.3:
+                    return "write", at, data[: SECTOR_BYTES * draw.randint(0, len(data) // SECTOR_BYTES)]
+            return change
+
+        for way in (*ways, *[some] * DRAWS):
+            left: dict[str, bytes | None] = {}
+            _collect(self._root, "", way, left)
+            yield left
+
+
+def _parsed(line: str) -> tuple[str, str, int]:
+    found = LINE.match(line)
+    assert found, f"strace says what nobody understands: {line[:200]}"
+    return found[1], found[2], int(found[3], 0)
+
+
+def _found(place: Path) -> Thing:
+    if place.is_dir():
+        names = {path.name: _found(path) for path in place.iterdir()}
+        return Thing(names, dict(names))
+    content = place.read_bytes()
+    return Thing(bytearray(content), content)
+
+
+def _collect(thing: Thing, path: str, way: Survives, left: dict[str, bytes | None]) -> None:
+    content = bytearray(thing.sure) if isinstance(thing.sure, bytes) else dict(thing.sure)
+    for change in thing.since:
+        if (survived := way(thing, change)) is not None:
+            _apply(content, survived)
+    if isinstance(content, bytearray):
+        left[path] = bytes(content)
+        return
+    left[path] = None
+    for name, inner in content.items():
+        if not name.endswith("-shm"):  # an index that SQLite makes anew after every power cut
+            _collect(inner, f"{path}/{name}", way, left)
+
+
+def written(left: dict[str, bytes | None], to: Path) -> Path:
+    """Make a real folder of what was left."""
+    for path, content in left.items():
+        place = to / path.lstrip("/")
+        if content is None:
+            place.mkdir()
+        else:
+            place.write_bytes(content)
+    return to
