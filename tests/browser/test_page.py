@@ -148,7 +148,7 @@ def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(page: P
     expect(page.get_by_role("status")).to_contain_text("A picture is being taken")
     page.locator(SHUTTER).tap()
     expect(page.locator("[data-code=busy]")).to_contain_text("Wait until it is done")
-    expect(page.locator(".state")).to_have_text("Ready")
+    expect(page.locator(".state")).to_have_text("Ready", timeout=60_000)
 
 
 def test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three(
