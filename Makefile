@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -96,6 +96,11 @@ bench-retinas: .venv/ready ## Print the acceptance figures on real photographs a
 
 bench-wifi: .venv/ready browser ## Print how the page fares at the end of a bad link (network namespace; needs root).
 	@$(BIN)/python -m tests.bench.wifi
+
+MINUTES ?= 6
+
+bench-page: .venv/ready browser ## Print the time from tap to quick look, how alive the page stays, its memory; MINUTES=60.
+	@$(BIN)/python -m tests.bench.page $(MINUTES)
 
 # Without its declared dependencies (hydra, rawpy, paramiko, an old numpy): its ADMM needs only these.
 bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-venv, for the benches to compare with.

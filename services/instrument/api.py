@@ -12,14 +12,12 @@ from typing import Annotated, Any, Self
 from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
-from fastapi.staticfiles import StaticFiles
+from fastapi.responses import JSONResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-import web
 from device.errors import (
     BusFault,
     Busy,
@@ -68,6 +66,7 @@ from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
 from services.instrument.owner import Owner
+from services.instrument.page import page
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
 from services.instrument.visits_api import NAME, exports_router, visits_router
@@ -182,7 +181,7 @@ def create_app(
     _state(app, owner, people, lease)
     _live(app, owner)
     technician_routes(app, owner, door, rooms)
-    _page(app)
+    page(app)
     return app
 
 
@@ -235,8 +234,8 @@ def _words_for_errors(app: FastAPI) -> None:
 
 
 def rules(path: str) -> dict[str, str]:
-    """The page's rules for its browser, and whether an answer may be kept."""
-    return HEADERS | {"Cache-Control": "no-store" if path.startswith("/api/") else "no-cache"}
+    """The page's rules for its browser; what the instrument says of people and itself is not kept there."""
+    return HEADERS | ({"Cache-Control": "no-store"} if path.startswith("/api/") else {})
 
 
 class SafeHeaders:
@@ -377,17 +376,3 @@ def _still_kept(store: Store, id: str) -> Capture | None:
         return store.get(id)
     except StoreError:
         return None
-
-
-def _page(app: FastAPI) -> None:
-    folder = Path(web.__file__).parent
-
-    @app.get("/", include_in_schema=False)
-    def index() -> FileResponse:
-        return FileResponse(folder / "index.html")
-
-    @app.get("/technician", include_in_schema=False)
-    def technician() -> FileResponse:
-        return FileResponse(folder / "technician.html")
-
-    app.mount("/web", StaticFiles(directory=folder))

@@ -19,7 +19,6 @@ from threading import Condition, Event, Thread
 from device.clock import Clock, Deadline
 from device.errors import Busy, DiffuscopeError, LightFault
 from device.head import Head
-from device.recon.aim import Aim
 from device.recon.focus import sharpest
 from device.recon.model import field_box
 from device.recon.plan import Planner
@@ -42,6 +41,7 @@ log = logging.getLogger(__name__)
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
 RETRY_S = 1.0
+LIVE_S = 0.4  # while a picture is refined, pages hear this often how far it is, and who aims sees a live picture
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
@@ -68,7 +68,7 @@ class Exam:
         self._exposing = self._closing = self._ended = False
         self._exposed: deque[Exposed] = deque()
         self._in_the_making = 0
-        self._wanted_until_s = 0.0
+        self._wanted_until_s = self._alive_s = self._took_s = 0.0
         self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
@@ -210,6 +210,7 @@ class Exam:
         """Expose what was pressed; its picture is made next."""
         with self._turn:
             press, self._press, self._exposing = self._press, None, True
+            self._wanted_until_s = 0.0  # aiming is over; who aims on will ask, and the lamp shines for nobody else
         assert press is not None
         self._tell_state()
         with self._answering(press):
@@ -290,20 +291,35 @@ class Exam:
             light.off()
 
     def _reconstruct(self, shot: Exposed, budget_s: float) -> Reconstruction:
+        begin_s, usual_s = self.clock.now_s(), self._took_s or budget_s
+
         def show(stage: Stage) -> None:
             if not stage.last:
                 self._show_quick(shot, stage.picture)
 
-        return self._reconstructor(
+        def between() -> None:
+            self._watchdog.beat()
+            if self._press is not None and not self._closing:
+                self._let_in()
+            elif self.clock.now_s() - self._alive_s > LIVE_S:
+                self._show_life(shot, self.clock.now_s() - begin_s, usual_s)
+
+        made = self._reconstructor(
             shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
-            deadline=Deadline.after(self.clock, budget_s), watch=show, between=self._let_in,
+            deadline=Deadline.after(self.clock, budget_s), watch=show, between=between,
         )  # fmt: skip
+        self._took_s = self.clock.now_s() - begin_s
+        return made
+
+    def _show_life(self, shot: Exposed, gone_s: float, usual_s: float) -> None:
+        """Between two rounds: pages hear how far it is, by what the last picture took; who aims sees a live picture."""
+        self._alive_s, left_s = self.clock.now_s(), max(0.0, usual_s - gone_s)
+        self._tell_stage(shot.press, shot.id, "refine", 0.9 - 0.5 * left_s / usual_s, left_s=left_s)
+        if self.clock.now_s() < self._wanted_until_s:
+            self._look()
 
     def _let_in(self) -> None:
         """Between two rounds: who pressed meanwhile is exposed and sees a quick look; then the refinement goes on."""
-        self._watchdog.beat()
-        if self._press is None or self._closing:
-            return
         self._answer()
         if self._exposed:
             shot = self._exposed.pop()
@@ -314,7 +330,7 @@ class Exam:
 
     def _show_quick(self, shot: Exposed, image: Image) -> None:
         self._quick[shot.id] = picture.to_jpeg(image, QUICK_PX, shot.frame.simulated)
-        self._tell_stage(shot.press, shot.id, "quick", 0.4, f"/api/captures/{shot.id}/quick.jpg")
+        self._tell_stage(shot.press, shot.id, "quick", 0.4, url=f"/api/captures/{shot.id}/quick.jpg")
 
     def _files(self, shot: Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
         shown = self._eye(made.picture)
@@ -327,7 +343,8 @@ class Exam:
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""
         try:
-            jpeg, exposed_s, dark_s, aim = self._live_picture()
+            if (live := self._live_picture()) is None:
+                return
         except DiffuscopeError as error:
             self.head.light.off()
             self._report_problem(error)
@@ -335,9 +352,9 @@ class Exam:
             return
         self._report_problem(None)
         with self._turn:
-            self._preview = Preview(self._preview.number + 1, jpeg, exposed_s, aim)
+            self._preview, dark_s = live
             self._turn.notify_all()
-        self._pause(2 * dark_s - exposed_s - self.clock.now_s())  # as much darkness as there was light
+        self._pause(2 * dark_s - self._preview.exposed_s - self.clock.now_s())  # as much darkness as there was light
 
     def _pause(self, duration_s: float) -> None:
         """Do nothing, in the dark, but go on at once when somebody presses."""
@@ -345,8 +362,8 @@ class Exam:
         while self._press is None and not self._closing and (left_s := until_s - self.clock.now_s()) > 0:
             self.clock.sleep(min(left_s, 0.02))
 
-    def _live_picture(self) -> tuple[bytes, float, float, Aim]:
-        """A JPEG, when its light went on and off (aiming must not use up the picture's light), and what to do."""
+    def _live_picture(self) -> tuple[Preview, float] | None:
+        """The next one, and when its light (for aiming, not the picture's) went off; None if somebody pressed."""
         spec = self.head.spec
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
@@ -356,10 +373,13 @@ class Exam:
         finally:
             self.head.light.off()
             dark_s = self.clock.now_s()
+        if self._press is not None:
+            return None
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
         made = self._live(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
         jpeg = picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated)
-        return jpeg, exposed_s, dark_s, self._eyes.aim(frame.counts, exposed_s)
+        aim = self._eyes.aim(frame.counts, exposed_s)
+        return Preview(self._preview.number + 1, jpeg, exposed_s, aim), dark_s
 
     def _report_problem(self, error: DiffuscopeError | None) -> None:
         before = self.problem.code if self.problem else None
@@ -374,9 +394,8 @@ class Exam:
             self.bulletin.tell("state", state=self._told)
             self._watchdog.status(self._told)
 
-    def _tell_stage(self, press: Press, id: str, stage: str, fraction: float, url: str | None = None) -> None:
+    def _tell_stage(self, press: Press, id: str, stage: str, fraction: float, **more: object) -> None:
         """How far a picture is; it says whose press it is, for no page may take another's picture for its own."""
         self._watchdog.beat()
-        self.bulletin.tell(
-            "stage", id=id, stage=stage, fraction=fraction, left_s=0.0, url=url, key=press.key, **press.errand.facts
-        )
+        more = {"left_s": 0.0, "url": None, "key": press.key} | more | press.errand.facts
+        self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, **more)

@@ -59,6 +59,7 @@ class Store:
         self.folder = folder
         self._captures, self._torn, self._lock = folder / "captures", folder / "torn", folder / ".lock"
         self._reserve_bytes, self._free_bytes = reserve_bytes, free_bytes
+        self._sizes: tuple[int, int] | None = None  # bytes and captures; counted once, for each status asks for it
         with told(), ExitStack() as undo:
             disk.make_folder(self._captures)
             disk.make_folder(self._torn)
@@ -104,6 +105,8 @@ class Store:
                     if beside is not None:
                         session.flush()
                         beside(session, capture)
+        if self._sizes is not None:
+            self._sizes = self._sizes[0] + sum(map(len, files.values())), self._sizes[1] + 1
         return capture
 
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
@@ -163,12 +166,14 @@ class Store:
 
     def space_left(self) -> int:
         """How many more captures will fit, judged by the mean size so far."""
-        with self._reading() as session:
-            total_bytes, number = session.execute(
-                select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(FileRow.capture_id)))
-            ).one()
-            mean_bytes = max(1, total_bytes // number) if number else ESTIMATE_BYTES
-            return self._room_bytes() // mean_bytes
+        if self._sizes is None:
+            every = select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(FileRow.capture_id)))
+            with self._reading() as session:
+                total_bytes, number = session.execute(every).one()
+            self._sizes = total_bytes, number
+        total_bytes, number = self._sizes
+        mean_bytes = max(1, total_bytes // number) if number else ESTIMATE_BYTES
+        return self._room_bytes() // mean_bytes
 
     def try_out(self) -> None:
         """Write a small file as a capture's would be, and remove it; StoreFull or StoreError if the disk refuses."""

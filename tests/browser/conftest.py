@@ -33,8 +33,8 @@ def free_port() -> int:
 class Server:
     """`diffuscope run` as a process of its own, on one port and one shelf, that can be stopped and started again."""
 
-    def __init__(self, data: Path, head: str = "hardware/heads/sim.toml") -> None:
-        self.data, self._head = data, head
+    def __init__(self, data: Path, source: str = "hardware/heads/sim.toml", kind: str = "--head") -> None:
+        self.data, self._source = data, (kind, source)
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._log = (data.parent / "server.log").open("ab")
@@ -42,7 +42,7 @@ class Server:
 
     def start(self) -> None:
         """Launch the process without waiting for it; the first start measures the computer for half a minute."""
-        command = [str(Path(sys.executable).parent / "diffuscope"), "run", "--head", self._head]
+        command = [str(Path(sys.executable).parent / "diffuscope"), "run", *self._source]
         command += ["--port", str(self.port), "--data", str(self.data)]
         self._process = subprocess.Popen(command, cwd=ROOT, stdout=self._log, stderr=self._log)
 

@@ -13,26 +13,21 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import uvicorn
 from fastapi import FastAPI, Header
-from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
-from fastapi.staticfiles import StaticFiles
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from PIL import Image
 
+from services.instrument.api import SafeHeaders
+from services.instrument.page import page
 from tests.browser.stub_visits import PROTOCOL, Visits
 
-WEB = Path(__file__).parents[2] / "web"
 ROWS, COLS, FIELD_PX = 540, 960, 260
 OTHER = {"code": "link.other", "message": "Another screen is taking pictures.", "remedy": "Use this one instead."}
 UNKNOWN = {"code": "store.unknown", "message": "This is not kept here.", "remedy": "Choose from the list."}
-CSP = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
-    "require-trusted-types-for 'script'; trusted-types lit-html"
-)
 
 
 def drawn_retina(blur: int, shift: float = 0.0) -> Image.Image:
@@ -160,11 +155,8 @@ def build(stub: Stub) -> FastAPI:
     _visits(app, stub)
     _live(app, stub)
 
-    @app.get("/")
-    def index() -> FileResponse:
-        return FileResponse(WEB / "index.html", headers={"Content-Security-Policy": CSP})
-
-    app.mount("/web", StaticFiles(directory=WEB), name="web")
+    page(app)
+    app.add_middleware(SafeHeaders)
     return app
 
 

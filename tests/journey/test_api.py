@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from io import BytesIO
@@ -224,7 +225,7 @@ def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> Non
     quiet = {"raise_app_exceptions": False}
     answers = {
         "page": rig.request("GET", "/"),
-        "script": rig.request("GET", "/web/app.js"),
+        "script": rig.request("GET", script_of(rig)),
         "json": rig.request("GET", "/api/status"),
         "file": rig.request("GET", f"/api/captures/{kept.id}/picture.png"),
         "preview": rig.request("GET", "/api/preview"),
@@ -242,16 +243,28 @@ def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> Non
         assert "default-src 'none'" in answer.headers["content-security-policy"], name
         assert answer.headers["x-content-type-options"] == "nosniff", name
         assert answer.headers["referrer-policy"] == "no-referrer", name
-        api = name not in ("page", "script", "unknown")
-        assert answer.headers["cache-control"] == ("no-store" if api else "no-cache"), name
+        keep = {"page": "no-cache", "script": "public, max-age=31536000, immutable", "unknown": None}
+        assert answer.headers.get("cache-control") == keep.get(name, "no-store"), name
     refused(answers["unforeseen"], 500, "fault")
+
+
+def script_of(rig: Any) -> str:
+    """The address of the page's module, which is another one for other files."""
+    return re.findall(r'src="(/web/[0-9a-f]{12}/app/app[.]js)"', rig.request("GET", "/").text)[0]
 
 
 def test_the_page_and_its_scripts_are_served(old_rig: Any) -> None:
     page = old_rig.request("GET", "/")
     assert page.headers["content-type"].startswith("text/html")
-    assert "<script" in page.text
-    assert "javascript" in old_rig.request("GET", "/web/app.js").headers["content-type"]
+    at = script_of(old_rig)
+    pressed = old_rig.request("GET", at, headers={"Accept-Encoding": "gzip"})
+    plain = old_rig.request("GET", at, headers={"Accept-Encoding": "identity"})
+    assert "javascript" in plain.headers["content-type"]
+    assert pressed.headers["content-encoding"] == "gzip"
+    assert "content-encoding" not in plain.headers
+    assert pressed.text == plain.text
+    assert int(pressed.headers["content-length"]) < 0.5 * int(plain.headers["content-length"])
+    assert "technician.js" in old_rig.request("GET", "/technician").text
 
 
 def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wait_until: Callable[..., None]) -> None:
