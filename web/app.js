@@ -38,7 +38,11 @@ async function arrive(route) {
   if (!same) requestAnimationFrame(() => focusOn(route.screen));
 }
 
+// Home needs no viewer. A link that is lost meanwhile tells so by itself, and its return comes through here again.
+const getViewer = () => import("./viewer.js").catch(() => {});
+
 async function load(route) {
+  if (route.screen !== "home") getViewer();
   if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });

@@ -111,8 +111,7 @@ function away({ visit, folders, copied }, act) {
 // ---- two pictures: side by side, or one over the other
 
 export function compare(state, act) {
-  const { route, blink, front = 0 } = state;
-  const shown = [route.capture, route.other];
+  const { blink, front = 0, redfree, loupe } = state;
   return html`
     <section class="compare" ?data-blink=${blink}>
       <div class="ends">
@@ -130,19 +129,25 @@ export function compare(state, act) {
               ${t("compare.swap")} (${t("compare.which", { n: front + 1 })})
             </button>`
           : nothing}
+        <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(!redfree)}>${t("tool.redfree")}</button>
+        <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => act.setLoupe(!loupe)}>${t("tool.loupe")}</button>
       </div>
-      <div class="two">
-        ${shown.map(
-          (id, i) => html`<eye-pic
-            class=${blink && i !== front ? "behind" : ""}
-            aria-label=${t("compare.which", { n: i + 1 })}
-            .head=${state.status}
-            .subject=${id}
-            .src=${act.finalOf(id)}
-            @looked=${act.linkZoom}
-          ></eye-pic>`,
-        )}
-      </div>
+      <div class="two">${[0, 1].map((i) => side(state, act, i))}</div>
     </section>
   `;
+}
+
+function side({ route, status, blink, front = 0, redfree, loupe }, act, i) {
+  const id = [route.capture, route.other][i];
+  return html`<eye-pic
+    class=${blink && i !== front ? "behind" : ""}
+    aria-label=${t("compare.which", { n: i + 1 })}
+    .head=${status}
+    .subject=${id}
+    .redfree=${redfree}
+    .loupe=${loupe}
+    .src=${act.finalOf(id)}
+    @looked=${act.linkZoom}
+    @loupe=${act.heardLoupe}
+  ></eye-pic>`;
 }
