@@ -38,10 +38,13 @@ void main() {
 /** The chip cannot do it, did it wrong, or went away. */
 export class GlFault extends Error {}
 
-/** A context of this tablet's chip, or null. It stands on a canvas of the page, for which browsers keep their own lists. */
+/**
+ * A context of this tablet's chip, or null: also where the browser would only imitate a chip, which is slower than
+ * JavaScript. It stands on a canvas of the page, for which browsers keep lists of chips that they do not trust.
+ */
 export function openGl() {
-  const options = { alpha: false, antialias: false, depth: false, stencil: false };
-  return document.createElement("canvas").getContext("webgl2", options);
+  const plain = { alpha: false, antialias: false, depth: false, stencil: false };
+  return document.createElement("canvas").getContext("webgl2", { ...plain, failIfMajorPerformanceCaveat: true });
 }
 
 export class PainterGl {
@@ -49,7 +52,7 @@ export class PainterGl {
 
   /** Throws GlFault unless `gl` (null: there is none) draws what the formula says; calls `lost` when it goes away. */
   constructor(gl, lost) {
-    if (!gl) throw new GlFault("this browser offers no WebGL2");
+    if (!gl) throw new GlFault("this browser offers no WebGL2 on a chip");
     this.gl = gl;
     gl.canvas.addEventListener("webglcontextlost", lost);
     this.uniforms = this.#build();
