@@ -159,7 +159,7 @@ export const WORDS = {
   "tool.colour": "நிறம்",
   "tool.plain": "எடுத்தபடி",
   "tool.redfree": "சிவப்பின்றி",
-  "tool.loupe": "உருப்பெருக்கி",
+  "tool.loupe": "லென்ஸ்",
   "tool.brightness": "ஒளிர்வு",
   "tool.brightness.less": "ஒளி குறை",
   "tool.brightness.more": "ஒளி கூட்டு",

@@ -1,7 +1,8 @@
 """`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
 
 Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`, `scaling` or `viewer`.
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`,
+`scaling` or `viewer`.
 """
 
 import os

@@ -1,9 +1,10 @@
 """How long a tool of the picture viewer takes until it is seen, on the graphics chip and without it.
 
 A real Chromium shows one picture of 1024 x 1024 in the page's own element on 1280 x 800; a tool is changed, and the
-clock stops when a pixel of the glass has been read back. So a wait of up to one frame (17 ms) is in every figure, and
-where the chip is a program (SwiftShader, as on this bench unless it has a chip) all that it computes, too. `CPU/4` slows
-the page's own thread four times: a guess at a cheap tablet. Limits: 50 ms with the chip, 100 ms without.
+clock stops when a pixel of the glass has been read back. So a wait of up to one frame (17 ms) is in every figure; and
+where the chip is a program (SwiftShader, wherever the bench's computer has none) all that it computes, too: such a chip
+is refused by an ordinary browser, so its figures are the worst case. `CPU/4` slows the page's own thread four times: a
+guess at a cheap tablet. Limits: 50 ms with the chip, 100 ms without.
 """
 
 from collections.abc import Iterator
