@@ -15,7 +15,7 @@ export class Gestures {
   #fingers = new Map();
   #tap = { time: 0, x: 0, y: 0 };
   #hold = 0;
-  #began = [0, 0];
+  #began = { at: [0, 0], time: 0 };
   #peeking = false; // a long press holds the loupe under the finger
 
   constructor(viewer) {
@@ -46,7 +46,7 @@ export class Gestures {
     this.#fingers.set(event.pointerId, at);
     clearTimeout(this.#hold);
     if (this.#fingers.size > 1) return;
-    this.#began = at;
+    this.#began = { at, time: event.timeStamp };
     this.#hold = setTimeout(() => this.#peek(at), HOLD_MS);
   }
 
@@ -60,7 +60,7 @@ export class Gestures {
     const was = this.#fingers.get(event.pointerId);
     if (!was) return;
     const is = this.#fromMiddle(event);
-    if (distance(is, this.#began) > STILL_PX) clearTimeout(this.#hold);
+    if (distance(is, this.#began.at) > STILL_PX) clearTimeout(this.#hold);
     this.#fingers.set(event.pointerId, is);
     if (this.#peeking) this.#viewer.placeLoupe(is, true);
     else if (this.#fingers.size === 1) this.#drag(is[0] - was[0], is[1] - was[1]);
@@ -81,10 +81,11 @@ export class Gestures {
 
   #up(event) {
     const alone = this.#fingers.size === 1;
-    const peeked = this.#gone(event);
+    // The finger's own time counts: on a busy tablet the loupe's clock may run out before a short tap is heard of.
+    const held = this.#gone(event) && event.timeStamp - this.#began.time >= HOLD_MS;
     const [x, y] = this.#fromMiddle(event);
     const before = this.#tap;
-    const still = alone && !peeked && distance([x, y], this.#began) < TAP_PX;
+    const still = alone && !held && distance([x, y], this.#began.at) < TAP_PX;
     this.#tap = { time: still ? event.timeStamp : 0, x, y };
     if (!still) return;
     if (event.timeStamp - before.time < DOUBLE_TAP_MS && distance([x, y], [before.x, before.y]) < TAP_PX) {

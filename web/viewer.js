@@ -151,6 +151,7 @@ export class EyePic extends HTMLElement {
     this.#fadeFrom = bitmap && !calm ? performance.now() : -Infinity;
     this.#bitmap = bitmap;
     this.#mark = mark;
+    this.dataset.drawn = ""; // what is on the glass and will stay: written when it is
     this.#note();
     this.#redraw();
   }
@@ -197,6 +198,8 @@ export class EyePic extends HTMLElement {
     if (fade < 1) return this.#redraw();
     this.#drop(this.#before);
     this.#before = null;
+    const { redfree, brightness, contrast } = this.#tools;
+    this.dataset.drawn = `${this.#mark} ${redfree ? "red-free" : "colour"} ${brightness} ${contrast}`;
   }
 
   #paint(context, bitmap) {

@@ -49,6 +49,10 @@
     },
 
     /** The largest difference between two lists of values, of 255. */
-    apart: (a, b) => a.reduce((worst, value, i) => Math.max(worst, Math.abs(value - b[i])), 0),
+    apart(a, b) {
+      let worst = 0;
+      for (let i = 0; i < a.length; i += 1) worst = Math.max(worst, Math.abs(a[i] - b[i]));
+      return worst;
+    },
   };
 })()
