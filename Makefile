@@ -85,7 +85,7 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/mypy --no-error-summary
 	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
-bench: .venv/ready ## Print figures of speed and truth, measured on this machine.
+bench: .venv/ready browser ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
 bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.

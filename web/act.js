@@ -1,19 +1,20 @@
 // Everything that a person can do, by tap or key: one object that the templates and the keys share.
 
 import { fileOf, getFolders, askForControls } from "./api.js";
+import { clamp, homeBox } from "./field.js";
 import { get, remember, set, shotOf } from "./memory.js";
 import { typedBy } from "./parts.js";
 import { cue, freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
 import { codeText } from "./screens/outcome.js";
 import { lower, raise } from "./states.js";
-import { EyePic, homeBox } from "./viewer.js";
 import * as visits from "./visit.js";
 import { learn, t, today } from "./words.js";
 
 const $ = (selector) => document.querySelector(selector);
 const here = () => get().route;
 const PUPIL_REST_MS = 60_000;
+const TOOL_STEPS = 5; // of brightness and contrast, up and down
 
 const toAim = (slot) => go({ screen: "aim", visit: here().visit, slot });
 
@@ -112,10 +113,13 @@ const picture = {
   zoomIn: () => $("#picture").zoomIn(),
   zoomOut: () => $("#picture").zoomOut(),
   setRedfree: (redfree) => set({ redfree }),
-  contrastBy: (step) => set({ contrast: EyePic.clampContrast(get().contrast + step) }),
+  contrastBy: (step) => set({ contrast: clamp(get().contrast + step, -TOOL_STEPS, TOOL_STEPS) }),
+  brightnessBy: (step) => set({ brightness: clamp(get().brightness + step, -TOOL_STEPS, TOOL_STEPS) }),
+  setLoupe: (loupe) => set({ loupe }),
+  heardLoupe: ({ detail }) => set({ loupe: detail }),
 
   reset() {
-    set({ contrast: 0 });
+    set({ brightness: 0, contrast: 0, loupe: false });
     $("#picture").showAll();
   },
 

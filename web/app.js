@@ -38,12 +38,23 @@ async function arrive(route) {
 }
 
 // What Home does not need, by the screens that do. A file that a lost link kept back is asked for again when the link is back.
-const FILES = { history: () => import("./screens/history.js"), aloud: () => import("./screens/aloud.js") };
-const LATER = { history: "history", film: "history", compare: "history", person: "aloud", aim: "aloud" };
+const FILES = {
+  history: () => import("./screens/history.js"),
+  aloud: () => import("./screens/aloud.js"),
+  viewer: () => import("./viewer.js"),
+};
+const LATER = {
+  find: ["viewer"],
+  person: ["viewer", "aloud"],
+  aim: ["viewer", "aloud"],
+  picture: ["viewer"],
+  history: ["viewer", "history"],
+  film: ["viewer", "history"],
+  compare: ["viewer", "history"],
+};
 
-async function bring(screen) {
-  const name = LATER[screen];
-  if (!name || get().later[name]) return;
+async function bring(name) {
+  if (get().later[name]) return;
   try {
     const module = await FILES[name]();
     set({ later: Object.freeze({ ...get().later, [name]: module }) });
@@ -53,7 +64,7 @@ async function bring(screen) {
 }
 
 async function load(route) {
-  bring(route.screen);
+  for (const name of LATER[route.screen] ?? []) bring(name);
   if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });

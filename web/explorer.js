@@ -3,15 +3,17 @@
 
 import { html, render, svg } from "./vendor/lit-html.js";
 import { Refusal } from "./api.js";
+import "./viewer.js";
 import { clockTime, number, t } from "./words.js";
 
 const WIDE = 720, HIGH = 400, LEFT = 64, RIGHT = 16, TOP = 16, BELOW = 56;
 const ASK_MS = 1000;
 const TICKS_S = [0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30];
 const ZOOMS = [1, 2, 4];
+const ALL = Object.freeze({ zoom: 1, u: 0, v: 0 });
 
 class AccuracyTime extends HTMLElement {
-  #state = { explored: null, captures: [], capture: null, point: null, again: null, zoom: 1, all: false, alert: null };
+  #state = { explored: null, head: null, captures: [], capture: null, point: null, again: null, look: ALL, all: false, alert: null };
   #timer = 0;
 
   connectedCallback() {
@@ -20,7 +22,6 @@ class AccuracyTime extends HTMLElement {
 
   disconnectedCallback() {
     clearTimeout(this.#timer);
-    this.#forget();
   }
 
   #set(patch) {
@@ -28,14 +29,16 @@ class AccuracyTime extends HTMLElement {
     render(view(this.#state, this.#act), this);
   }
 
-  #forget() {
-    if (this.#state.again) URL.revokeObjectURL(this.#state.again);
+  // Two pictures, one place: whichever is moved takes the other with it.
+  #look(look, from = null) {
+    for (const pic of this.querySelectorAll("eye-pic")) if (pic !== from) pic.view = look;
+    this.#set({ look });
   }
 
   async #load() {
     await this.#tried(async () => {
-      const [explored, captures] = await Promise.all([said("GET"), lately()]);
-      this.#set({ explored, captures, capture: this.#state.capture ?? captures[0] ?? null });
+      const [explored, captures, head] = await Promise.all([said("GET"), lately(), status()]);
+      this.#set({ explored, captures, head, capture: this.#state.capture ?? captures[0] ?? null });
       this.#follow();
     });
   }
@@ -69,35 +72,34 @@ class AccuracyTime extends HTMLElement {
     }),
 
     pick: ({ target }) => {
-      this.#forget();
-      this.#set({ capture: this.#state.captures.find((one) => one.id === target.value), point: null, again: null });
+      const capture = this.#state.captures.find((one) => one.id === target.value);
+      this.#set({ capture, point: null, again: null, look: ALL });
     },
 
     see: (point) => this.#tried(async () => {
-      this.#forget();
       this.#set({ alert: null, point, again: null });
       const { method, bin, rounds } = point;
       const path = `/api/technician/captures/${this.#state.capture.id}/again.png`;
       const answer = await ask("GET", `${path}?method=${method}&bin=${bin}&rounds=${rounds}`);
       const blob = await answer.blob();
-      if (this.#state.point === point) this.#set({ again: URL.createObjectURL(blob) });
+      if (this.#state.point === point) this.#set({ again: blob });
     }),
 
-    zoom: (zoom) => this.#set({ zoom }),
+    zoom: (zoom) => this.#look({ ...this.#state.look, zoom }),
     showAll: ({ target }) => this.#set({ all: target.checked }),
 
-    // Two pictures, one place: whichever is moved takes the other with it.
-    moved: ({ target }) => {
-      for (const box of this.querySelectorAll(".compared")) {
-        if (box !== target) box.scrollTo(target.scrollLeft, target.scrollTop);
-      }
+    moved: ({ target, detail }) => this.#look(detail, target),
+    drawn: ({ target }) => {
+      target.view = this.#state.look; // the second picture comes later, perhaps when the first was moved
     },
+    fault: () => this.#set({ alert: { message: t("fault.picture"), remedy: t("fault.picture.remedy") } }),
   };
 }
 
 customElements.define("accuracy-time", AccuracyTime);
 
 const lately = async () => (await (await ask("GET", "/api/captures?limit=12")).json()).captures;
+const status = async () => (await ask("GET", "/api/status")).json();
 const said = async (method, room = "explorer", body = undefined) => (await ask(method, `/api/technician/${room}`, body)).json();
 
 async function ask(method, path, body) {
@@ -201,23 +203,21 @@ function plot(points, budget, act, live) {
   </svg>`;
 }
 
-function compared({ capture, point, again, zoom }, act) {
+function compared({ capture, head, point, again, look }, act) {
+  const pic = (src, name) => html`<eye-pic class="compared" aria-label=${name} .head=${head} .subject=${capture.id} .src=${src}
+    @looked=${act.moved} @drawn=${act.drawn} @fault=${act.fault}></eye-pic>`;
   return html`
     <h3>${t("explore.beside", point)}</h3>
     <div class="row" role="group" aria-label=${t("explore.zoom")}>
-      ${ZOOMS.map((one) => html`<button type="button" aria-pressed=${one === zoom} @click=${() => act.zoom(one)}>${one}×</button>`)}
+      ${ZOOMS.map((one) => html`<button type="button" aria-pressed=${one === look.zoom} @click=${() => act.zoom(one)}>${one}×</button>`)}
     </div>
     <div class="pair">
       <figure>
-        <div class="compared zoom-${zoom}" tabindex="0" @scroll=${act.moved}>
-          <img src=${capture.links.picture} alt=${t("explore.kept.alt")} />
-        </div>
+        ${pic({ url: capture.links.picture, mark: "final" }, t("explore.kept.alt"))}
         <figcaption>${t("explore.kept")}</figcaption>
       </figure>
       <figure>
-        ${again ? html`<div class="compared zoom-${zoom}" tabindex="0" @scroll=${act.moved}>
-            <img src=${again} alt=${t("explore.again.alt")} />
-          </div>` : html`<p>${t("explore.making")}</p>`}
+        ${again ? pic({ blob: again, mark: "final" }, t("explore.again.alt")) : html`<p>${t("explore.making")}</p>`}
         <figcaption>${t("explore.again", point)}</figcaption>
       </figure>
     </div>

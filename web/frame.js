@@ -109,7 +109,7 @@ function menu({ theme, letters, auto, sound, status }, act) {
       <h3>${t("menu.keys")}</h3>
       <label><input type="checkbox" id="letters" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
       <dl>
-        ${["take", "tiles", "g", "contrast", "zero", "rn"].map(
+        ${["take", "tiles", "g", "l", "brightness", "contrast", "zero", "rn"].map(
           (key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`,
         )}
       </dl>

@@ -31,21 +31,24 @@ function onFind({ key }, act) {
 }
 
 function onLetter({ key }, act) {
-  const { route, redfree, protocol } = get();
+  const { route, redfree, loupe, protocol } = get();
   const shot = shotOf(get());
   const told = route.screen === "picture" && shot && (shot.over || shot.verdict);
   const keys = {
     ArrowLeft: () => route.screen !== "home" && act.back(),
     "?": act.openMenu,
-    ...(told ? { r: act.again, n: act.next, ArrowRight: act.next, ...looking(act, redfree) } : {}),
+    ...(told ? { r: act.again, n: act.next, ArrowRight: act.next, ...looking(act, redfree, loupe) } : {}),
   };
   const exam = route.screen === "aim" || route.screen === "picture";
   if (exam && /^[1-9]$/.test(key) && protocol?.slots[key - 1]) act.chooseTile(protocol.slots[key - 1].id);
   else keys[key.length === 1 ? key.toLowerCase() : key]?.();
 }
 
-const looking = (act, redfree) => ({
+const looking = (act, redfree, loupe) => ({
   g: () => act.setRedfree(!redfree),
+  l: () => act.setLoupe(!loupe),
+  b: () => act.brightnessBy(1),
+  d: () => act.brightnessBy(-1),
   z: act.zoomIn,
   "+": () => act.contrastBy(1),
   "=": () => act.contrastBy(1),

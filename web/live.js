@@ -2,7 +2,7 @@
 // fewer frames and never an old picture (MJPEG was 3 s behind on the same link; knowledge/page.md 3.1).
 
 import { getPreview } from "./api.js";
-import { fitCanvas, homeBox } from "./viewer.js";
+import { fitCanvas, homeBox } from "./field.js";
 import { number, t } from "./words.js";
 
 const RETRY_MS = 500;

@@ -18,7 +18,15 @@ function remembered(key, otherwise) {
   }
 }
 
-export const FRESH_PICTURE = Object.freeze({ picture: "none", grey: false, redfree: false, contrast: 0, asking: false });
+export const FRESH_PICTURE = Object.freeze({
+  picture: "none",
+  grey: false,
+  redfree: false,
+  brightness: 0,
+  contrast: 0,
+  loupe: false,
+  asking: false,
+});
 
 export const store = createStore({
   link: "opening", // opening | live | lost

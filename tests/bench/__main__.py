@@ -1,7 +1,8 @@
 """`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
 
 Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness` or `scaling`.
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`,
+`scaling` or `viewer`.
 """
 
 import os
@@ -13,11 +14,11 @@ from pathlib import Path
 from device.recon.plan import Planner, processor
 from device.sim.staged import staged
 from device.spec import load_head
-from tests.bench import calibration, camera, deadline, fitness, peers, scaling, simulator, speed
+from tests.bench import calibration, camera, deadline, fitness, peers, scaling, simulator, speed, viewer
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling")
+PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling", "viewer")
 
 
 def main(parts: list[str]) -> None:
@@ -38,6 +39,8 @@ def main(parts: list[str]) -> None:
             part(planner)
     if "scaling" in wanted:
         scaling.scaling(PLANS)
+    if "viewer" in wanted:
+        viewer.viewer()
     print(f"\npeak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 

@@ -85,6 +85,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.parent == here and "server" in getattr(item, "fixturenames", ()))
 
 
+# The tests read pixels back more often than a page would, and their graphics chip is a program, which must hand every
+# picture back to the processor: the browser's advice about both is not for us.
+ADVICE = ("willReadFrequently", "GPU stall due to ReadPixels")
+
+
 @dataclass
 class Complaints:
     """What the browser complained about; `expect` names, as regular expressions, what a test causes on purpose."""
@@ -100,8 +105,7 @@ class Complaints:
 
     def watch(self, page: Page) -> None:
         def console(message: ConsoleMessage) -> None:
-            # The tests read pixels back more often than a page would; the browser's advice about that is not for us.
-            if message.type in ("error", "warning") and "willReadFrequently" not in message.text:
+            if message.type in ("error", "warning") and not any(advice in message.text for advice in ADVICE):
                 self.heard.append(f"console {message.type}: {message.text} ({message.location.get('url')})")
 
         def failed(request: Request) -> None:

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, Response, expect
 
 from tests.browser.conftest import Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
-from tests.browser.walk import SHUTTER, Open, live, new_person, settled, tap
+from tests.browser.walk import SHUTTER, Open, double_tap, live, new_person, settled, tap
 
 pytestmark = pytest.mark.browser
 
@@ -84,8 +84,7 @@ def test_from_aiming_to_the_next_picture_by_touch(page: Page, complaints: Compla
 
     box = page.locator("#picture").bounding_box()
     assert box is not None
-    for _ in range(2):
-        page.touchscreen.tap(box["x"] + box["width"] * 0.4, box["y"] + box["height"] * 0.4)
+    double_tap(page, box["x"] + box["width"] * 0.4, box["y"] + box["height"] * 0.4)
     expect(page.locator("#picture")).to_have_attribute("data-zoom", "3.00")
     page.get_by_role("button", name="Red-free").tap()
     expect(page.get_by_role("button", name="Red-free")).to_have_attribute("aria-pressed", "true")

@@ -9,7 +9,7 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Complaints
 from tests.browser.stub import Stubbed
-from tests.browser.walk import SHUTTER, Open, aiming, new_person, settled, taken
+from tests.browser.walk import SHUTTER, Open, aiming, double_tap, drawn, new_person, settled, taken
 
 pytestmark = pytest.mark.browser
 
@@ -61,19 +61,19 @@ def test_a_sharper_picture_replaces_the_quick_look_and_keeps_the_view(open_page:
 def test_red_free_and_contrast_change_what_is_drawn(open_page: Open, stub: Stubbed) -> None:
     page = aiming(open_page, stub)
     taken(page)
-    page.wait_for_timeout(300)  # the cross-fade
+    drawn(page, "colour 0 0")
     red, green, blue = middle_pixel(page)
     assert red > green > blue
     page.keyboard.press("g")
-    page.wait_for_timeout(100)
+    drawn(page, "red-free 0 0")
     assert middle_pixel(page) == [green] * 3
     bright = middle_pixel(page, 0.235)[0]
     page.keyboard.press("+")
-    page.wait_for_timeout(100)
+    drawn(page, "red-free 0 1")
     assert middle_pixel(page, 0.235)[0] > bright, "more contrast makes the bright nerve head brighter"
     expect(page.get_by_text("Contrast +1")).to_be_visible()
     page.keyboard.press("0")
-    page.wait_for_timeout(100)
+    drawn(page, "red-free 0 0")
     assert middle_pixel(page) == [green] * 3
 
 
@@ -94,11 +94,9 @@ def test_fingers_wheel_and_keys_zoom_between_one_and_eight(open_page: Open, stub
         fingers("touchMove", x - spread, x + spread)
     fingers("touchEnd")
     assert zoom(page) == pytest.approx(3, rel=0.05)
-    for _ in range(2):
-        page.touchscreen.tap(x + 40, y)
+    double_tap(page, x + 40, y)
     assert zoom(page) == 1
-    for _ in range(2):
-        page.touchscreen.tap(x + 40, y)
+    double_tap(page, x + 40, y)
     assert zoom(page) == 3
     page.mouse.move(x, y)
     for _ in range(20):

@@ -129,10 +129,14 @@ def test_a_capture_is_seen_under_another_method_and_a_pace_is_chosen_to_stay(ins
     inside.get_by_label("Also list what something better beats").tap()
     expect(inside.locator("tbody tr")).to_have_count(3)
     inside.locator("tbody tr", has_text="variation").get_by_role("button").tap()
-    again = inside.locator(".compared img").nth(1)
-    expect(again).to_be_visible(timeout=60_000)
-    assert again.evaluate("(picture) => picture.decode().then(() => picture.naturalWidth)") > 100
-    assert faults(inside, ".compared img >> nth=1") == []
+    kept, again = inside.locator("eye-pic").nth(0), inside.locator("eye-pic").nth(1)
+    expect(again).to_have_attribute("data-mark", "final", timeout=60_000)
+    inside.get_by_role("button", name="2×").tap()
+    expect(again).to_have_attribute("data-zoom", "2.00")
+    again.focus()
+    inside.keyboard.press("+")
+    expect(kept).to_have_attribute("data-zoom", "3.00")
+    assert faults(inside, "eye-pic >> nth=1") == []
     inside.get_by_role("button", name="Best").tap()
     expect(inside.get_by_role("button", name="Best")).to_have_attribute("aria-pressed", "true")
     inside.reload()

@@ -1,5 +1,6 @@
 """How the tests walk through the page: to a live picture, through a press, to a verdict."""
 
+import time
 from collections.abc import Callable
 
 from playwright.sync_api import Page, expect
@@ -53,6 +54,22 @@ def taken(page: Page) -> None:
     """Press, and wait until the final picture is drawn."""
     tap(page, SHUTTER)
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+
+
+def double_tap(page: Page, x: float, y: float) -> None:
+    """Two taps 0.15 s apart by their own time, however busy this computer is."""
+    touch = page.context.new_cdp_session(page)
+    begin_s = time.time() - 0.3
+    for after_s in (0.0, 0.15):
+        for kind, points, at_s in (("touchStart", [{"x": x, "y": y}], 0.0), ("touchEnd", [], 0.05)):
+            when = {"timestamp": begin_s + after_s + at_s}
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points, **when})
+    touch.detach()
+
+
+def drawn(page: Page, tools: str, which: str = "#picture") -> None:
+    """Wait until the final picture is on the glass under these tools ("red-free 0 1": brightness, contrast)."""
+    expect(page.locator(which)).to_have_attribute("data-drawn", f"final {tools}", timeout=20_000)
 
 
 def spoken(page: Page, language: str) -> None:

@@ -115,8 +115,7 @@ function away({ visit, folders, copied }, act) {
 // ---- two pictures: side by side, or one over the other
 
 export function compare(state, act) {
-  const { route, blink, front = 0 } = state;
-  const shown = [route.capture, route.other];
+  const { blink, front = 0, redfree, loupe } = state;
   return html`
     <section class="compare" ?data-blink=${blink}>
       <div class="ends">
@@ -134,21 +133,28 @@ export function compare(state, act) {
               ${t("compare.swap")}
             </button>`
           : nothing}
+        <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(!redfree)}>${t("tool.redfree")}</button>
+        <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => act.setLoupe(!loupe)}>${t("tool.loupe")}</button>
       </div>
-      <div class="two">
-        ${shown.map(
-          (id, i) => html`<figure class=${blink && i !== front ? "behind" : ""}>
-            <figcaption>${nameOf(state, id)}</figcaption>
-            <eye-pic
-              aria-label=${nameOf(state, id)}
-              .head=${state.status}
-              .subject=${id}
-              .src=${act.finalOf(id)}
-              @looked=${act.linkZoom}
-            ></eye-pic>
-          </figure>`,
-        )}
-      </div>
+      <div class="two">${[0, 1].map((i) => side(state, act, i))}</div>
     </section>
   `;
+}
+
+function side(state, act, i) {
+  const { route, status, blink, front = 0, redfree, loupe } = state;
+  const id = [route.capture, route.other][i];
+  return html`<figure class=${blink && i !== front ? "behind" : ""}>
+    <figcaption>${nameOf(state, id)}</figcaption>
+    <eye-pic
+      aria-label=${nameOf(state, id)}
+      .head=${status}
+      .subject=${id}
+      .redfree=${redfree}
+      .loupe=${loupe}
+      .src=${act.finalOf(id)}
+      @looked=${act.linkZoom}
+      @loupe=${act.heardLoupe}
+    ></eye-pic>
+  </figure>`;
 }

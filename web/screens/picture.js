@@ -124,18 +124,16 @@ function details({ id, report, calibration_id: calibration, links }, grey) {
 
 // ---- tools
 
-function tools({ redfree, contrast, zoom, grey }, act) {
-  const step = (less, more, label, lessName, moreName) => html`
+function tools({ redfree, brightness, contrast, loupe, zoom, grey }, act) {
+  const step = (tool, label, by) => html`
     <div class="step" role="group" aria-label=${label}>
-      <button type="button" aria-label=${lessName} @click=${less}>−</button>
+      <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
       <span aria-hidden="true">${label}</span>
-      <button type="button" aria-label=${moreName} @click=${more}>+</button>
+      <button type="button" aria-label=${t(`${tool}.more`)} @click=${() => by(1)}>+</button>
     </div>
   `;
-  const sign = contrast > 0 ? "+" : "−";
-  const contrastWord = t("tool.contrast") + (contrast ? ` ${sign}${Math.abs(contrast)}` : "");
-  const soften = () => act.contrastBy(-1);
-  const harden = () => act.contrastBy(1);
+  const signed = (tool, steps) => t(tool) + (steps ? ` ${steps > 0 ? "+" : "−"}${Math.abs(steps)}` : "");
+  const zoomBy = (way) => (way > 0 ? act.zoomIn() : act.zoomOut());
   return html`
     <div class="tools" role="group" aria-label=${t("part.tools")}>
       <div class="pair">
@@ -145,8 +143,10 @@ function tools({ redfree, contrast, zoom, grey }, act) {
           </button>`,
         )}
       </div>
-      ${step(soften, harden, contrastWord, t("tool.contrast.less"), t("tool.contrast.more"))}
-      ${step(act.zoomOut, act.zoomIn, t("tool.zoom", { z: number(zoom) }), t("tool.zoom.less"), t("tool.zoom.more"))}
+      ${step("tool.brightness", signed("tool.brightness", brightness), act.brightnessBy)}
+      <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => act.setLoupe(!loupe)}>${t("tool.loupe")}</button>
+      ${step("tool.contrast", signed("tool.contrast", contrast), act.contrastBy)}
+      ${step("tool.zoom", t("tool.zoom", { z: number(zoom) }), zoomBy)}
       <button class="reset" type="button" @click=${act.reset}>${t("tool.reset")}</button>
     </div>
   `;

@@ -31,11 +31,14 @@ export function stage(state, act) {
           .head=${state.status}
           .subject=${shot?.key ?? null}
           .redfree=${state.redfree}
+          .brightness=${state.brightness}
           .contrast=${state.contrast}
+          .loupe=${state.loupe}
           .src=${sourceOf(shot)}
           @drawn=${act.drawn}
           @fault=${act.pictureFault}
           @zoomed=${act.zoomed}
+          @loupe=${act.heardLoupe}
         ></eye-pic>
       </div>
       ${isExam(state) ? prompt(state, act) : ""}
