@@ -3,7 +3,7 @@
 import { fileOf, getFolders, askForControls } from "./api.js";
 import { get, remember, set, shotOf } from "./memory.js";
 import { typedBy } from "./parts.js";
-import { freshPicture, take, unlocked } from "./press.js";
+import { forgetLost, freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
 import { today } from "./screens/history.js";
 import { codeText } from "./screens/outcome.js";
@@ -43,7 +43,7 @@ const moves = {
     const { visit, shots } = get();
     const underway = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
     lower(({ from }) => from === "press");
-    if (underway || visit.slots[slot].captures.length) go({ screen: "picture", visit: visit.id, slot });
+    if (underway || visit.finished_at || visit.slots[slot].captures.length) go({ screen: "picture", visit: visit.id, slot });
     else toAim(slot);
   },
 };
@@ -59,6 +59,8 @@ const exam = {
   couldNot: (slot, reason) => unlocked() && visits.couldNot(slot, reason),
   finish: () => unlocked() && visits.finish(),
   reopen: () => unlocked() && visits.reopen(),
+  backToOutcome: () => go({ screen: "outcome", visit: here().visit }),
+  otherEyeIs: (slot, capture) => unlocked() && visits.moveToOtherEye(slot, capture),
   print: () => window.print(),
 
   async showCode() {
@@ -163,6 +165,8 @@ const ofState = {
     visits.moveToOtherEye(slot ?? here().slot, id ?? shotOf(get()).id);
   },
   keepEye: () => lower("eye.side"),
+  forget: ({ key }) => forgetLost(key),
+  uncross: visits.uncross,
 };
 
 const settings = {

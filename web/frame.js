@@ -49,8 +49,8 @@ function top(state, act) {
 // ---- header
 
 function header(state, act) {
-  const { status, link, doing, route, visit } = state;
-  const word = link === "live" ? doing : link;
+  const { status, link, route, visit } = state;
+  const word = link === "live" ? doingOf(state) : link;
   const space = status?.people_left;
   return html`
     <header>
@@ -67,6 +67,12 @@ function header(state, act) {
       <button class="quiet" type="button" id="open-menu" @click=${act.openMenu}>${icon("menu")} ${t("menu")}</button>
     </header>
   `;
+}
+
+// With two pictures in the making the instrument is busy, but nobody has to hold still any more.
+function doingOf({ doing, shots }) {
+  const own = shots.filter((shot) => !shot.over);
+  return doing === "busy" && own.length && own.every((shot) => shot.verdict) ? "making" : doing;
 }
 
 function title(route, visit, act) {
