@@ -3,7 +3,7 @@
 import { fileOf, getFolders, askForControls } from "./api.js";
 import { get, remember, set, shotOf } from "./memory.js";
 import { typedBy } from "./parts.js";
-import { forgetLost, freshPicture, take, unlocked } from "./press.js";
+import { freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
 import { today } from "./screens/history.js";
 import { codeText } from "./screens/outcome.js";
@@ -165,7 +165,6 @@ const ofState = {
     visits.moveToOtherEye(slot ?? here().slot, id ?? shotOf(get()).id);
   },
   keepEye: () => lower("eye.side"),
-  forget: ({ key }) => forgetLost(key),
   uncross: visits.uncross,
 };
 

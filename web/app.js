@@ -118,7 +118,8 @@ async function refreshStatus() {
   const { problem } = status;
   set({ status: Object.freeze(status), doing: status.state });
   lower(({ from, told }) => from === "status" && told !== problem?.code);
-  if (problem) raise({ ...problem, told: problem.code, from: "status" });
+  // A live picture whose light was cut tells it by its age; the next one is on its way.
+  if (problem && problem.code !== "light.cut") raise({ ...problem, told: problem.code, from: "status" });
   settleShots();
   tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);

@@ -66,7 +66,7 @@ export const underway = ({ shots }, visit) => shots.filter((shot) => shot.visit 
 export const moveShot = (id, { id: slot, eye }) =>
   set({ shots: Object.freeze(get().shots.map((shot) => (shot.id === id ? Object.freeze({ ...shot, slot, eye }) : shot))) });
 
-/** Pictures of the open visit that were pressed for and never came, until another is taken or somebody has read it. */
+/** Pictures of the open visit that were pressed for and never came, until another is taken or could not be. */
 export function lostShots({ shots, visit }) {
   if (!visit || visit.finished_at) return [];
   const of = ({ slot }) => shots.filter((shot) => shot.visit === visit.id && shot.slot === slot);

@@ -56,7 +56,7 @@ function sayAlready() {
 async function makePicture(visit, slot) {
   const eye = eyeOf(get(), slot);
   const key = freshKey();
-  for (const { id } of get().shots) if (id) known.add(id);
+  for (const { id, over } of get().shots) if (id && over) known.add(id);
   lower(({ from }) => from === "press");
   put([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: START, verdict: null, over: false })]);
   go({ screen: "picture", visit, slot });
@@ -97,9 +97,6 @@ export async function settleShots() {
     }
   }
 }
-
-/** Somebody has read that this picture was lost. */
-export const forgetLost = (key) => put(get().shots.filter((shot) => shot.key !== key));
 
 function kept(capture, key = byId(capture.id)?.key) {
   known.add(capture.id);

@@ -22,7 +22,7 @@ const TABLE = [
   ["cal.missing", "stop", ["technician"]],
   ["cal.mismatch", "stop", ["technician"]],
   ["light.cut", "refused", []],
-  ["shot.lost", "tell", ["takeNow", "forget"]],
+  ["shot.lost", "tell", ["takeNow"]],
   ["shot.crossed", "tell", ["uncross"], { wait_s: 10 }],
   ["camera.stalled", "tell", []],
   ["power.lost", "tell", ["takeNow"]],

@@ -165,6 +165,7 @@ export function goOn(after) {
 /** Finish; while a picture of this visit is still being made, that is shown, and then it goes on by itself. */
 export async function finish() {
   const { visit } = get().route;
+  lower("shot.crossed"); // what is finished is opened again first
   if (underway(get(), visit).length) {
     go({ screen: "outcome", visit });
     set({ finishing: visit });

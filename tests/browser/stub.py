@@ -149,6 +149,17 @@ class Stub:
         self.tell("kept", self.captures[0])
         return self.captures[0]
 
+    async def seated(self, wish: dict[str, str]) -> Any:
+        """The same as an answer; its seat is free again after it."""
+        self.making += 1
+        try:
+            return await self.made(wish) or JSONResponse(UNKNOWN, 404)
+        except Lost as lost:
+            return JSONResponse(lost.words, lost.status)
+        finally:
+            self.making = max(0, self.making - 1)  # a test that is over has emptied the seats
+            self.tell("state", {"state": "making" if self.making else "aim"})
+
     def capture(self, name: str, wish: dict[str, Any], verdict: dict[str, Any]) -> dict[str, Any]:
         return {
             "id": name,
@@ -215,19 +226,7 @@ def _captures(app: FastAPI, stub: Stub) -> None:
             return JSONResponse(stub.refuse[1], stub.refuse[0])
         if stub.controller not in (None, x_controller):
             return JSONResponse(OTHER, 409)
-        if stub.making >= stub.seats:
-            return JSONResponse(BUSY, 409)
-        return await seated(stub, wish)
-
-    async def seated(stub: Stub, wish: dict[str, str]) -> Any:
-        stub.making += 1
-        try:
-            return await stub.made(wish) or JSONResponse(UNKNOWN, 404)
-        except Lost as lost:
-            return JSONResponse(lost.words, lost.status)
-        finally:
-            stub.making = max(0, stub.making - 1)  # a test that is over has emptied the seats
-            stub.tell("state", {"state": "making" if stub.making else "aim"})
+        return JSONResponse(BUSY, 409) if stub.making >= stub.seats else await stub.seated(wish)
 
     @app.get("/api/captures/{name}")
     def one(name: str) -> Any:

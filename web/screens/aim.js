@@ -19,7 +19,7 @@ export function aim(state, act) {
     <div class="last finish">
       ${state.visit?.slots[state.route.slot]?.state === "could_not"
         ? nothing
-        : html`<button class="quiet" type="button" id="could-not" @click=${act.ask}>${icon("cross")} ${t("aim.couldnot")}</button>`}
+        : html`<button class="quiet" type="button" id="could-not" @click=${act.ask}>${icon("cross")} ${t("result.couldnot")}</button>`}
       <button class=${answered ? "primary" : "quiet"} type="button" id="finish" @click=${act.finish}>
         ${t(answered ? "result.finish" : "finish.now")}
       </button>
