@@ -13,6 +13,7 @@ DiffuscopeError
 │   ├── CameraPacked             the camera gives no plain counts
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
+│   │   └── LightCut             the guard ended a light before its exposure was over
 │   ├── BusFault                 a chip on the I2C bus does not answer
 │   │   └── MemoryDamaged        the head's memory answers, and holds no whole identity
 │   ├── HeadMismatch             the head's memory names another head
@@ -158,6 +159,13 @@ class LightLimit(HardwareError):
 
     code = "light.limit"
     default_remedy = "This eye has had enough light for now. Let it rest before the next picture."
+
+
+class LightCut(LightLimit):
+    """The guard ended a light before its exposure was over: the computer was late, the eye has had little."""
+
+    code = "light.cut"
+    default_remedy = "The light went out too early, so there is no picture. Take it again."
 
 
 class BusFault(HardwareError):

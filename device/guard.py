@@ -11,7 +11,7 @@ from types import TracebackType
 
 from device.clock import Clock
 from device.dose import Hazard
-from device.errors import LightLimit, StoreError
+from device.errors import LightCut, LightLimit, StoreError
 from device.ledger import Ledger, Reserved
 from device.ports import Light, Lit
 from device.values import EYES, Eye, Glow
@@ -82,7 +82,7 @@ class GuardedLight:
         self._timer.start()
         self._held.__enter__()
         if self._late:  # the timer came before the light, and nothing else would end it
-            raise LightLimit(f"the lamp took longer to light up than the {self.max_on_s:g} s it may shine")
+            raise LightCut(f"the lamp took longer to light up than the {self.max_on_s:g} s it may shine")
 
     def _reserve(self, glow: Glow, eyes: Sequence[Eye]) -> None:
         """Count the most that this stretch can give, on the disk, while it is still dark."""

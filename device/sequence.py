@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from device.errors import LightLimit
+from device.errors import LightCut
 from device.ports import Camera, Light
 from device.values import Colour, Frame, Glow, Shot
 
@@ -15,7 +15,7 @@ def burst(
 ) -> Iterator[Frame]:
     """`count` frames in one light, which is on until the last of them; `into` (count, rows, cols) is filled if given.
 
-    Raises LightLimit if the guard ends the light before, and then it is dark.
+    Raises LightCut if the guard ends the light before, and then it is dark.
     """
     with light.on(glow):
         for k in range(count):
@@ -34,7 +34,7 @@ def colours(camera: Camera, light: Light, glows: Sequence[Glow], shot: Shot) -> 
 
 
 def lit(frame: Frame) -> Frame:
-    """The same frame, if its light shone through the whole of its exposure; LightLimit otherwise."""
+    """The same frame, if its light shone through the whole of its exposure; LightCut otherwise."""
     if frame.glow is None:
-        raise LightLimit("the light went out during the exposure: it had been on for too long")
+        raise LightCut("the light went out during the exposure: it had been on for too long")
     return frame

@@ -43,7 +43,7 @@ const moves = {
     const { visit, shots } = get();
     const underway = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
     lower(({ from }) => from === "press");
-    if (underway || visit.slots[slot].captures.length) go({ screen: "picture", visit: visit.id, slot });
+    if (underway || visit.finished_at || visit.slots[slot].captures.length) go({ screen: "picture", visit: visit.id, slot });
     else toAim(slot);
   },
 };
@@ -59,6 +59,8 @@ const exam = {
   couldNot: (slot, reason) => unlocked() && visits.couldNot(slot, reason),
   finish: () => unlocked() && visits.finish(),
   reopen: () => unlocked() && visits.reopen(),
+  backToOutcome: () => go({ screen: "outcome", visit: here().visit }),
+  otherEyeIs: (slot, capture) => unlocked() && visits.moveToOtherEye(slot, capture),
   print: () => window.print(),
 
   async showCode() {
@@ -166,6 +168,7 @@ const ofState = {
     visits.moveToOtherEye(slot ?? here().slot, id ?? shotOf(get()).id);
   },
   keepEye: () => lower("eye.side"),
+  uncross: visits.uncross,
 };
 
 const settings = {

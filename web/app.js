@@ -6,11 +6,11 @@ import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
 import { get, set, store } from "./memory.js";
-import { cue, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
+import { cue, freshPicture, heardOfShots, lock, openPicture, settleShots, take } from "./press.js";
 import { follow, go } from "./routes.js";
 import { lower, raise } from "./states.js";
 import { render } from "./vendor/lit-html.js";
-import { politely, refreshList, refreshVisit, saveRest } from "./visit.js";
+import { finishWhenMade, politely, refreshList, refreshVisit, saveRest } from "./visit.js";
 import { learn, t, today } from "./words.js";
 
 const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
@@ -28,7 +28,10 @@ async function arrive(route) {
   const same = ["screen", "visit", "slot", "capture"].every((name) => before[name] === route[name]);
   const picked = route.visit === before.visit ? get().picked : Object.freeze([]);
   if (!same) freshPicture();
-  if (route.slot !== before.slot) lower(({ from }) => from === "press");
+  // What went wrong belongs to the screen on which it did: nobody after that is told.
+  if (!same) lower(({ from }) => from === "press");
+  if (route.visit !== before.visit) lower("shot.crossed");
+  if (route.screen !== "outcome") set({ finishing: null });
   set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
   lock(); // a double tap must not also press what stands there on the new screen
   lower("link.slow");
@@ -72,10 +75,20 @@ async function load(route) {
   if (get().visit?.id !== route.visit) set({ visit: null });
   const visit = await refreshVisit(route.visit);
   if (get().route.visit !== route.visit) return;
-  if (!visit && !get().visit && get().link !== "lost") go({ screen: "home" }, { replace: true });
+  if (!visit && !get().visit && get().link !== "lost") return leave();
+  if (visit?.finished_at && ["aim", "person"].includes(route.screen)) {
+    return go({ screen: "outcome", visit: route.visit }, { replace: true }); // it is closed: to be looked at only
+  }
   if (route.screen !== "picture" || !visit) return;
   if (!get().status) await refreshStatus(); // after a reload: is a picture being made?
   await openPicture(route);
+}
+
+// Home, with the words why.
+function leave() {
+  const said = get().states.filter(({ from }) => from === "press");
+  go({ screen: "home" }, { replace: true });
+  said.forEach(raise);
 }
 
 // Where the keyboard goes on; a finger does not notice.
@@ -131,7 +144,9 @@ async function refreshStatus() {
   const { problem } = status;
   set({ status: Object.freeze(status), doing: status.state });
   lower(({ from, told }) => from === "status" && told !== problem?.code);
-  if (problem) raise({ ...problem, told: problem.code, from: "status" });
+  // A live picture whose light was cut tells it by its age; the next one is on its way.
+  if (problem && problem.code !== "light.cut") raise({ ...problem, told: problem.code, from: "status" });
+  settleShots();
   tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
   await holdControls();
@@ -216,6 +231,7 @@ function draw(state) {
 
 await learn(get().language);
 store.subscribe(draw);
+store.subscribe(finishWhenMade);
 listenToKeys(act);
 follow(arrive);
 draw(get());

@@ -51,8 +51,8 @@ function top(state, act) {
 // ---- header
 
 function header(state, act) {
-  const { status, link, doing, route, visit } = state;
-  const word = link === "live" ? doing : link;
+  const { status, link, route, visit } = state;
+  const word = link === "live" ? doingOf(state) : link;
   const space = status?.people_left;
   return html`
     <header>
@@ -73,6 +73,11 @@ function header(state, act) {
 
 // A number is told when it matters: one of thousands changes with every picture, and nobody plans by it.
 const room = (people) => t(people > PLENTY ? "space.plenty" : "space", { n: people });
+// With two pictures in the making the instrument is busy, but nobody has to hold still any more.
+function doingOf({ doing, shots }) {
+  const own = shots.filter((shot) => !shot.over);
+  return doing === "busy" && own.length && own.every((shot) => shot.verdict) ? "making" : doing;
+}
 
 function title(route, visit, act) {
   if (!route.visit || !visit) return html`<h1>${t("app.name")}</h1>`;

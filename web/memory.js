@@ -49,7 +49,7 @@ export const store = createStore({
   picked: Object.freeze([]), // two pictures to compare
   folders: null, // where a visit can be copied to
   copied: null,
-  undoUntil: 0,
+  finishing: null, // the visit that is finished as soon as its last picture is there
   now: 0, // set every second while something counts down
   later: Object.freeze({}), // modules that Home does not need, by name
   aloud: null, // what can be said to the person: {tag, words, able}; see aloud.js
@@ -69,7 +69,23 @@ export function shotOf({ route, shots }) {
   if (route.screen !== "picture") return null;
   const here = shots.filter((shot) => shot.visit === route.visit && shot.slot === route.slot);
   if (route.capture) return here.find((shot) => shot.id === route.capture) ?? null;
-  return here.at(-1) ?? null;
+  return here.findLast((shot) => !shot.failed) ?? here.at(-1) ?? null;
+}
+
+/** The shots of a visit that are not over: what of it is still being made. */
+export const underway = ({ shots }, visit) => shots.filter((shot) => shot.visit === visit && !shot.over);
+
+/** A picture that belongs to the other eye is found there from now on. */
+export const moveShot = (id, { id: slot, eye }) =>
+  set({ shots: Object.freeze(get().shots.map((shot) => (shot.id === id ? Object.freeze({ ...shot, slot, eye }) : shot))) });
+
+/** Pictures of the open visit that were pressed for and never came, until another is taken or could not be. */
+export function lostShots({ shots, visit }) {
+  if (!visit || visit.finished_at) return [];
+  const of = ({ slot }) => shots.filter((shot) => shot.visit === visit.id && shot.slot === slot);
+  return shots.filter(
+    (shot) => shot.failed && of(shot).at(-1) === shot && visit.slots[shot.slot]?.state !== "could_not",
+  );
 }
 
 export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slot.id === id) ?? null;

@@ -2,7 +2,7 @@
 
 import { fileOf } from "./api.js";
 import { icon } from "./icons.js";
-import { slotPlan } from "./memory.js";
+import { get, lostShots, slotPlan } from "./memory.js";
 import { shownStates, timeLeft, wordsOf } from "./states.js";
 import { html, nothing } from "./vendor/lit-html.js";
 import { has, t } from "./words.js";
@@ -29,12 +29,14 @@ const FACES = {
   poor: ["pen", "tile.poor"],
   could_not: ["cross", "tile.could_not"],
   making: ["wait", "tile.making"],
+  lost: ["warn", "tile.lost"],
 };
 
-function faceOf({ shots, visit }, id) {
+function faceOf(state, id) {
+  const { shots, visit } = state;
   const slot = visit?.slots[id];
   if (shots.some((shot) => shot.visit === visit?.id && shot.slot === id && !shot.over)) return "making";
-  if (!slot || slot.state === "empty") return "empty";
+  if (!slot || slot.state === "empty") return lostShots(state).some((shot) => shot.slot === id) ? "lost" : "empty";
   if (slot.state === "could_not") return "could_not";
   return slot.verdict?.word === "again" ? "poor" : "good";
 }
@@ -60,6 +62,7 @@ function tile(state, act, { id, eye, field }) {
       data-face=${face}
       aria-label=${name}
       aria-current=${state.route.slot === id ? "step" : "false"}
+      ?disabled=${Boolean(state.visit?.finished_at) && !capture}
       @click=${() => act.chooseTile(id)}
     >
       <span class="thumb">${capture ? thumb(capture, act) : nothing}<span class="mark">${icon(mark)}</span></span>
@@ -71,6 +74,8 @@ function tile(state, act, { id, eye, field }) {
 export const thumb = (capture, act) =>
   html`<img src=${fileOf(capture, "quick.jpg")} alt="" loading="lazy" @load=${act.thumbLoaded} />`;
 
+const OF_THE_EXAM = new Set(["otherEye", "finish"]); // such a button is for whoever takes pictures
+
 // ---- states: one bar for what stops, at most two chips for what only tells
 
 /** What stands instead of the prompt, or on top of a screen that has none: the worst stop, else the last refusal. */
@@ -81,7 +86,9 @@ export function standing(state) {
 export function stateBar(one, act) {
   const left = timeLeft(one.until);
   const words = one.aloud ? html`<p role="alert">${wordsOf(one)}</p>` : html`<p>${wordsOf(one)}</p>`;
-  const buttons = one.from === "press" ? [...one.buttons, "ok"] : one.buttons;
+  const open = get().route.slot && !get().visit?.finished_at;
+  const own = one.buttons.filter((name) => open || !OF_THE_EXAM.has(name));
+  const buttons = one.from === "press" ? [...own, "ok"] : own;
   return html`
     <div class="state-bar" data-code=${one.code}>
       ${icon(one.code === "link.lost" ? "nolink" : "warn")} ${words} ${left ? html`<b class="clock">${left}</b>` : nothing}
@@ -97,8 +104,8 @@ export function chips(state, act) {
     <ul class="notices" aria-label=${t("part.notices")}>
       ${shown.map(
         (one) => html`<li data-code=${one.code}>
-          <p>${wordsOf(one)}</p>
-          ${one.buttons.map((name) => does(one, name, act))}
+          <p role=${one.aloud ? "alert" : nothing}>${wordsOf(one)}</p>
+          ${one.until ? html`<b class="clock">${timeLeft(one.until)}</b>` : nothing} ${one.buttons.map((name) => does(one, name, act))}
         </li>`,
       )}
     </ul>
@@ -127,6 +134,21 @@ export function choice({ label, field, value, options, choose, many = false }) {
           ${on(one) ? icon("check") : nothing}<span>${word}</span>
         </button>`,
       )}
+    </div>
+  `;
+}
+
+/** Why a picture could not be taken: the programme's reasons as tiles. */
+export function reasons({ protocol, route }, act) {
+  return html`
+    <div class="reasons" role="group" aria-labelledby="why">
+      <h2 id="why">${t("result.why")}</h2>
+      ${protocol.reasons.map(
+        (reason) => html`<button type="button" data-reason=${reason} @click=${() => act.couldNot(route.slot, reason)}>
+          ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
+        </button>`,
+      )}
+      <button class="quiet" type="button" id="not-asked" @click=${act.stopAsking}>${t("back")}</button>
     </div>
   `;
 }

@@ -60,7 +60,7 @@ function sayAlready() {
 async function makePicture(visit, slot) {
   const eye = eyeOf(get(), slot);
   const key = freshKey();
-  for (const { id } of get().shots) if (id) known.add(id);
+  for (const { id, over } of get().shots) if (id && over) known.add(id);
   lower(({ from }) => from === "press");
   put([...get().shots, Object.freeze({ key, visit, slot, eye, id: null, stage: START, verdict: null, over: false })]);
   go({ screen: "picture", visit, slot });
@@ -73,18 +73,33 @@ async function makePicture(visit, slot) {
   }
 }
 
+// A shot that the instrument began is never forgotten without a word, for somebody may have been told that it is good.
 function refused(key, { code, message, remedy, vars }) {
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.over) return;
   const here = shotOf(get())?.key === key;
-  if (shot.id && code !== "link.cut" && here) {
-    change(key, { over: true, failed: { code: "make.failed", message, remedy } }); // light was spent: the raw shot is kept
-    return;
+  if (shot.id && code === "link.cut") {
+    change(key, { cut: true }); // perhaps it is kept: asked when the link is back
+  } else {
+    if (shot.id) change(key, { over: true, failed: { code, message, remedy } });
+    else put(get().shots.filter((one) => one.key !== key));
+    if (here) go({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
   }
-  put(get().shots.filter((one) => one.key !== key));
-  raise({ code, message, remedy, ...vars, from: "press" });
-  if (here) go({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
+  if (here || !shot.id) raise({ code, message, remedy, ...vars, from: "press" }); // elsewhere the chip of the lost one tells
   refreshVisit(shot.visit);
+}
+
+/** The link is back: what became of the pictures whose answer it cut off? */
+export async function settleShots() {
+  for (const { id, key } of get().shots.filter(({ cut, over }) => cut && !over)) {
+    try {
+      kept(await getCapture(id), key);
+    } catch (problem) {
+      if (!(problem instanceof Refusal)) throw problem;
+      const later = problem.code === "link.cut" || ["making", "busy"].includes(get().doing);
+      if (!later) refused(key, { ...problem, message: t("lost"), remedy: t("lost.remedy") });
+    }
+  }
 }
 
 function kept(capture, key = byId(capture.id)?.key) {
@@ -138,9 +153,10 @@ export const heardOfShots = {
     else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
   },
 
+  /** Whoever pressed hears it as the answer; a page that was loaded anew since then hears it here. */
   failed({ id, code, message, remedy }) {
     const shot = byId(id);
-    if (shot && !shot.over) change(shot.key, { over: true, failed: { code: code ?? "make.failed", message, remedy } });
+    if (shot?.reloaded && !shot.over) change(shot.key, { over: true, failed: { code, message, remedy } });
   },
 };
 

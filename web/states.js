@@ -1,7 +1,7 @@
 // Every state that the page can tell, as data: one table, one way to show it. The words stand in english.js under
 // "state.CODE" (English master); what stops stands in the prompt bar and in the shutter ("stop.CODE"), what only tells is a chip.
 
-import { get, set } from "./memory.js";
+import { get, lostShots, set } from "./memory.js";
 import { has, t } from "./words.js";
 
 const SAID_ALOUD = /^(link\.lost|light\.|heat\.)/;
@@ -21,6 +21,9 @@ const TABLE = [
   ["store.full", "stop", ["how"]],
   ["cal.missing", "stop", ["technician"]],
   ["cal.mismatch", "stop", ["technician"]],
+  ["light.cut", "refused", []],
+  ["shot.lost", "tell", ["takeNow"]],
+  ["shot.crossed", "tell", ["uncross"], { wait_s: 10 }],
   ["camera.stalled", "tell", []],
   ["power.lost", "tell", ["takeNow"]],
   ["link.slow", "tell", []],
@@ -84,7 +87,7 @@ const filled = ({ eye, other, slot, ...vars }) => ({
 
 /**
  * A state begins, or is told anew. `from` says who takes it back: "status" (gone when the next status has no problem),
- * "press" (gone with OK, another slot, the next press), "notice" (the instrument says when), or "page".
+ * "press" (gone with OK, on another screen, with the next press), "notice" (the instrument says when), or "page".
  */
 export function raise({ code: told, from, ...vars }) {
   const code = SAME[told] ?? told;
@@ -105,11 +108,13 @@ export function lower(test) {
 
 const worstFirst = (one, other) => one.rank - other.rank;
 
-/** At most one stop and two chips, worst first. */
-export function shownStates({ states }) {
+/** At most one stop and two chips, worst first; and every picture that was lost. */
+export function shownStates(state) {
+  const { states } = state;
+  const lost = lostShots(state).map((shot) => ({ ...shot, ...STATES["shot.lost"], aloud: true }));
   return {
     stop: states.find(({ level }) => level === "stop") ?? null,
-    chips: states.filter(({ level }) => level === "tell").slice(0, 2),
+    chips: [...lost, ...states.filter(({ level }) => level === "tell").slice(0, 2)],
   };
 }
 
@@ -121,7 +126,7 @@ export function timeLeft(until) {
 
 // One clock for everything that counts down; it stands still when nothing does.
 setInterval(() => {
-  const { states, undoUntil, timer } = get();
+  const { states, timer } = get();
   lower(({ until }) => until && until <= Date.now());
-  if (undoUntil > Date.now() - 2000 || timer || states.some(({ until }) => until)) set({ now: Date.now() });
+  if (timer || states.some(({ until }) => until)) set({ now: Date.now() });
 }, 1000);

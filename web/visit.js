@@ -1,11 +1,9 @@
 // A person's visit: begin, fill in, go on to the next missing picture, finish, take back. Every change is sent as it is made.
 
 import { freshKey, getVisit, getVisits, Refusal, send } from "./api.js";
-import { get, set } from "./memory.js";
+import { get, lostShots, moveShot, set, underway } from "./memory.js";
 import { go } from "./routes.js";
-import { raise } from "./states.js";
-
-const UNDO_MS = 10_000;
+import { lower, raise } from "./states.js";
 
 /** Do something that the instrument may refuse, and tell the refusal in its words; undefined then. */
 export async function politely(work) {
@@ -45,7 +43,7 @@ export async function begin(number) {
 /** Where a visit that was left goes on. */
 export function resume(visit) {
   set({ visit: Object.freeze(visit) });
-  if (visit.outcome) go({ screen: "outcome", visit: visit.id });
+  if (visit.finished_at) go({ screen: "outcome", visit: visit.id });
   else if (visit.fields.consent !== "agreed" || !visit.next_slot) go({ screen: "person", visit: visit.id });
   else go({ screen: "aim", visit: visit.id, slot: visit.next_slot });
 }
@@ -101,9 +99,25 @@ async function drain() {
 const change = (what, body) =>
   politely(async () => take(await send("POST", at(get().route.visit, what), body)));
 
+/** It could not be taken; for ten seconds a chip offers to take that back. */
 export async function couldNot(slot, reason) {
   set({ asking: false });
-  if (await change("could-not", { slot, reason })) goOn(slot);
+  const { visit, protocol } = get();
+  const before = visit.slots[slot].capture;
+  if (!(await change("could-not", { slot, reason }))) return;
+  go({ screen: "aim", visit: visit.id, slot: nextSlot(slot) ?? slot });
+  const { eye } = protocol.slots.find(({ id }) => id === slot);
+  lower("shot.crossed");
+  raise({ code: "shot.crossed", visit: visit.id, slot, eye, before, from: "page" });
+}
+
+/** It could be taken after all. */
+export async function uncross({ visit, slot, before }) {
+  lower("shot.crossed");
+  const answer = await politely(() => send("POST", at(visit, "slots"), { slot, capture: before }));
+  if (!answer) return;
+  take(answer);
+  go({ screen: "aim", visit, slot });
 }
 
 export async function keepPoor(capture, slot) {
@@ -120,19 +134,22 @@ export async function moveToOtherEye(slot, capture) {
   const { protocol } = get();
   const from = protocol.slots.find(({ id }) => id === slot);
   const to = protocol.slots.find(({ eye, field }) => field === from.field && eye !== from.eye);
-  if (!to || !(await useInSlot(to.id, capture))) return;
-  await useInSlot(slot, null);
-  go({ screen: "picture", visit: get().route.visit, slot: to.id, capture });
+  if (!to) return;
+  const visit = await politely(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: to.eye }));
+  if (!visit) return;
+  take(visit);
+  moveShot(capture, to);
+  go({ screen: "picture", visit: visit.id, slot: to.id, capture });
 }
 
 /** The next slot without a picture, after this one in the order of the programme; null when every one is answered. */
 export function nextSlot(after) {
-  const { visit, protocol, shots } = get();
+  const { visit, protocol } = get();
   if (!visit || !protocol) return null;
   const ids = protocol.slots.map(({ id }) => id);
   const order = [...ids.slice(ids.indexOf(after) + 1), ...ids.slice(0, ids.indexOf(after))];
-  const underway = (id) => shots.some((shot) => shot.visit === visit.id && shot.slot === id && !shot.over);
-  const missing = order.filter((id) => id !== after && visit.slots[id]?.state === "empty" && !underway(id));
+  const making = underway(get(), visit.id).map(({ slot }) => slot);
+  const missing = order.filter((id) => id !== after && visit.slots[id]?.state === "empty" && !making.includes(id));
   return missing[0] ?? null;
 }
 
@@ -145,19 +162,32 @@ export function goOn(after) {
 
 // ---- the end
 
+/** Finish; while a picture of this visit is still being made, that is shown, and then it goes on by itself. */
 export async function finish() {
-  const { route } = get();
-  const visit = await change("finish");
-  if (!visit) return;
-  set({ undoUntil: Date.now() + UNDO_MS, now: Date.now() });
-  go({ screen: "outcome", visit: route.visit });
+  const { visit } = get().route;
+  lower("shot.crossed"); // what is finished is opened again first
+  if (underway(get(), visit).length) {
+    go({ screen: "outcome", visit });
+    set({ finishing: visit });
+    return;
+  }
+  if (await change("finish")) go({ screen: "outcome", visit });
+}
+
+/** The last picture of a visit that is to be finished is there, or is lost: then it is asked for instead. */
+export function finishWhenMade() {
+  const { finishing, route, visit } = get();
+  if (!finishing || visit?.id !== finishing || underway(get(), finishing).length) return;
+  set({ finishing: null });
+  if (route.visit !== finishing || route.screen !== "outcome") return;
+  const [lost] = lostShots(get());
+  if (lost) go({ screen: "aim", visit: finishing, slot: lost.slot }, { replace: true });
+  else finish();
 }
 
 export async function reopen() {
   const visit = await change("reopen");
-  if (!visit) return;
-  set({ undoUntil: 0 });
-  resume(visit);
+  if (visit) resume(visit);
 }
 
 export async function copyTo({ folder, name }) {

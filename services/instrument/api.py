@@ -67,6 +67,7 @@ from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
 from services.instrument.owner import Owner
 from services.instrument.page import page
+from services.instrument.promised import Promised
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
 from services.instrument.visits_api import NAME, exports_router, visits_router
@@ -160,7 +161,7 @@ def create_app(
     """
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
-    lease = Lease(clock)
+    lease, promised = Lease(clock), Promised()
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -175,8 +176,8 @@ def create_app(
     app.add_middleware(OwnPageOnly, names=own_names() if names is None else names, answer=refusal)
     app.add_middleware(SafeHeaders)
     only_one = Depends(one_screen(lease))
-    _captures(app, owner, people, only_one)
-    app.include_router(visits_router(people, lease), dependencies=[only_one])
+    _captures(app, owner, people, promised, only_one)
+    app.include_router(visits_router(people, lease, promised), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
     _state(app, owner, people, lease)
     _live(app, owner)
@@ -284,7 +285,7 @@ def shown(capture: Capture) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _captures(app: FastAPI, owner: Owner, people: People, only_one: Any) -> None:
+def _captures(app: FastAPI, owner: Owner, people: People, promised: Promised, only_one: Any) -> None:
     store = owner.house.store
 
     @app.post("/api/captures", status_code=201, dependencies=[only_one])
@@ -294,7 +295,10 @@ def _captures(app: FastAPI, owner: Owner, people: People, only_one: Any) -> None
         if kept is not None:  # by an instrument that was started anew since then
             return shown(store.get(kept))
         errand = people.errand(press.eye, press.key, press.visit, press.slot)
-        return shown(await asyncio.wrap_future(owner.exam.press(press.eye, press.key, errand)))
+        future = owner.exam.press(press.eye, press.key, errand)
+        if press.visit is not None:
+            promised.add(press.visit, future)
+        return shown(await asyncio.wrap_future(future))
 
     @app.get("/api/captures")
     def captures(limit: int = Query(50, ge=1, le=500), before: str | None = None) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from typing import Any
 from device.errors import StickFull, StickGone
 from services.records import disk
 from services.records.answers import IDENTIFIERS
+from services.records.picture import noted
 from services.records.store import Store
 from services.records.visit import Visit
 
@@ -80,12 +81,29 @@ def exported(store: Store, visit: Visit, shown: Mapping[str, Any]) -> dict[str, 
     files: dict[str, bytes] = {}
     for slot, state in visit.slots.items():
         for number, taken in enumerate(state.taken, 1):
-            files[f"{slot}-{number}.png"] = store.read(taken.capture, "picture.png")
-            files[f"{slot}-{number}.json"] = store.read(taken.capture, "report.json")
+            files[f"{slot}-{number}.png"] = _picture(store, taken.capture)
+            files[f"{slot}-{number}.json"] = _report(store, taken.capture)
     plain = dict(shown) | {"fields": {key: value for key, value in visit.fields.items() if key not in IDENTIFIERS}}
     files["visit.json"] = json.dumps(plain, indent=1, ensure_ascii=False).encode()
     sums = [f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items()]
     return files | {"SHA256SUMS": "".join(sums).encode()}
+
+
+def _picture(store: Store, id: str) -> bytes:
+    """The picture as it was made; of one that was moved to the other eye, the same pixels with that eye in its note."""
+    capture, made = store.get(id), store.read(id, "picture.png")
+    if "moved" not in capture.report:
+        return made
+    return noted(made, f"{capture.eye} {capture.taken_at:%Y-%m-%d}")
+
+
+def _report(store: Store, id: str) -> bytes:
+    """The report as it was made; of a picture that was moved to the other eye, with what was moved."""
+    capture, made = store.get(id), store.read(id, "report.json")
+    if "moved" not in capture.report:
+        return made
+    told = {name: capture.report[name] for name in ("slot", "moved")}
+    return json.dumps(json.loads(made) | {"eye": capture.eye} | told, indent=1).encode()
 
 
 def folder_name(visit: Visit) -> str:

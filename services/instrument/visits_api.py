@@ -1,14 +1,16 @@
 """The addresses of persons and visits: what a page asks of the shelf, in the page's own words."""
 
-from datetime import date, timedelta
+from datetime import date
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from device.values import Eye
 from services.instrument.exporting import Sticks, copied, exported, folder_name, zipped
 from services.instrument.lease import Lease
-from services.records.people import UNDO_S, People
+from services.instrument.promised import Promised
+from services.records.people import People
 from services.records.store import Store
 from services.records.visit import SlotState, Visit
 
@@ -53,6 +55,12 @@ class Chosen(Order):
     capture: CaptureName | None
 
 
+class OfEye(Order):
+    """Which eye a picture was really of."""
+
+    eye: Eye
+
+
 class Away(Order):
     """A stick to copy a visit to."""
 
@@ -65,11 +73,16 @@ class Asking(Order):
     take: bool = False
 
 
-def visits_router(people: People, lease: Lease) -> APIRouter:
+def visits_router(people: People, lease: Lease, promised: Promised) -> APIRouter:
     """What there is to ask about persons and visits."""
     router = APIRouter()
     _reading(router, people)
-    _changing(router, people)
+    _changing(router, people, promised)
+
+    @router.post("/api/captures/{id}/eye")
+    def move(id: str, order: OfEye) -> dict[str, Any]:
+        """This picture was of the other eye: it goes to that eye's slot of the same part, and its report says so."""
+        return shown_visit(people.move(order.key, id, order.eye, lease.holder), people)
 
     @router.post("/api/controller")
     def controller(asking: Asking) -> dict[str, Any]:
@@ -106,7 +119,7 @@ def _reading(router: APIRouter, people: People) -> None:
         return shown_visit(people.get(id), people)
 
 
-def _changing(router: APIRouter, people: People) -> None:
+def _changing(router: APIRouter, people: People, promised: Promised) -> None:
     @router.post("/api/visits", status_code=201)
     def begin(order: Begin) -> dict[str, Any]:
         """Begin a visit; without a number, of somebody new with the next one."""
@@ -134,12 +147,13 @@ def _changing(router: APIRouter, people: People) -> None:
 
     @router.post("/api/visits/{id}/finish")
     def finish(id: str, order: Order) -> dict[str, Any]:
-        """Finish with what there is; the answer has the outcome."""
+        """Finish with what there is, once no picture of it is being made any more; the answer has the outcome."""
+        promised.wait(id)
         return shown_visit(people.finish(order.key, id), people)
 
     @router.post("/api/visits/{id}/reopen")
     def reopen(id: str, order: Order) -> dict[str, Any]:
-        """Undo a finish, within ten seconds."""
+        """Undo a finish, on the same day."""
         return shown_visit(people.reopen(order.key, id), people)
 
 
@@ -184,7 +198,7 @@ def exports_router(people: People, store: Store, sticks: Sticks) -> APIRouter:
 def shown_visit(visit: Visit, people: People) -> dict[str, Any]:
     """A visit as JSON."""
     finished, ending = visit.finished_at, visit.outcome
-    undo_until = finished + timedelta(seconds=UNDO_S) if finished and people.can_undo(finished) else None
+    undo_until = people.undo_until(finished) if finished else None
     return {
         "id": visit.id, "number": visit.number, "begun_at": visit.begun_at.isoformat(), "day": visit.day,
         "fields": dict(visit.fields), "slots": {id: _shown_slot(slot) for id, slot in visit.slots.items()},

@@ -14,14 +14,13 @@ from sqlalchemy.orm import Session
 from device.clock import Clock
 from device.errors import InputError, NotKept, VisitFinished
 from device.values import Capture, Eye
-from services.records import answers, numbering, schema, visits
+from services.records import answers, moving, numbering, schema, visits
 from services.records.errand import Beside, Errand
 from services.records.protocol import CHOOSE, Protocol
 from services.records.schema import CounterRow, FieldRow, IdentifierRow, KeyRow, PersonRow, ShotRow, SlotRow, VisitRow
 from services.records.store import told
 from services.records.visit import Decided, Taken, Visit, decided_after, outcome
 
-UNDO_S = 10.0
 REMEMBERED = timedelta(days=30)  # no network repeats a request for longer
 
 
@@ -94,7 +93,7 @@ class People:
         if wanted.eye != eye:
             raise InputError(f"{slot} is a picture of {wanted.eye}, not of {eye}", CHOOSE)
         if visit.finished_at is not None:
-            raise VisitFinished(f"the visit {id} is finished")
+            raise VisitFinished(f"{visit.number} is finished")
         tries = len(visit.slots[slot].taken)
         return Errand(id, slot, tries, self.protocol.retakes, self._beside(key))
 
@@ -119,14 +118,34 @@ class People:
         """Make a capture the one that stands for its slot; NotKept if it belongs to no visit."""
 
         def act(session: Session) -> str:
-            shot = session.get(ShotRow, capture)
-            if shot is None:
-                raise NotKept(f"the capture {capture[:60]!r} belongs to no visit")
+            shot = moving.place_of(session, capture)
             self._open(session, shot.visit)
             _decide(session, shot.visit, shot.slot, Decided(capture))
             return shot.visit
 
         return self.get(self._once(key, f"keep {capture}", act))
+
+    def move(self, key: str, capture: str, eye: Eye, by: str | None) -> Visit:
+        """A picture was taken of the other eye: it goes to that eye's slot of the same part; `by` is who says so.
+
+        Errors: NotKept (it belongs to no visit), VisitFinished, InputError (the programme has no such slot).
+        """
+
+        def act(session: Session) -> str:
+            shot = moving.place_of(session, capture)
+            before = self._read(session, self._open(session, shot.visit)).slots
+            to, left = moving.same_field(self.protocol, shot.slot, eye), shot.slot
+            if to.id == left:
+                return shot.visit
+            stood = before[left].decided
+            if stood is not None and stood.capture == capture:  # what is left of that eye speaks for itself
+                _decide(session, shot.visit, left, None)
+            verdict = next(one.verdict for one in before[left].taken if one.capture == capture)
+            _decide(session, shot.visit, to.id, decided_after(before[to.id], Taken(capture, verdict)))
+            moving.relabel(session, shot, to, self.clock.wall(), by)
+            return shot.visit
+
+        return self.get(self._once(key, f"move {capture} {eye}", act))
 
     def choose(self, key: str, id: str, slot: str, capture: str | None) -> Visit:
         """Make a capture of that very slot stand for it, or empty the slot (None); either ends a "could not"."""
@@ -135,7 +154,7 @@ class People:
             self._open(session, id)
             shot = session.get(ShotRow, capture) if capture is not None else None
             if capture is not None and (shot is None or (shot.visit, shot.slot) != (id, slot)):
-                raise NotKept(f"{capture[:60]!r} is not a picture of {slot} of this visit")
+                raise NotKept(f"this is not a picture of {slot} of this person")
             _decide(session, id, slot, Decided(capture))
             return id
 
@@ -161,21 +180,19 @@ class People:
         def act(session: Session) -> str:
             row = visits.row(session, id)
             if row.finished_at is None:
-                visit = visits.read(session, self.protocol, [row])[0]
-                told = outcome(self.protocol, visit.fields, visit.slots)
-                row.outcome = json.dumps({"code": told.code, "sentence": told.sentence})
+                self._tell_outcome(session, row)
                 row.finished_at = schema.utc_text(self.clock.wall())
             return id
 
         return self.get(self._once(key, f"finish {id}", act))
 
     def reopen(self, key: str, id: str) -> Visit:
-        """Undo a finish, within ten seconds; then VisitFinished."""
+        """Undo a finish, on the day on which it was finished; then VisitFinished."""
 
         def act(session: Session) -> str:
             row = visits.row(session, id)
-            if row.finished_at is not None and not self.can_undo(datetime.fromisoformat(row.finished_at)):
-                raise VisitFinished(f"the visit {id} was finished more than {UNDO_S:.0f} s ago")
+            if row.finished_at is not None and self.undo_until(datetime.fromisoformat(row.finished_at)) is None:
+                raise VisitFinished(f"{row.person} was finished on an earlier day")
             row.finished_at = row.outcome = None
             return id
 
@@ -193,9 +210,20 @@ class People:
         answer = act()
         return self._once(key, request, lambda _: answer)
 
-    def can_undo(self, finished_at: datetime) -> bool:
-        """Whether what was finished then can still be undone."""
-        return self.clock.wall() - finished_at <= timedelta(seconds=UNDO_S)
+    def undo_until(self, finished_at: datetime) -> datetime | None:
+        """When what was finished then can no longer be undone: at the end of that day; None if that is over."""
+        day = finished_at.astimezone().replace(hour=0, minute=0, second=0, microsecond=0)
+        end = day + timedelta(days=1)
+        return end if self.clock.wall() < end else None
+
+    def _read(self, session: Session, row: VisitRow) -> Visit:
+        return visits.read(session, self.protocol, [row])[0]
+
+    def _tell_outcome(self, session: Session, row: VisitRow) -> None:
+        """Write down how a visit ends by what is known of it now."""
+        visit = self._read(session, row)
+        told = outcome(self.protocol, visit.fields, visit.slots)
+        row.outcome = json.dumps({"code": told.code, "sentence": told.sentence})
 
     def _once(self, key: str, request: str, act: Callable[[Session], str]) -> str:
         """Do it, and remember the answer in the same transaction; a repetition is only answered."""
@@ -234,15 +262,22 @@ class People:
         """A visit in which something may still be changed."""
         row = visits.row(session, id)
         if row.finished_at is not None:
-            raise VisitFinished(f"the visit {id} is finished")
+            raise VisitFinished(f"{row.person} is finished")
         return row
 
     def _put(self, session: Session, capture: Capture) -> None:
-        """Put a new capture into its slot; also of a visit that was finished meanwhile: no picture is lost."""
+        """Put a new capture into its slot; also of a visit that was finished meanwhile: no picture is lost.
+
+        Such a visit ends anew, by what is known of it now.
+        """
         id, slot = capture.report["visit"], capture.report["slot"]
-        visit = visits.read(session, self.protocol, [visits.row(session, id)])[0]
+        row = visits.row(session, id)
+        visit = self._read(session, row)
         session.add(ShotRow(capture=capture.id, visit=id, slot=slot))
         _decide(session, id, slot, decided_after(visit.slots[slot], Taken(capture.id, capture.report.get("verdict"))))
+        if row.finished_at is not None:
+            session.flush()
+            self._tell_outcome(session, row)
 
     @contextmanager
     def _writing(self) -> Iterator[Session]:

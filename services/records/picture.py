@@ -44,15 +44,24 @@ def to_png(picture: Image, simulated: bool, note: str = "") -> bytes:
     goes into a text chunk only. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_no_picture(picture)
-    pixels = _marked(_for_eyes(picture), simulated)
+    return _png(Pillow.fromarray(_marked(_for_eyes(picture), simulated)), "true" if simulated else "false", note)
+
+
+def noted(png: bytes, note: str) -> bytes:
+    """The pixels of `to_png` under another note."""
+    with Pillow.open(BytesIO(png)) as image:
+        return _png(image, str(image.info["simulated"]), note)
+
+
+def _png(image: Pillow.Image, simulated: str, note: str) -> bytes:
     chunks = PngInfo()
     chunks.add(b"sRGB", b"\0")
-    chunks.add_text("simulated", "true" if simulated else "false")
+    chunks.add_text("simulated", simulated)
     if note:
         chunks.add_itxt("note", note)
     out = BytesIO()
     # Level 1: a noisy picture hardly shrinks further, and level 6 takes four times as long.
-    Pillow.fromarray(pixels).save(out, "PNG", pnginfo=chunks, compress_level=1)
+    image.save(out, "PNG", pnginfo=chunks, compress_level=1)
     return out.getvalue()
 
 

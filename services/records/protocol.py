@@ -12,7 +12,7 @@ from device.values import EYES, Eye
 STANDARD = Path(__file__).parent / "protocol.toml"
 CHOOSE = "Choose one of the pictures on the page."
 
-Reason = Literal["pupil", "cloudy", "still", "refused", "device"]
+Reason = Literal["lids", "pupil", "cloudy", "still", "refused", "device", "other"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
 Vision = Literal["6/6", "6/9", "6/12", "6/18", "6/24", "6/36", "6/60", "CF", "HM", "LP", "NLP"]
 VISIONS: tuple[Vision, ...] = get_args(Vision)  # the ladder, best first: counts fingers, hand movement, light, none

@@ -23,7 +23,7 @@ def row(session: Session, id: str) -> VisitRow:
     """The row of a visit; NotKept if there is none."""
     found = session.get(VisitRow, id) if _ID.fullmatch(id) else None
     if found is None:
-        raise NotKept(f"there is no visit named {id[:60]!r}", "Choose the person from the list.")
+        raise NotKept("this visit is not kept here", "Choose the person from the list.")
     return found
 
 

@@ -28,6 +28,9 @@ from tests.browser.stub_visits import PROTOCOL, Visits
 ROWS, COLS, FIELD_PX = 540, 960, 260
 OTHER = {"code": "link.other", "message": "Another screen is taking pictures.", "remedy": "Use this one instead."}
 UNKNOWN = {"code": "store.unknown", "message": "This is not kept here.", "remedy": "Choose from the list."}
+BUSY = {"code": "busy", "message": "A picture is being taken.", "remedy": "Wait until it is done, then press again."}
+CUT = {"code": "light.cut", "message": "The light went out.", "remedy": "Take it again."}
+FULL = {"code": "store.full", "message": "No room.", "remedy": "Make room."}
 
 
 def drawn_retina(blur: int, shift: float = 0.0) -> Image.Image:
@@ -49,6 +52,14 @@ def encoded(kind: str, blur: int, shift: float = 0.0) -> bytes:
     out = io.BytesIO()
     drawn_retina(blur, shift).save(out, kind)
     return out.getvalue()
+
+
+class Lost(Exception):
+    """A press of which nothing is kept."""
+
+    def __init__(self, status: int, words: dict[str, str]) -> None:
+        super().__init__(words["code"])
+        self.status, self.words = status, words
 
 
 @dataclass
@@ -74,6 +85,10 @@ class Stub:
     silent: bool = False
     closing: bool = False
     presses: int = 0
+    seats: int = 2  # pictures in the making at once
+    making: int = 0
+    cut: list[int] = field(default_factory=list)  # the presses, counted from one, whose light goes out too early
+    lose: list[int] = field(default_factory=list)  # those that are called good, and cannot be kept
     captures: list[dict[str, Any]] = field(default_factory=list)
     events: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
 
@@ -101,10 +116,13 @@ class Stub:
         """One picture, told step by step; nothing if the test that pressed is over."""
         name = f"20261120T1000{self.presses:02d}-{wish['eye']}-stub"
         verdict, shelf = self.next_verdict(), self.visits
+        number = self.presses
         self.tell("state", {"state": "busy"})
         self.stage(wish, name, "expose", 0.05, self.refine_s)
         await asyncio.sleep(self.expose_s)
-        self.tell("state", {"state": "making"})
+        if number in self.cut:
+            raise Lost(423, CUT)
+        self.tell("state", {"state": "busy" if self.making >= self.seats else "making"})
         for step in range(5):
             self.stage(
                 wish, name, "quick" if step == 0 else "refine", 0.2 + 0.15 * step, self.refine_s * (1 - step / 5)
@@ -117,13 +135,25 @@ class Stub:
                 await self.release("keep")
             if self.visits is not shelf:
                 return None
+        if number in self.lose:
+            raise Lost(507, FULL)
         self.stage(wish, name, "keep", 1.0, 0)
         self.captures.insert(0, self.capture(name, wish, verdict))
         if wish.get("visit"):
             self.visits.taken(wish["visit"], wish["slot"], name, verdict)
         self.tell("kept", self.captures[0])
-        self.tell("state", {"state": "aim"})
         return self.captures[0]
+
+    async def seated(self, wish: dict[str, str]) -> Any:
+        """The same as an answer; its seat is free again after it."""
+        self.making += 1
+        try:
+            return await self.made(wish) or JSONResponse(UNKNOWN, 404)
+        except Lost as lost:
+            return JSONResponse(lost.words, lost.status)
+        finally:
+            self.making = max(0, self.making - 1)  # a test that is over has emptied the seats
+            self.tell("state", {"state": "making" if self.making else "aim"})
 
     def capture(self, name: str, wish: dict[str, Any], verdict: dict[str, Any]) -> dict[str, Any]:
         return {
@@ -188,13 +218,17 @@ def _captures(app: FastAPI, stub: Stub) -> None:
             return JSONResponse(stub.refuse[1], stub.refuse[0])
         if stub.controller not in (None, x_controller):
             return JSONResponse(OTHER, 409)
-        made = await stub.made(wish)
-        return made or JSONResponse(UNKNOWN, 404)
+        return JSONResponse(BUSY, 409) if stub.making >= stub.seats else await stub.seated(wish)
 
     @app.get("/api/captures/{name}")
     def one(name: str) -> Any:
         found = [capture for capture in stub.captures if capture["id"] == name]
         return found[0] if found else JSONResponse(UNKNOWN, 404)
+
+    @app.post("/api/captures/{name}/eye")
+    def move(name: str, wish: dict[str, str]) -> Any:
+        capture = next(capture for capture in stub.captures if capture["id"] == name)
+        return stub.visits.move(capture, wish["eye"])
 
     @app.post("/api/captures/{name}/keep")
     def keep(name: str, wish: dict[str, str]) -> Any:

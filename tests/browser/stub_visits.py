@@ -10,7 +10,7 @@ SLOTS = [
 ]
 PROTOCOL = {
     "slots": SLOTS,
-    "reasons": ["pupil", "cloudy", "still", "refused", "device"],
+    "reasons": ["lids", "pupil", "cloudy", "still", "refused", "device", "other"],
     "retakes": 2,
     "programme": {"vision_limit": "6/18", "prefix": "A", "centre_phone": "+91 44 5550 0142"},
 }
@@ -82,7 +82,7 @@ class Visits:
         if what == "could-not":
             visit["slots"][wish["slot"]] |= {"state": "could_not", "reason": wish["reason"]}
         elif what == "slots" and wish["capture"] is None:
-            visit["slots"][wish["slot"]] = empty_slot()
+            visit["slots"][wish["slot"]] |= {"state": "empty", "capture": None, "verdict": None, "reason": None}
         elif what == "slots":
             slot, name = visit["slots"][wish["slot"]], wish["capture"]
             slot |= {"state": "taken", "capture": name, "verdict": verdicts[name]}
@@ -93,10 +93,23 @@ class Visits:
             visit |= {"outcome": None, "finished_at": None, "undo_until": None}
         return self.seen(visit)
 
+    def move(self, capture: dict[str, Any], eye: str) -> dict[str, Any]:
+        """A picture goes to the same part of the other eye."""
+        visit, name = self.kept[capture["visit"]], capture["id"]
+        old = visit["slots"][capture["slot"]]
+        old["captures"].remove(name)
+        rest = old["captures"][-1] if old["captures"] else None
+        old |= {"capture": rest, "state": "taken" if rest else "empty", "tries": len(old["captures"])}
+        slot = capture["slot"].replace(*("R-", "L-") if eye == "OS" else ("L-", "R-"))
+        capture |= {"eye": eye, "slot": slot}
+        self.taken(visit["id"], slot, name, capture["verdict"])
+        return self.seen(visit)
+
     def finish(self, visit: dict[str, Any]) -> None:
         urgent = {"sudden_loss", "pain"} & set(visit["fields"].get("complaints", []))
-        poor = any(s["state"] == "could_not" for s in visit["slots"].values())
+        taken = {name[0] for name, s in visit["slots"].items() if s["state"] == "taken"}
+        poor = any(s["state"] == "could_not" for s in visit["slots"].values()) or (taken and len(taken) < 2)
         code = "refer_today" if urgent else "refer_picture" if poor else "send"
         visit["outcome"] = {"code": code, "sentence": SENTENCES[code]}
         visit["finished_at"] = now().isoformat()
-        visit["undo_until"] = (now() + timedelta(seconds=10)).isoformat()
+        visit["undo_until"] = (now() + timedelta(hours=5)).isoformat()

@@ -145,7 +145,7 @@ def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(page: P
     }""")
     page.wait_for_timeout(800)
     expect(page.get_by_role("status")).to_contain_text("A picture is being taken")
-    page.locator(SHUTTER).tap()
+    page.locator(SHUTTER).tap(force=True)
     expect(page.locator("[data-code=busy]")).to_contain_text("Wait until it is done")
     expect(page.locator(".state")).to_have_text("Ready", timeout=60_000)
 

@@ -190,7 +190,7 @@ def test_the_wrong_eye_is_asked_about_and_changed_by_one_tap(open_page: Open, st
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "empty")
 
 
-def test_finish_can_be_undone_for_ten_seconds_and_the_code_holds_no_name(open_page: Open, stub: Stubbed) -> None:
+def test_a_finished_visit_can_be_opened_again_and_the_code_holds_no_name(open_page: Open, stub: Stubbed) -> None:
     stub.stub.visits.begin(consent="agreed", name="Lakshmi")
     page = settled(open_page(f"{stub.url}/#/visit/v142/aim/R-centre"))
     tap(page, "#finish")
@@ -205,7 +205,7 @@ def test_finish_can_be_undone_for_ten_seconds_and_the_code_holds_no_name(open_pa
     expect(page.locator("header")).to_be_hidden()
     expect(page.locator(".slip")).not_to_contain_text("Lakshmi")
     page.emulate_media(media="screen")
-    tap(page, "#undo")
+    tap(page, "#reopen")
     live(page)
     assert stub.stub.visits.kept["v142"]["finished_at"] is None
 

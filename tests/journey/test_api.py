@@ -294,7 +294,8 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
     fixed = {
         "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
         "/api/events": {"get"}, "/api/preview": {"get"}, "/api/health": {"get"}, "/api/status": {"get"},
-        "/api/captures/{id}/keep": {"post"}, "/api/controller": {"post"}, "/api/protocol": {"get"},
+        "/api/captures/{id}/keep": {"post"}, "/api/captures/{id}/eye": {"post"},
+        "/api/controller": {"post"}, "/api/protocol": {"get"},
         "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
         "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
         "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},

@@ -2,7 +2,7 @@
 
 import { zipOf } from "../api.js";
 import { people } from "./home.js";
-import { ending } from "./outcome.js";
+import { ending, openAgain } from "./outcome.js";
 import { icon } from "../icons.js";
 import { choice, slotWords, thumb } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -64,7 +64,7 @@ export function film(state, act) {
             ? html`<p class="muted">${t("film.pick", { n: 2 - picked.length })}</p>`
             : nothing}
         ${visit.finished_at
-          ? nothing
+          ? openAgain(visit, act)
           : html`<button type="button" @click=${() => act.resume(visit)}>
               ${t("home.continue", { number: visit.number })}
             </button>`}
@@ -115,7 +115,7 @@ function away({ visit, folders, copied }, act) {
 // ---- two pictures: side by side, or one over the other
 
 export function compare(state, act) {
-  const { blink, front = 0, redfree, loupe } = state;
+  const { blink, redfree, loupe } = state;
   return html`
     <section class="compare" ?data-blink=${blink}>
       <div class="ends">

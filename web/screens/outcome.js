@@ -1,16 +1,17 @@
-// Outcome: one sentence, the slip, the code, done. Undo for ten seconds instead of "are you sure?".
+// Outcome: one sentence, the slip, the code, done. It can be opened again that day; nobody is asked "are you sure?".
 
 import { markOf } from "./home.js";
 import { icon } from "../icons.js";
-import { personWords, tiles } from "../parts.js";
+import { underway } from "../memory.js";
+import { personWords, slotWords, tiles } from "../parts.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../words.js";
 
 export function outcome(state, act) {
-  const { visit, undoUntil } = state;
+  const { visit } = state;
   if (!visit) return nothing;
+  if (state.finishing === visit.id) return stillMaking(state, act);
   if (!visit.outcome) return notYet(act, visit);
-  const left = Math.ceil((undoUntil - Date.now()) / 1000);
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: visit.number })}</h2>
@@ -23,9 +24,7 @@ export function outcome(state, act) {
           ${t("outcome.code")}
         </button>
         <button type="button" id="film" @click=${() => act.go({ screen: "film", visit: visit.id })}>${t("outcome.film")}</button>
-        ${left > 0
-          ? html`<button type="button" id="undo" @click=${act.reopen}>${icon("again")} ${t("outcome.undo", { s: left })}</button>`
-          : nothing}
+        ${openAgain(visit, act)}
         <button class="primary big" type="button" id="done" @click=${() => act.go({ screen: "home" })}>
           ${t("outcome.done")}
         </button>
@@ -33,6 +32,27 @@ export function outcome(state, act) {
       ${state.code ? code(state.code) : nothing} ${slip(state)}
     </section>
   `;
+}
+
+/** A finished visit is to be looked at, unless it is opened again, as long as the instrument allows it. */
+export const openAgain = ({ undo_until: allowed }, act) =>
+  allowed
+    ? html`<button type="button" id="reopen" @click=${act.reopen}>${icon("again")} ${t("outcome.reopen")}</button>`
+    : nothing;
+
+// How it ends is told when every picture is there: before, nobody can know.
+function stillMaking(state, act) {
+  const shots = underway(state, state.visit.id);
+  return html`<section class="outcome" id="finishing">
+    <h2>${icon("wait")} ${t("outcome.making", { n: Math.max(1, shots.length) })}</h2>
+    ${shots.map(
+      ({ slot, stage }) => html`<label class="making">
+        ${slotWords(state, slot).eye} · ${slotWords(state, slot).part}
+        <progress max="1" .value=${stage.fraction}></progress>
+      </label>`,
+    )}
+    ${tiles(state, act)}
+  </section>`;
 }
 
 function notYet(act, visit) {

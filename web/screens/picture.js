@@ -3,7 +3,7 @@
 
 import { icon } from "../icons.js";
 import { shotOf } from "../memory.js";
-import { chips, does, slotWords, tiles } from "../parts.js";
+import { chips, does, reasons, slotWords, tiles } from "../parts.js";
 import { STATES, timeLeft, wordsOf } from "../states.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { nextSlot } from "../visit.js";
@@ -17,7 +17,7 @@ export function picture(state, act) {
     ${card(state, act, shot)} ${state.picture === "none" ? nothing : tools(state, act)} ${tiles(state, act)}
     ${chips(state, act)}
     <div class="actions">${actions(state, act, shot)}</div>
-    ${complete(state, shot)
+    ${state.visit?.finished_at || complete(state, shot)
       ? nothing
       : html`<button class="quiet finish" type="button" id="finish" @click=${act.finish}>${t("finish.now")}</button>`}
   `;
@@ -52,21 +52,19 @@ function card(state, act, shot) {
       ${side ? html`<p class="ask">${wordsOf(side)} ${side.buttons.map((one) => does(side, one, act))}</p>` : nothing}
       ${shot.over ? nothing : html`${bar(shot)} <p class="muted">${t("make.goon")}</p>`}
       ${timer(state, act, shot)} ${warnings.map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
-      ${shot.capture ? details(shot.capture, state.grey) : nothing}
+      ${shot.capture ? details(state, act, shot) : nothing}
     </div>
   `;
 }
 
 function verdictWords(state, shot) {
-  if (shot.failed) return ["warn", t("verdict.again"), wordsOf({ ...shot.failed, code: knownFailure(shot.failed.code) })];
+  if (shot.failed) return ["warn", t("verdict.again"), wordsOf(shot.failed)];
   if (shot.verdict?.word === "good") return ["star", t("verdict.good"), t("verdict.good.what")];
   if (!shot.verdict) return ["check", t("verdict.none"), ""];
   if (exhausted(state, shot)) return ["pen", t("verdict.again"), wordsOf({ code: "shot.poor", n: triesOf(state, shot) })];
   const cause = STATES[shot.verdict.code] ? wordsOf({ code: shot.verdict.code }) : "";
   return ["pen", t("verdict.again"), cause];
 }
-
-const knownFailure = (code) => (STATES[code] ? code : "make.failed");
 
 function timer(state, act, shot) {
   if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return nothing;
@@ -99,8 +97,8 @@ function makingCard(state, shot) {
 
 const bar = ({ stage }) => html`<progress max="1" .value=${stage.fraction} aria-label=${t("make.progress")}></progress>`;
 
-// For the technician: how the picture was made, and the files to take away.
-function details({ id, report, calibration_id: calibration, links }, grey) {
+// For the technician: how the picture was made, the files to take away; and for who took it of the wrong eye.
+function details({ grey, visit }, act, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
   const total = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const rows = [
     ["method", report.method],
@@ -116,6 +114,11 @@ function details({ id, report, calibration_id: calibration, links }, grey) {
       ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
       <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
       <p class="links">
+        ${visit?.finished_at
+          ? nothing
+          : html`<button type="button" id="other-eye" @click=${() => act.otherEyeIs(slot, id)}>
+              ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
+            </button>`}
         ${["picture", "raw", "report"].map((key) => html`<a href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
       </p>
     </details>
@@ -155,6 +158,7 @@ function tools({ redfree, brightness, contrast, loupe, zoom, grey }, act) {
 // ---- what to do with it: the primary button moves to what the verdict advises
 
 function actions(state, act, shot) {
+  if (state.visit?.finished_at) return button(act.backToOutcome, "result", "left", "result.seen");
   if (!shot.verdict && !shot.over) {
     const held = shot.stage.name === "expose" && state.picture === "none";
     return html`<button class="primary shutter" type="button" id="shutter" aria-disabled="true" @click=${act.take}>
@@ -165,13 +169,14 @@ function actions(state, act, shot) {
   if (state.route.capture && current !== shot.id) {
     return [button(act.again, "again", "again", "result.again"), button(act.useThis, "use", "check", "result.use", true)];
   }
-  if (shot.verdict?.word !== "again" && !shot.failed) {
+  if (shot.failed) return button(act.again, "again", "again", "result.again", true);
+  if (shot.verdict?.word !== "again") {
     return [button(act.again, "again", "again", "result.again"), next(state, act, true)];
   }
   if (exhausted(state, shot)) {
     return [button(act.again, "again", "again", "result.try"), button(act.ask, "could-not", "cross", "result.couldnot", true)];
   }
-  const keep = shot.over && !shot.failed ? button(act.keepThis, "keep", "check", "result.keep") : next(state, act, false);
+  const keep = shot.over ? button(act.keepThis, "keep", "check", "result.keep") : next(state, act, false);
   return [keep, button(act.again, "again", "again", "result.again", true)];
 }
 
@@ -191,19 +196,5 @@ function next(state, act, primary) {
         ${slot ? html`<small>${eye} · ${part}</small>` : nothing}
       </span>
     </button>
-  `;
-}
-
-function reasons({ protocol, route }, act) {
-  return html`
-    <div class="reasons" role="group" aria-labelledby="why">
-      <h2 id="why">${t("result.why")}</h2>
-      ${protocol.reasons.map(
-        (reason) => html`<button type="button" data-reason=${reason} @click=${() => act.couldNot(route.slot, reason)}>
-          ${t(`reason.${reason}`)}
-        </button>`,
-      )}
-      <button class="quiet" type="button" @click=${act.stopAsking}>${t("back")}</button>
-    </div>
   `;
 }

@@ -89,7 +89,7 @@ function markOf(state) {
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
   if (state.picture === "final") return ["done", "check", t("mark.final")];
   if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
-  return shot.stage.name === "expose" ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
+  return shot.stage.name === "expose" && !shot.verdict ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
 }
 
 function pictureName(state, shot) {
