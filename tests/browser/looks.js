@@ -23,7 +23,7 @@
   const { scrollWidth } = document.documentElement;
   if (scrollWidth > innerWidth) faults.push(`sideways scroll: ${scrollWidth} > ${innerWidth}`);
 
-  for (const el of scope.querySelectorAll("button, a, summary, input, label")) {
+  for (const el of scope.querySelectorAll("button, a, summary, input, select, label")) {
     if (!shown(el) || el.matches("label input")) continue;
     const box = el.getBoundingClientRect();
     const least = el.id === "shutter" ? 84 : 48;

@@ -21,6 +21,7 @@ class Looked:
     def at(self, name: str, mark: str) -> None:
         self.page.wait_for_selector(mark)
         self.faults[name] = axe_faults(self.page)
+        self.page.locator("[data-link=live]").wait_for()  # axe held the page so long that it may have missed beats
 
     def go(self, place: str, mark: str) -> None:
         self.page.goto(f"{self.page.url.split('#')[0]}#/{place}")

@@ -228,6 +228,21 @@ def test_letter_keys_can_be_switched_off(open_page: Open, stub: Stubbed) -> None
     expect(page.get_by_role("button", name="Red-free")).to_have_attribute("aria-pressed", "false")
 
 
+def test_a_screen_that_a_broken_link_kept_back_comes_when_it_is_asked_for_again(
+    open_page: Open, stub: Stubbed, complaints: Complaints
+) -> None:
+    complaints.expect("ERR_FAILED")
+    page = open_page(stub.url)
+    page.wait_for_selector("#new")
+    page.route("**/screens/history.js", lambda route: route.abort())
+    with page.expect_event("requestfailed"):
+        settled(page).locator("#history").tap()
+    page.unroute("**/screens/history.js")
+    settled(page).locator("#back").tap()
+    settled(page).locator("#history").tap()
+    page.wait_for_selector(".history")
+
+
 def test_motion_is_left_out_where_it_is_not_wanted(open_page: Open, stub: Stubbed) -> None:
     page = aiming(open_page, stub, reduced_motion="reduce")
     assert page.locator(SHUTTER).evaluate("b => getComputedStyle(b).transitionDuration") == "0s"

@@ -288,6 +288,7 @@ def test_numbers_find_a_person_and_history_compares_two_pictures(open_page: Open
     tap(page, "[data-visit=v142]")
     page.wait_for_selector("[data-screen=aim]")
     page.goto(f"{stub.url}/#/visit/v142/film")
+    page.wait_for_selector(".pick")
     for pick in page.locator(".pick").all():
         pick.tap()
     tap(page, "#compare")

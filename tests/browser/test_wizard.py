@@ -82,7 +82,7 @@ def come_in(page: Page) -> None:
     for digit in PIN:
         page.get_by_role("button", name=digit, exact=True).tap()
     page.locator("#enter").tap()
-    expect(page.locator(".place")).not_to_have_attribute("data-view", re.compile("door|opening"))
+    expect(page.locator(".place")).not_to_have_attribute("data-view", re.compile("door|opening"), timeout=30_000)
 
 
 def start(page: Page) -> None:
