@@ -94,7 +94,6 @@ class Exam:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         Raises CalibrationOld or CalibrationStale where no picture should rest on the calibration.
-
         The same `key` again gives the same picture, however often the network repeats the request.
         """
         with self._turn:
