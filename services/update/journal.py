@@ -1,13 +1,17 @@
 """What became of the last update, on the data partition where both slots read it, and the words for it."""
 
 import json
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from device.errors import DiffuscopeError
+from device.errors import DiffuscopeError, UpdateError, UpdateFailed, UpdateNoRoom
+from services.records import disk
 from services.update.bootchooser import write_whole
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,13 @@ class Journal:
             return Entry()
 
     def write(self, **changed: object) -> Entry:
-        """Change some of the last entry; and give it back."""
+        """Change some of the last entry; and give it back. UpdateNoRoom or UpdateFailed if it cannot be kept."""
         entry = replace(self.read(), **changed)  # type: ignore[arg-type]
-        write_whole(self._path, json.dumps(asdict(entry)) + "\n")
+        try:
+            write_whole(self._path, json.dumps(asdict(entry)) + "\n")
+        except OSError as error:
+            kind = UpdateNoRoom if disk.is_full(error) else UpdateFailed
+            raise kind(f"{self._path} cannot be written: {error.strerror or error}") from error
         return entry
 
     @contextmanager
@@ -53,7 +61,10 @@ class Journal:
         try:
             yield
         except DiffuscopeError as error:
-            self.write(state="refused", said=f"{error.message} {error.remedy}")
+            try:
+                self.write(state="refused", said=f"{error.message} {error.remedy}")
+            except UpdateError:
+                log.warning("the journal of updates cannot be written")  # whoever asked hears the first reason
             raise
 
 

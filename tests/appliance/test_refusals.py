@@ -3,6 +3,7 @@
 import hashlib
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,7 @@ from tests.appliance import releases
 from tests.appliance.bench import Bench
 from tests.appliance.device import run
 from tests.appliance.releases import Workshop
+from tests.house import ROOT
 from tests.site import identity, served, signed
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(120)]
@@ -211,6 +213,36 @@ def test_a_wrong_clock_keeps_nobody_from_an_update(bench: Bench, shelf: Shelf, d
         bench.updater(rauc=bench.rauc("faketime", date)).install(shelf.newer)
     assert bench.version("B") == "2.0"
     assert bench.boot() == "B"
+
+
+ASKS = """
+import sys
+from pathlib import Path
+from device.clock import VirtualClock
+from device.errors import UpdateUnreachable
+from services.update.channel import opened
+from services.update.sources import Web
+at, authority, channel, keyring = sys.argv[1:]
+print(opened(Path(channel).read_bytes(), Path(keyring)).version)
+try:
+    Web(at, Path(authority), VirtualClock()).small("channel.cms")
+except UpdateUnreachable as error:
+    print(error.remedy)
+"""
+
+
+@pytest.mark.parametrize("date", ["2020-01-01", "2035-01-01"])
+def test_a_channel_is_believed_by_a_wrong_clock_and_its_server_refused_with_the_reason(
+    shelf: Shelf, tmp_path: Path, date: str
+) -> None:
+    """What is signed has no date of expiry; a web server's certificate has, and no stick needs that."""
+    offer = {"compatible": "diffuscope-pi5", "version": "2.0", "bundle": "a.raucb", "bytes": 1, "sha256": "0" * 64}
+    (tmp_path / "channel.cms").write_bytes(signed(shelf.workshop.keys, json.dumps(offer).encode()))
+    certificate, key = identity(tmp_path)
+    with served(certificate, key) as site:
+        files = [certificate, tmp_path / "channel.cms", shelf.workshop.keys / "ca.crt"]
+        said = run("faketime", date, sys.executable, "-c", ASKS, site.at, *files, cwd=ROOT)
+    assert said.startswith("2.0\nLook whether date and time of this device are right")
 
 
 def test_rauc_that_is_not_there_is_said(bench: Bench, shelf: Shelf) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import resource
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,10 +11,19 @@ from pathlib import Path
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import UpdateDamaged, UpdateForeign, UpdateNowhere, UpdateOlder, UpdateUnreachable
+from device.errors import (
+    UpdateDamaged,
+    UpdateFailed,
+    UpdateForeign,
+    UpdateNoRoom,
+    UpdateNowhere,
+    UpdateOlder,
+    UpdateUnreachable,
+)  # fmt: skip
 from services.update.channel import Offer, opened
 from services.update.engine import Release
 from services.update.gate import number, refuse_wrong
+from services.update.journal import Journal
 from services.update.settings import UpdateSettings, load
 from services.update.sources import WAITS_S, Web, on_stick
 from tests.house import ROOT
@@ -143,6 +153,27 @@ def test_what_judges_a_version_loads_none_of_what_it_judges() -> None:
     asks = "import sys, services.update.command; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     assert not {"numba", "scipy", "pyfftw", "fastapi", "device.head", "device.recon"} & set(loaded.split())
+
+
+def test_a_journal_that_cannot_be_written_is_said_and_hides_no_refusal(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A limit on the length of files is what a full disk is: the old entry stays."""
+    journal = Journal(tmp_path)
+    journal.write(state="installed", version="2.0")
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, usual[1]))
+    try:
+        with pytest.raises(UpdateNoRoom):
+            journal.write(state="trying")
+        with pytest.raises(UpdateNowhere), journal.refusals():
+            raise UpdateNowhere("no stick")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+    assert "cannot be written" in caplog.text
+    assert journal.read().state == "installed"
+    with pytest.raises(UpdateFailed):
+        Journal(tmp_path / "gone").write(state="trying")
 
 
 def test_sticks_are_looked_at_one_folder_deep(tmp_path: Path) -> None:
