@@ -209,7 +209,7 @@ def a_long_one(folder: Path) -> Path:
     wide.mkdir()
     for name in ("raw.tiff", "psf.tiff"):
         counts = tifffile.imread(folder / "scene" / name)
-        tifffile.imwrite(wide / name, np.pad(counts, ((270, 270), (480, 480)), "edge"))
+        tifffile.imwrite(wide / name, np.pad(counts, ((540, 540), (960, 960)), "edge"))
     return wide
 
 
