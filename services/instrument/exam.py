@@ -68,7 +68,7 @@ class Exam:
         self._exposing = self._closing = self._ended = False
         self._exposed: deque[Exposed] = deque()
         self._in_the_making = 0
-        self._wanted_until_s = self._alive_s = self._took_s = 0.0
+        self._wanted_until_s, self._alive_s, self._took_s = 0.0, 0.0, budget_s()
         self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
         self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
@@ -290,7 +290,7 @@ class Exam:
             light.off()
 
     def _reconstruct(self, shot: Exposed, budget_s: float) -> Reconstruction:
-        begin_s, usual_s = self.clock.now_s(), self._took_s or budget_s
+        begin_s = self._alive_s = self.clock.now_s()
 
         def show(stage: Stage) -> None:
             if not stage.last:
@@ -301,19 +301,19 @@ class Exam:
             if self._press is not None and not self._closing:
                 self._let_in()
             elif self.clock.now_s() - self._alive_s > LIVE_S:
-                self._show_life(shot, self.clock.now_s() - begin_s, usual_s)
+                self._show_life(shot, self.clock.now_s() - begin_s)
 
         made = self._reconstructor(
             shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
             deadline=Deadline.after(self.clock, budget_s), watch=show, between=between,
         )  # fmt: skip
-        self._took_s = self.clock.now_s() - begin_s
+        self._took_s = max(LIVE_S, self.clock.now_s() - begin_s)
         return made
 
-    def _show_life(self, shot: Exposed, gone_s: float, usual_s: float) -> None:
+    def _show_life(self, shot: Exposed, gone_s: float) -> None:
         """Between two rounds: pages hear how far it is, by what the last picture took; who aims sees a live picture."""
-        self._alive_s, left_s = self.clock.now_s(), max(0.0, usual_s - gone_s)
-        self._tell_stage(shot.press, shot.id, "refine", 0.9 - 0.5 * left_s / usual_s, left_s=left_s)
+        self._alive_s, left_s = self.clock.now_s(), max(0.0, self._took_s - gone_s)
+        self._tell_stage(shot.press, shot.id, "refine", 0.9 - 0.5 * left_s / self._took_s, left_s=left_s)
         if self.clock.now_s() < self._wanted_until_s:
             self._look()
 

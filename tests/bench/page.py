@@ -68,9 +68,9 @@ Object.defineProperty(HTMLProgressElement.prototype, "value", { ...valued, set(v
 Mark = tuple[str, float, Any]
 
 
-def opened(browser: Browser, url: str) -> Page:
+def opened(browser: Browser, url: str, hooks: str = HOOKS) -> Page:
     page = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True).new_page()
-    page.add_init_script(HOOKS)
+    page.add_init_script(hooks)
     page.goto(url)
     page.wait_for_selector("eye-live[data-frame]", timeout=60_000)
     return page
@@ -183,7 +183,7 @@ def renderers_mb(browser: Browser) -> float:
 
 def memory(browser: Browser, url: str, minutes: float) -> None:
     """Print by how much an hour of aiming fills the memory, by a straight line through the minutes after the first."""
-    page = opened(browser, url)
+    page = opened(browser, url, hooks="")  # what they note would fill the memory
     tools = page.context.new_cdp_session(page)
     seen: list[tuple[float, float, float]] = []
     for at_s in np.arange(0.0, 60 * minutes + 1, 10.0):
@@ -209,7 +209,7 @@ def a_long_one(folder: Path) -> Path:
     wide.mkdir()
     for name in ("raw.tiff", "psf.tiff"):
         counts = tifffile.imread(folder / "scene" / name)
-        tifffile.imwrite(wide / name, np.pad(counts, ((270, 270), (480, 480)), "edge"))
+        tifffile.imwrite(wide / name, np.pad(counts, ((540, 540), (960, 960)), "edge"))
     return wide
 
 

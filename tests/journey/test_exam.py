@@ -156,7 +156,8 @@ def test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture(make
     first = rig.exam.press("OD").result(30)
     (second,) = [pressed.result(30) for pressed in eager.pressed]
     assert rig.store.captures() == [second, first]
-    order = [(data["id"], data["stage"]) for kind, data in rig.told() if kind == "stage"]
+    stages = [data for kind, data in rig.told() if kind == "stage" and data["stage"] != "refine"]
+    order = [(data["id"], data["stage"]) for data in stages]
     a, b = first.id, second.id
     assert order[:5] == [(a, "expose"), (a, "quick"), (b, "expose"), (b, "quick"), (a, "keep")]
     assert first.report["rounds"] == second.report["rounds"] > 5
@@ -165,6 +166,37 @@ def test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture(make
     alone = rig.exam._eye(rig.exam._reconstructor(raw, dark, simulated=True).picture)
     kept = rig.store.read(a, "picture.png")
     assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # to the last bit
+
+
+def test_while_a_picture_is_refined_pages_hear_how_far_it_is_and_who_aims_sees_a_live_picture(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+
+    def aim_on() -> int:
+        rig.clock.sleep(1.0)
+        seen: int = rig.exam._preview.number
+        assert rig.exam.preview(seen, wait_s=0.0) is None
+        return seen
+
+    eager.press = aim_on
+    rig.exam.press("OD").result(30)
+    stages = [data for kind, data in rig.told() if kind == "stage"]
+    assert [data["stage"] for data in stages[:3]] == ["expose", "quick", "refine"]
+    assert stages[-1]["stage"] == "keep"
+    fractions = [data["fraction"] for data in stages]
+    assert fractions == sorted(fractions)
+    assert stages[2]["left_s"] > 0
+    assert rig.exam._preview.number > eager.pressed[0], "made before the picture was done"
+
+
+def test_nobody_aims_nobody_is_lit_while_a_picture_is_refined(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+    live = rig.exam.preview(0)
+    eager.press = lambda: rig.clock.sleep(1.0)  # within the three seconds for which a live picture would be wanted
+    rig.exam.press("OD").result(30)
+    assert live is not None
+    assert rig.exam._preview.number <= live.number + 1, "one may have been under way"
 
 
 def test_a_press_that_fails_in_the_pause_leaves_the_refinement_alone(make_rig: Any) -> None:
