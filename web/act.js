@@ -7,7 +7,7 @@ import { freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
 import { today } from "./screens/history.js";
 import { codeText } from "./screens/outcome.js";
-import { lower, raise } from "./states.js";
+import { dismiss, lower, raise } from "./states.js";
 import { EyePic, homeBox } from "./viewer.js";
 import * as visits from "./visit.js";
 import { learn, t } from "./words.js";
@@ -132,8 +132,8 @@ const picture = {
 
 const ofState = {
   ok: ({ code }) => lower(code),
-  later: ({ code }) => lower(code),
-  dateIsRight: ({ code }) => lower(code),
+  later: dismiss,
+  dateIsRight: dismiss,
   retry: () => answers.refreshStatus(),
   useHere: async () => {
     const answer = await visits.politely(() => askForControls(true));

@@ -1,7 +1,7 @@
 // The page's story: where the person is, what the instrument tells, what is drawn. What a person can do stands in act.js.
 
 import { act, answers } from "./act.js";
-import { askForControls, EventLine, getProtocol, getStatus, Refusal } from "./api.js";
+import { askForControls, EventLine, getProtocol, getStatus, letControlsGo, Refusal } from "./api.js";
 import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
@@ -9,7 +9,7 @@ import { get, set, store } from "./memory.js";
 import { buzz, freshPicture, heardOfShots, lock, openPicture, take } from "./press.js";
 import { follow, go } from "./routes.js";
 import { today } from "./screens/history.js";
-import { lower, raise } from "./states.js";
+import { lower, over, raise, stands } from "./states.js";
 import { render } from "./vendor/lit-html.js";
 import { politely, refreshList, refreshVisit, saveRest } from "./visit.js";
 import { learn, t } from "./words.js";
@@ -81,8 +81,9 @@ const heard = {
   aim: (aim) => heardAim(aim),
 
   /** What only tells begins, changes (`n`), or is over. */
-  notice({ code, over, ...more }) {
-    if (over) lower(code);
+  notice({ code, over: gone, ...more }) {
+    if (code === "link.other") holdControls(); // whose turn it is, the instrument says to each page by itself
+    else if (gone) over(code);
     else raise({ code, ...more, from: "notice" });
   },
 
@@ -106,6 +107,7 @@ async function refreshStatus() {
   set({ status: Object.freeze(status), doing: status.state });
   lower(({ from, told }) => from === "status" && told !== problem?.code);
   if (problem) raise({ ...problem, told: problem.code, from: "status" });
+  stands(status.standing ?? []);
   tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
   await holdControls();
@@ -170,6 +172,9 @@ function heardAim(aim) {
   }
   if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
 }
+
+// A page that closes lets the next screen take pictures; one that only loads itself anew is back before anybody asks.
+addEventListener("pagehide", letControlsGo);
 
 act.heardAim = ({ detail }) => heardAim(detail);
 act.heardLate = ({ detail: seconds }) => {

@@ -73,10 +73,6 @@ function refused(key, { code, message, remedy, vars }) {
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.over) return;
   const here = shotOf(get())?.key === key;
-  if (shot.id && code !== "link.cut" && here) {
-    change(key, { over: true, failed: { code: "make.failed", message, remedy } }); // light was spent: the raw shot is kept
-    return;
-  }
   put(get().shots.filter((one) => one.key !== key));
   raise({ code, message, remedy, ...vars, from: "press" });
   if (here) go({ screen: "aim", visit: shot.visit, slot: shot.slot }, { replace: true });
@@ -133,9 +129,10 @@ export const heardOfShots = {
     else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
   },
 
+  /** Whoever pressed hears it as the answer; a page that was loaded anew since then hears it here. */
   failed({ id, code, message, remedy }) {
     const shot = byId(id);
-    if (shot && !shot.over) change(shot.key, { over: true, failed: { code: code ?? "make.failed", message, remedy } });
+    if (shot?.reloaded && !shot.over) change(shot.key, { over: true, failed: { code, message, remedy } });
   },
 };
 

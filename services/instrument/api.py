@@ -60,13 +60,14 @@ from device.errors import (
 )  # fmt: skip
 from device.head import kind_of
 from device.recon.model import field_radius_px
-from device.values import Capture, Eye
+from device.values import EYES, Capture, Eye
 from services.health.checks import judged
 from services.health.probe import as_json
 from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
+from services.instrument.notices import Notices, is_old
 from services.instrument.owner import Owner
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
@@ -128,11 +129,16 @@ LARGEST_BODY_BYTES = 10_000
 
 
 class Refusal(BaseModel):
-    """Why something was not done: a code for the log, what happened, and what to do, in plain words."""
+    """Why something was not done: a code for the log, what happened, and what to do, in plain words.
+
+    `n` (minutes to wait) and `wait_s` are there where they are known.
+    """
 
     code: str
     message: str
     remedy: str
+    n: int | None = None
+    wait_s: float | None = None
 
 
 class Press(BaseModel):
@@ -162,16 +168,20 @@ def create_app(
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
     lease = Lease(clock)
+    notices = Notices(owner, people, lease)
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
+        notices.begin()
         yield
+        notices.close()
         owner.house.bulletin.close()
 
     app = FastAPI(
         title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
         docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
+    app.state.notices = notices
     _words_for_errors(app)
     app.add_middleware(OwnPageOnly, names=own_names() if names is None else names, answer=refusal)
     app.add_middleware(SafeHeaders)
@@ -179,7 +189,7 @@ def create_app(
     _captures(app, owner, people, only_one)
     app.include_router(visits_router(people, lease), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
-    _state(app, owner, people, lease)
+    _state(app, owner, people, notices)
     _live(app, owner)
     technician_routes(app, owner, door, rooms)
     _page(app)
@@ -204,9 +214,11 @@ def refusal(error: DiffuscopeError) -> JSONResponse:
     return JSONResponse(words(error), status)
 
 
-def words(error: DiffuscopeError) -> dict[str, str]:
+def words(error: DiffuscopeError) -> dict[str, Any]:
     """What happened and what to do, as the page shows it."""
-    return {"code": error.code, "message": error.message, "remedy": error.remedy}
+    return Refusal(
+        code=error.code, message=error.message, remedy=error.remedy, n=error.n, wait_s=error.wait_s
+    ).model_dump(exclude_none=True)
 
 
 def _words_for_errors(app: FastAPI) -> None:
@@ -225,7 +237,7 @@ def _words_for_errors(app: FastAPI) -> None:
     async def _(request: Request, error: HTTPException) -> JSONResponse:
         message = f"{request.method} {request.url.path}: {error.detail}"
         answer = Refusal(code=f"http.{error.status_code}", message=message, remedy="Go back to the page.")
-        return JSONResponse(answer.model_dump(), error.status_code, error.headers)
+        return JSONResponse(answer.model_dump(exclude_none=True), error.status_code, error.headers)
 
     @app.exception_handler(Exception)  # answered outside every middleware, and then logged by the server
     async def _(request: Request, _: Exception) -> JSONResponse:
@@ -315,7 +327,7 @@ def _captures(app: FastAPI, owner: Owner, people: People, only_one: Any) -> None
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
+def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None:
     store = owner.house.store
 
     @app.get("/api/status")
@@ -327,10 +339,11 @@ def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
             "name": spec.name, "kind": kind_of(spec), "state": owner.state,
             "shape": head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
-            "swept": store.swept, "space_left": store.space_left(),
-            "people_left": store.people_left(len(people.protocol.slots)), "controller": lease.holder,
+            "swept": [asdict(one) for one in notices.lost()], "space_left": store.space_left(),
+            "people_left": store.people_left(len(people.protocol.slots)), "controller": notices.lease.holder,
             "problem": words(problem) if problem else None,
-            "notices": [one.remedy for one in owner.findings if not one.ok],
+            "standing": [{"code": code, **facts} for code, facts in notices.standing().items()],
+            "notices": [one.remedy for one in owner.findings if not one.ok and not is_old(one)],
         }  # fmt: skip
 
     @app.get("/api/health")
@@ -347,9 +360,13 @@ def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
 
 def _live(app: FastAPI, owner: Owner) -> None:
     @app.get("/api/preview")
-    def preview(after: int = Query(0, ge=0)) -> Response:
-        """The next live picture after number `after`; 204 when none comes in 2 s."""
-        live = owner.preview(after)
+    def preview(after: int = Query(0, ge=0), eye: Eye | None = None) -> Response:
+        """The next live picture after number `after`, of that eye if it is known; 204 when none comes in 2 s.
+
+        It makes the lamp shine, so no page but the instrument's own may ask: browsers say so themselves
+        (`Sec-Fetch-Site`), and everybody else gives any `X-Controller`, which no foreign page can.
+        """
+        live = owner.preview(after, EYES if eye is None else (eye,))
         if live is None:
             return Response(status_code=204)
         age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
@@ -358,7 +375,13 @@ def _live(app: FastAPI, owner: Owner) -> None:
 
     @app.get("/api/events")
     async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:
-        """What happens, as server-sent events, with a heartbeat every second."""
+        """What happens, as server-sent events, with a heartbeat (`beat`) every second.
+
+        `state` (what the instrument does), `aim` (what to do so that a picture can be taken), `stage` (how far a
+        picture is: `fraction`, `left_s`), `verdict`, `kept` (a capture), `failed` (`code`, `message`, `remedy`), and
+        `notice`: a state of the page by its `code` stands from now on, with the numbers of its words (`n`, `date`,
+        `wait_s`), or is over (`over`). What stands already is in the status. `calibration` is news of its findings.
+        """
 
         async def lines() -> AsyncIterator[str]:
             async for event in owner.house.bulletin.follow(last_event_id):

@@ -60,9 +60,10 @@ class Away(Order):
 
 
 class Asking(Order):
-    """A screen that wants to take pictures; `take`: even if another does."""
+    """A screen that wants to take pictures; `take`: even if another does; `release`: it closes, and wants no more."""
 
     take: bool = False
+    release: bool = False
 
 
 def visits_router(people: People, lease: Lease) -> APIRouter:
@@ -73,8 +74,8 @@ def visits_router(people: People, lease: Lease) -> APIRouter:
 
     @router.post("/api/controller")
     def controller(asking: Asking) -> dict[str, Any]:
-        """Ask for the right to take pictures, or take it from another screen."""
-        held = lease.ask(asking.key, asking.take)
+        """Ask for the right to take pictures, take it from another screen, or let it go."""
+        held = lease.release(asking.key) if asking.release else lease.ask(asking.key, asking.take)
         return {"lease": held.lease, "mine": held.mine}
 
     return router

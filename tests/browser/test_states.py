@@ -47,11 +47,17 @@ CAUSES = ["saturated", "dark", "pupil", "moved", "blink", "noeye", "edge", "halo
 
 
 def tell(stub: Stubbed, page: Page, code: str, **more: Any) -> None:
-    stub.stub.tell("notice", {"code": code, **NUMBERS, **more})
+    if code == "link.other":
+        stub.stub.controller = "another screen"
+        stub.stub.events.append(("notice", {"code": code}))
+    else:
+        stub.stub.tell("notice", {"code": code, **NUMBERS, **more})
     page.locator(f"[data-code='{code}']").wait_for()
 
 
 def over(stub: Stubbed, page: Page, code: str) -> None:
+    if code == "link.other":
+        stub.stub.controller = None
     stub.stub.tell("notice", {"code": code, "over": True})
     expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
 
@@ -155,12 +161,9 @@ def test_a_cause_is_told_with_one_thing_to_do(open_page: Open, stub: Stubbed) ->
 
 
 def test_a_picture_that_could_not_be_made_says_so_and_the_shot_is_kept(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.hold = "verdict"
+    stub.stub.verdicts = ["make.failed"]
     page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
-    page.wait_for_selector(".stage[data-mark=quick]")
-    name = next(data["id"] for kind, data in reversed(stub.stub.events) if kind == "stage")
-    stub.stub.tell("failed", {"id": name, "code": "store", "message": "x", "remedy": "y"})
     expect(page.locator(".card")).to_contain_text("The picture could not be made. The shot is kept.")
     expect(page.locator("#next")).to_be_visible()
 
@@ -176,7 +179,7 @@ def test_power_that_went_off_names_the_eye_and_goes_there(open_page: Open, stub:
 
 
 def test_old_sweepings_are_told_without_names(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.swept = ["a", "b"]
+    stub.stub.swept = [{"id": name, "eye": None, "visit": None, "slot": None, "tries": 0} for name in "ab"]
     page = open_page(stub.url)
     expect(page.locator("[data-code='power.lost']")).to_contain_text("Power went off during 2 pictures.")
     page.get_by_role("button", name="OK").tap()

@@ -50,15 +50,13 @@ function card(state, act, shot) {
 }
 
 function verdictWords(state, shot) {
-  if (shot.failed) return ["warn", t("verdict.again"), wordsOf({ ...shot.failed, code: knownFailure(shot.failed.code) })];
+  if (shot.failed) return ["warn", t("verdict.again"), wordsOf(shot.failed)];
   if (shot.verdict?.word === "good") return ["star", t("verdict.good"), t("verdict.good.what")];
   if (!shot.verdict) return ["check", t("verdict.none"), ""];
   if (exhausted(state, shot)) return ["pen", t("verdict.again"), wordsOf({ code: "shot.poor", n: triesOf(state, shot) })];
   const cause = STATES[shot.verdict.code] ? wordsOf({ code: shot.verdict.code }) : "";
   return ["pen", t("verdict.again"), cause];
 }
-
-const knownFailure = (code) => (STATES[code] ? code : "make.failed");
 
 function timer(state, act, shot) {
   if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return nothing;
