@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from device.errors import FrameError
 from device.recon.kernels import Pixels
 from device.recon.model import Model, field_radius_px, tight_model
 from device.recon.plan import Planner
@@ -136,7 +137,12 @@ class Gate:
         plain = Reading(saturated, light_e_per_um2=self._light(light_dn))
         if self._eye is None or saturated > HOPELESS or light_dn <= 0:
             return plain
-        return self._eye.read(plain, counts, dark)
+        try:
+            return self._eye.read(plain, counts, dark)
+        except FrameError:
+            if saturated <= MOST_SATURATED:
+                raise
+            return plain  # too few pixels are left, and why is known
 
     @property
     def picture(self) -> Image | None:

@@ -148,18 +148,13 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    return traced(spec)
-
-
-def coarser(spec: InstrumentSpec) -> InstrumentSpec:
-    """The small head, half as fine again."""
-    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
-    return spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)})
+    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}  # half as fine again
+    return traced(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}))
 
 
 def traced(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """A world whose light is already traced, and its calibration: the same for every test, and half as fine again."""
-    world = World(coarser(spec), VirtualClock())
+    """A world whose light is already traced, and its calibration: the same for every test."""
+    world = World(spec, VirtualClock())
     for colour in (spec.light.colour, spec.light.preview_colour):
         world.electrons_per_s(colour)
     return world, simulated_calibration(world)

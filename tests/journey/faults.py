@@ -16,11 +16,11 @@ from typing import Any
 from device.calibration.archive import Provenance
 from device.clock import VirtualClock
 from device.head import Chips, Head
-from device.sim import stage
 from device.sim.chips import SimBattery, SimThermometer
 from device.sim.world import World
 from device.spec import BusSpec
 from device.values import Charge
+from services.instrument.bulletin import Bulletin
 from tests.journey.conftest import Rig, until
 from tests.simulated import having
 
@@ -41,6 +41,18 @@ class Shelf:
     def __call__(self, folder: Path) -> int:
         self.asked()
         return self.free_bytes
+
+
+class Attentive(Bulletin):
+    """News at which something else happens: once, when a press begins."""
+
+    at_the_press: Callable[[], None] | None = None
+
+    def tell(self, kind: str, **data: Any) -> None:
+        super().tell(kind, **data)
+        if data.get("stage") == "expose" and self.at_the_press is not None:
+            act, self.at_the_press = self.at_the_press, None
+            act()
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,15 @@ def aimed(rig: Rig) -> Said:
             known = {name: value for name, value in problem.items() if name not in ("code", "message", "remedy")}
             return Said("status", problem["code"], known, problem["remedy"])
     raise AssertionError("the status has no problem")
+
+
+def live(rig: Rig, after: int, eye: str = "OD") -> int:
+    """The number of the next live picture after number `after`."""
+    for _ in range(20):
+        answer = rig.request("GET", f"/api/preview?after={after}&eye={eye}")
+        if answer.status_code == 200:
+            return int(answer.headers["x-frame"])
+    raise AssertionError("no live picture came")
 
 
 def stands(rig: Rig, code: str) -> Said:
@@ -132,23 +153,17 @@ def fault(name: str, ask: Callable[[Rig], Said]) -> Callable[[Rig, Shelf], Said]
     return scenario
 
 
-def wall(rig: Rig) -> None:
-    """Something as bright as the eye, but even, stands there from now on."""
-    world = rig.world
-    mean_e_per_s = float(world.electrons_per_s("green").mean())
-    world.stage = stage.screen(world, mean_e_per_s)
-
-
 def no_eye(rig: Rig, shelf: Shelf) -> Said:
+    rest(rig)
     rig.clock.sleep(60)
-    wall(rig)
+    rig.world.faults.add("eye.closed")
     return pressed(rig)
 
 
 def blink(rig: Rig, shelf: Shelf) -> Said:
-    number = int(rig.request("GET", "/api/preview?after=0").headers["x-frame"])
-    assert rig.request("GET", f"/api/preview?after={number}").status_code == 200
-    wall(rig)
+    live(rig, live(rig, 0))
+    assert isinstance(rig.bulletin, Attentive)
+    rig.bulletin.at_the_press = lambda: rig.world.faults.add("eye.closed")
     return pressed(rig)
 
 
@@ -165,12 +180,13 @@ def light_limit(rig: Rig, shelf: Shelf) -> Said:
     said = pressed(rig)
     assert 0 < said.facts["n"] <= 180
     assert pressed(rig, "OS").way == "verdict", "the other eye can go on"
-    number = int(rig.request("GET", "/api/preview?after=0&eye=OS").headers["x-frame"]) + 1
+    number = live(rig, 0, "OS") + 1
     ledger = rig.exam.head.light.ledger
     before = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
-    assert rig.request("GET", f"/api/preview?after={number}&eye=OS").status_code == 200
+    live(rig, number, "OS")
     assert ledger.spent_j_per_cm2("OD") == before[0], "aiming at one eye costs the other nothing"
     assert ledger.spent_j_per_cm2("OS") > before[1]
+    rest(rig)
     rig.clock.sleep(60 * said.facts["n"])
     assert pressed(rig).way == "verdict", "after its rest the eye gets light again"
     return said
@@ -260,7 +276,7 @@ def unmade(rig: Rig, shelf: Shelf) -> Said:
 
 def poor(rig: Rig, shelf: Shelf) -> Said:
     visit = rig.request("POST", "/api/visits", json={"key": "b" * 16}).json()["id"]
-    with seen(rig, 0.1):
+    with seen(rig, 0.003):
         told = [pressed(rig, visit=visit, slot="R-centre").code for _ in range(3)]
     assert told[:2] == ["shot.dark"] * 2
     return Said("verdict", told[2], {"n": 3})
@@ -328,7 +344,7 @@ SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
     "light.day": light_day,
     "cal.old": old,
     "shot.saturated": shot(6.0),
-    "shot.dark": shot(0.1),
+    "shot.dark": shot(0.003),
     "shot.pupil": shot(eye={"pupil_um": 1500.0}),
     "shot.moved": shot(eye={"drift_deg_per_s": 20.0}),
     "shot.blink": blink,
@@ -370,13 +386,17 @@ def page_code(web: Path, code: str) -> str:
     return same.get(code, code)
 
 
+def rest(rig: Rig) -> None:
+    """Nobody aims any more: time may jump, and no lamp shines meanwhile."""
+    until(lambda: rig.clock.now_s() >= rig.exam._wanted_until_s and rig.world.glow is None and rig.exam.state == "aim")
+
+
 def mended(rig: Rig) -> None:
     """All is well again, whatever a scenario broke."""
     world = rig.world
     world.faults.clear()
-    world.stage, world.celsius, world.charge = None, 25.0, Charge(0.775, 3.88)
-    until(lambda: world.glow is None and not rig.exam.fitness.due)
-    if failing := [one for one in rig.exam.fitness.findings if one.fails]:
-        print("STALE", failing)
+    world.celsius, world.charge = 25.0, Charge(0.775, 3.88)
+    rest(rig)
+    until(lambda: not rig.exam.fitness.due)
     for heap in (rig.exam.fitness._sights, rig.exam.fitness._spheres_dpt):
         heap.clear()  # what was broken here says nothing about the next scenario

@@ -13,15 +13,17 @@ from device.calibration.archive import Archive
 from device.head import Chips, Head, open_bench, open_head, refuse_another_head
 from device.ledger import MemoryLedger
 from device.sim.chips import SimHeadMemory
-from device.spec import CalibrationTable
+from device.spec import CalibrationTable, load_head
 from device.values import Identity
 from services.instrument.api import create_app
 from services.instrument.exam import Exam
 from services.instrument.owner import Owner
 from tests.journey import faults
-from tests.journey.conftest import GateClock, MakeRig, Rig, until
-from tests.journey.faults import Said, Shelf
+from tests.journey.conftest import GateClock, MakeRig, Rig, builder, traced, until
+from tests.journey.faults import Attentive, Said, Shelf
+from tests.simulated import SCENES, coarse
 
+K = 4  # pixels of the paper's sensor that are one here, k x k
 WEB = Path(__file__).parents[2] / "web"
 STATES = re.findall(r'"(\w+\.\w+)"', (WEB / "states.js").read_text().split("const TABLE = [")[1].split("].map(")[0])
 WORDS = dict(re.findall(r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"', (WEB / "english.js").read_text()))
@@ -32,12 +34,13 @@ REFUSALS = {
 
 
 @pytest.fixture(scope="module")
-def equipped(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Rig, Shelf]]:
+def equipped(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Rig, Shelf]]:
     """One instrument with thermometer, battery and a calibration with a date, for all scenarios in turn."""
     shelf, clock = Shelf(), GateClock()
+    build = builder(traced(coarse(load_head(SCENES / "calm.toml"), K)), plans)
     with ExitStack() as undo:
         folder = tmp_path_factory.mktemp("faults")
-        yield build(folder, undo, head=faults.equipped, store={"free_bytes": shelf}, clock=clock), shelf
+        yield build(folder, undo, head=faults.equipped, store={"free_bytes": shelf}, clock=clock, bulletin=Attentive()), shelf
 
 
 @pytest.fixture
