@@ -33,8 +33,8 @@ class World:
     stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it, and it
     moves by `shake_px` columns and back from one frame to the next.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "camera.mode" (it gives every other pixel),
-    "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent", "eye.closed" (a lid, or no eye
-    at all: the lamp's light comes back from everywhere alike).
+    "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent", "eye.closed" (a
+    lid, or no eye at all: the lamp's light comes back from everywhere alike).
     """
 
     def __init__(

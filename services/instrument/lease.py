@@ -20,7 +20,10 @@ class Held:
 
 
 class Lease:
-    """Held by a screen's secret key, known to others by a name made from it; ends 10 s after its last request, or soon after it was let go."""
+    """Held by a screen's secret key, known to others by a name made from it; ends 10 s after its last request.
+
+    Sooner where it was let go.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self._clock, self._lock = clock, Lock()

@@ -164,7 +164,7 @@ class Notices:
 
 
 def is_old(one: Finding) -> bool:
-    """Whether a finding is what `cal.old` says; one that is too old refuses, and one of the future is another matter."""
+    """Whether a finding is what `cal.old` says: one that is too old refuses, one of the future is another matter."""
     return one.name == "age" and one.hint and one.limit > 0
 
 

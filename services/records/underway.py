@@ -5,7 +5,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import cast
 
 from device.errors import NotKept, StoreDamaged
 from device.values import EYES, Eye
@@ -84,4 +83,4 @@ def _read(path: Path) -> Lost:
 
 def _eye_in(name: str) -> Eye | None:
     """The eye that a capture's name says."""
-    return cast(Eye | None, next((eye for eye in EYES if f"-{eye}-" in name), None))
+    return next((eye for eye in EYES if f"-{eye}-" in name), None)

@@ -1,4 +1,4 @@
-"""The real application in this process, on a port: a small simulated head whose parts a test may break while it serves."""
+"""The real application in this process, on a port: a small simulated head whose parts a test breaks while it serves."""
 
 import threading
 import time
@@ -9,8 +9,8 @@ from pathlib import Path
 import uvicorn
 
 from device.spec import load_head
-from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, traced
-from tests.journey.faults import Shelf, equipped
+from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, coarsened
+from tests.journey.faults import Attentive, Shelf, equipped
 
 
 class Watch(GateClock):
@@ -38,10 +38,13 @@ class Real:
         self.url, self.clock, self.shelf = f"http://127.0.0.1:{port}", Watch(), Shelf()
         self._undo = ExitStack()
         (folder / "head.toml").write_text(SMALL_HEAD)
-        build = builder(traced(load_head(folder / "head.toml")), folder / "plans")
+        build = builder(coarsened(load_head(folder / "head.toml")), folder / "plans")
+        self.bulletin = Attentive()
         self.rig: Rig = build(
-            folder, self._undo, head=equipped, store={"free_bytes": self.shelf}, clock=self.clock
-        )
+            folder, self._undo, head=equipped, store={"free_bytes": self.shelf}, clock=self.clock,
+            bulletin=self.bulletin, wait=False,
+        )  # fmt: skip
+        assert self.rig.exam.ready.wait(300), "a busy computer makes plans for minutes"
         config = uvicorn.Config(self.rig.app, port=port, log_level="error", ws="none", timeout_graceful_shutdown=3)
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run)

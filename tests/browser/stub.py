@@ -180,7 +180,8 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
-                "controller": stub.controller and "a public name", "notices": stub.notices, "standing": list(stub.standing.values())}  # fmt: skip
+                "controller": stub.controller and "a public name", "notices": stub.notices,
+                "standing": list(stub.standing.values())}  # fmt: skip
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:

@@ -31,7 +31,6 @@ def real(instrument: Real) -> Iterator[Real]:
     world.faults.clear()
     world.celsius, world.charge = 25.0, Charge(0.775, 3.88)
     instrument.shelf.free_bytes, instrument.clock.moved = MOST_BYTES, timedelta(0)
-    rest(rig)
     for heap in (rig.exam.fitness._sights, rig.exam.fitness._spheres_dpt):
         heap.clear()
 
@@ -90,9 +89,7 @@ def test_heat_and_battery_say_so_in_time_and_go_by_themselves(open_page: Open, r
     taken(page)
 
 
-def test_broken_parts_are_named_and_mended_ones_forgotten(
-    open_page: Open, real: Real, complaints: Complaints
-) -> None:
+def test_broken_parts_are_named_and_mended_ones_forgotten(open_page: Open, real: Real, complaints: Complaints) -> None:
     complaints.expect("503", "423")
     page, faults = aiming(open_page, real), real.rig.world.faults
     faults.add("camera.missing")
@@ -107,7 +104,7 @@ def test_broken_parts_are_named_and_mended_ones_forgotten(
     tells(page, "camera.stalled", "It will come back")
     faults.clear()
     is_over(page, "camera.stalled")
-    faults.add("camera.mode")
+    real.bulletin.at_the_press = lambda: faults.add("camera.mode")
     taken(page)
     expect(page.locator(".card")).to_contain_text("The picture could not be made. The shot is kept.")
     faults.clear()
@@ -227,7 +224,7 @@ def test_hostile_words_in_every_field_are_kept_as_words(open_page: Open, real: R
 
 def test_no_foreign_page_makes_the_lamp_shine(open_page: Open, real: Real, complaints: Complaints) -> None:
     complaints.expect("403", "ERR_BLOCKED_BY_RESPONSE", "CORS")
-    rest(real.rig)
+    rest(real.rig)  # the page of the test before is closed
     frames = real.rig.world.frames
     page = open_page("about:blank")
     with page.expect_response("**/api/preview*") as answer:

@@ -148,7 +148,12 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}  # half as fine again
+    return coarsened(spec)
+
+
+def coarsened(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """The small head, half as fine again."""
+    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
     return traced(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}))
 
 

@@ -1,10 +1,10 @@
-"""Every state that the page can tell, and the fault of the simulated head, the shelf or the clock that brings it about.
+"""Every state that the page can tell, and the fault of simulated head, shelf or clock that brings it about.
 
-A scenario makes the fault happen on a `Rig` and answers with what the real server then says of it: `Said`, with the code,
-the numbers that the page's words need, and what to do where it is a refusal.
+A scenario makes the fault happen on a `Rig` and answers with what the real server then says of it: `Said`, with the
+code, the numbers that the page's words need, and what to do where it is a refusal.
 """
 
-import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -207,7 +207,8 @@ def warm(celsius: float, code: str) -> Callable[[Rig, Shelf], Said]:
         if code == "heat.hot":
             assert said.facts == {"wait_s": 300}
             rig.clock.sleep(48)
-            assert {one["code"]: one for one in rig.request("GET", "/api/status").json()["standing"]}[code]["wait_s"] == 252
+            standing = rig.request("GET", "/api/status").json()["standing"]
+            assert {"code": code, "wait_s": 252} in standing
             refused = pressed(rig)
             assert (refused.way, refused.code) == ("423", "head.hot")
             return replace(said, remedy=refused.remedy)
@@ -246,8 +247,11 @@ def full(rig: Rig, shelf: Shelf) -> Said:
 
 
 def low(rig: Rig, shelf: Shelf) -> Said:
-    shelf.free_bytes = 5 * 4 * 10_000_000 if not rig.store.captures(1) else 40 * sum(
-        path.stat().st_size for path in (rig.store.folder / "captures" / rig.store.captures(1)[0].id).iterdir()
+    shelf.free_bytes = (
+        5 * 4 * 10_000_000
+        if not rig.store.captures(1)
+        else 40
+        * sum(path.stat().st_size for path in (rig.store.folder / "captures" / rig.store.captures(1)[0].id).iterdir())
     )
     return stands(rig, "store.low")
 
@@ -368,8 +372,8 @@ SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
 APART = frozenset({"cal.missing", "cal.mismatch", "power.lost"})
 # The page alone knows that nothing arrives: the tests that cut or slow a real browser's link.
 OF_THE_PAGE = {
-    "link.lost": "tests/browser/test_page.py::test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three",
-    "link.slow": "tests/browser/test_page_states.py::test_an_old_live_picture_says_its_age",
+    "link.lost": ("test_page.py", "test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three"),
+    "link.slow": ("test_page_states.py", "test_an_old_live_picture_says_its_age"),
 }
 # No fault can bring these about, because the server does not do yet what could go wrong.
 NOT_YET = {
@@ -382,7 +386,7 @@ NOT_YET = {
 def page_code(web: Path, code: str) -> str:
     """The page's own name of what the server calls `code` (web/states.js)."""
     table = (web / "states.js").read_text().split("const SAME = {")[1].split("};")[0]
-    same = dict(json.loads("[" + line.strip().rstrip(",").replace('": "', '", "') + "]") for line in table.strip().splitlines())
+    same = dict(re.findall(r'"([\w.]+)": "([\w.]+)"', table))
     return same.get(code, code)
 
 

@@ -1,4 +1,4 @@
-"""Every state of the page is reached by a fault of the simulated head, over the real server, with what its words need."""
+"""Every state of the page is reached by a fault of the simulated head, over the real server, whole with its numbers."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -26,7 +26,8 @@ from tests.simulated import SCENES, coarse
 K = 4  # pixels of the paper's sensor that are one here, k x k
 WEB = Path(__file__).parents[2] / "web"
 STATES = re.findall(r'"(\w+\.\w+)"', (WEB / "states.js").read_text().split("const TABLE = [")[1].split("].map(")[0])
-WORDS = dict(re.findall(r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"', (WEB / "english.js").read_text()))
+SPOKEN = r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"'
+WORDS = dict(re.findall(SPOKEN, (WEB / "english.js").read_text()))
 REFUSALS = {
     "camera.missing", "light.fault", "light.limit", "light.day", "store.full", "batt.empty", "heat.hot", "link.other",
     "lock.idle",
@@ -40,7 +41,10 @@ def equipped(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     build = builder(traced(coarse(load_head(SCENES / "calm.toml"), K)), plans)
     with ExitStack() as undo:
         folder = tmp_path_factory.mktemp("faults")
-        yield build(folder, undo, head=faults.equipped, store={"free_bytes": shelf}, clock=clock, bulletin=Attentive()), shelf
+        yield (
+            build(folder, undo, head=faults.equipped, store={"free_bytes": shelf}, clock=clock, bulletin=Attentive()),
+            shelf,
+        )
 
 
 @pytest.fixture
@@ -73,9 +77,8 @@ def test_every_state_of_the_page_has_its_scenario_or_says_why_not() -> None:
     reached = faults.SCENARIOS.keys() | faults.APART
     assert reached | faults.OF_THE_PAGE.keys() | faults.NOT_YET.keys() == set(STATES)
     assert len(reached) + len(faults.OF_THE_PAGE) + len(faults.NOT_YET) == len(STATES)
-    for where in faults.OF_THE_PAGE.values():
-        path, test = where.split("::")
-        assert f"def {test}(" in (WEB.parent / path).read_text()
+    for file, test in faults.OF_THE_PAGE.values():
+        assert f"def {test}(" in (WEB.parent / "tests" / "browser" / file).read_text()
 
 
 def without_calibration(rig: Rig, wrong: Callable[[], Exam]) -> Any:
