@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from device.calibration.archive import Archive
@@ -126,3 +127,42 @@ def test_a_power_cut_in_a_picture_names_its_eye_and_part(build: Callable[..., Ri
         said = faults.cut_off(rig, lambda: build(tmp_path / "after", undo), tmp_path / "after")
         says_what_its_words_need("power.lost", said)
         until(lambda: not rig.exam.fitness.due)
+
+
+def test_stages_say_how_long_it_still_takes(make_rig: MakeRig) -> None:
+    class Slow(Attentive):
+        """Each stage takes a second more, as on a slow computer."""
+
+        def tell(self, kind: str, **data: Any) -> None:
+            super().tell(kind, **data)
+            if kind == "stage":
+                rig.clock.sleep(1.0)
+
+    rig = make_rig(bulletin=Slow())
+    for _ in range(2):
+        rig.exam.press("OD").result(30)
+    left_s = [data["left_s"] for kind, data in rig.told() if kind == "stage"]
+    assert left_s == pytest.approx([5.2, 5.0, 0.0, 3.2, 2.0, 1.0], abs=0.11)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 403), ({"Sec-Fetch-Site": "cross-site"}, 403), ({"Sec-Fetch-Site": "same-site"}, 403),
+        ({"Sec-Fetch-Site": "cross-site", "X-Controller": "stolen"}, 403), ({"X-Controller": "a script"}, 200),
+        ({"Sec-Fetch-Site": "same-origin"}, 200), ({"Sec-Fetch-Site": "none"}, 200),
+    ],
+)  # fmt: skip
+def test_the_lamp_shines_for_no_stranger(old_rig: Rig, headers: dict[str, str], status: int) -> None:
+    faults.rest(old_rig)
+    frames = old_rig.world.frames
+
+    async def story(client: httpx.AsyncClient) -> httpx.Response:
+        del client.headers["Sec-Fetch-Site"]
+        return await client.get("/api/preview?after=0", headers=headers)
+
+    answer = old_rig.ask(story)
+    assert answer.status_code == status or (status, answer.status_code) == (200, 204)  # a busy computer
+    if status == 403:
+        assert answer.json()["code"] == "link.forged"
+        assert old_rig.world.frames == frames
