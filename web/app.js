@@ -82,6 +82,7 @@ const heard = {
 
   /** What only tells begins, changes (`n`), or is over. */
   notice({ code, over: gone, ...more }) {
+    noticed += 1;
     if (code === "link.other") holdControls(); // whose turn it is, the instrument says to each page by itself
     else if (gone) over(code);
     else raise({ code, ...more, from: "notice" });
@@ -95,7 +96,10 @@ const heard = {
 
 let sweptTold = false;
 
+let noticed = 0;
+
 async function refreshStatus() {
+  const before = noticed;
   let status;
   try {
     status = await getStatus();
@@ -107,7 +111,7 @@ async function refreshStatus() {
   set({ status: Object.freeze(status), doing: status.state });
   lower(({ from, told }) => from === "status" && told !== problem?.code);
   if (problem) raise({ ...problem, told: problem.code, from: "status" });
-  stands(status.standing ?? []);
+  if (noticed === before) stands(status.standing ?? []); // else it is older than what was just told
   tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
   await holdControls();

@@ -177,10 +177,6 @@ def test_a_second_tablet_can_go_on_as_soon_as_the_first_page_closes(open_page: O
     first = aiming(open_page, real)
     second = open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre")
     expect(second.locator(".state-bar[data-code='link.other']")).to_be_visible(timeout=SOON_MS)
-    first.reload()
-    live(first)
-    taken(first)
-    expect(second.locator(SHUTTER)).to_contain_text("Other screen")
     first.goto("about:blank")
     expect(second.locator(".state-bar")).to_have_count(0, timeout=8_000)
     taken(second)
@@ -223,13 +219,12 @@ def test_hostile_words_in_every_field_are_kept_as_words(open_page: Open, real: R
 
 
 def test_no_foreign_page_makes_the_lamp_shine(open_page: Open, real: Real, complaints: Complaints) -> None:
-    complaints.expect("403", "ERR_BLOCKED_BY_RESPONSE", "CORS")
+    complaints.expect("403", "/api/preview")
     rest(real.rig)  # the page of the test before is closed
     frames = real.rig.world.frames
     page = open_page("about:blank")
-    with page.expect_response("**/api/preview*") as answer:
-        page.set_content(f'<img src="{real.url}/api/preview?after=0">')
-    assert answer.value.status == 403
+    page.set_content(f'<img src="{real.url}/api/preview?after=0">')
+    assert page.evaluate("document.images[0].decode().then(() => 1, () => 0)") == 0
     page.evaluate(f"fetch('{real.url}/api/preview', {{ mode: 'no-cors' }}).catch(() => 0)")
     with_key = f"fetch('{real.url}/api/preview', {{ headers: {{ 'X-Controller': 'a' }} }}).then(() => 1, () => 0)"
     assert page.evaluate(with_key) == 0

@@ -165,7 +165,7 @@ def test_a_picture_that_could_not_be_made_says_so_and_the_shot_is_kept(open_page
     page = aiming(open_page, stub)
     page.locator(SHUTTER).tap()
     expect(page.locator(".card")).to_contain_text("The picture could not be made. The shot is kept.")
-    expect(page.locator("#next")).to_be_visible()
+    expect(page.locator("#keep")).to_be_visible()
 
 
 def test_power_that_went_off_names_the_eye_and_goes_there(open_page: Open, stub: Stubbed) -> None:
