@@ -1,10 +1,9 @@
 """The HTTP face of the instrument: what DESIGN.md fixes, errors in one table, and the page itself."""
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -12,7 +11,7 @@ from typing import Annotated, Any, Self
 from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
+from fastapi.responses import FileResponse, JSONResponse
 from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers, MutableHeaders
@@ -51,7 +50,6 @@ from device.errors import (
     StickFull,
     StickGone,
     StoreDamaged,
-    StoreError,
     StoreFull,
     TechnicianLocked,
     TooHot,
@@ -60,13 +58,14 @@ from device.errors import (
 )  # fmt: skip
 from device.head import kind_of
 from device.recon.model import field_radius_px
-from device.values import EYES, Capture, Eye
+from device.values import Capture, Eye
 from services.health.checks import judged
 from services.health.probe import as_json
 from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
+from services.instrument.live_api import live_routes
 from services.instrument.notices import Notices, is_old
 from services.instrument.owner import Owner
 from services.instrument.technician import Door
@@ -75,7 +74,6 @@ from services.instrument.visits_api import NAME, exports_router, visits_router
 from services.instrument.wellbeing import facts
 from services.records.people import People
 from services.records.protocol import Protocol, load_protocol
-from services.records.store import Store
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
@@ -190,7 +188,7 @@ def create_app(
     app.include_router(visits_router(people, lease), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
     _state(app, owner, people, notices)
-    _live(app, owner)
+    live_routes(app, owner, shown)
     technician_routes(app, owner, door, rooms)
     _page(app)
     return app
@@ -356,50 +354,6 @@ def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None
             "battery": known.battery if isinstance(known.battery, float) else None, "checks": as_json(checks),
             "calibration": shown_findings(owner.findings),
         }  # fmt: skip
-
-
-def _live(app: FastAPI, owner: Owner) -> None:
-    @app.get("/api/preview")
-    def preview(after: int = Query(0, ge=0), eye: Eye | None = None) -> Response:
-        """The next live picture after number `after`, of that eye if it is known; 204 when none comes in 2 s.
-
-        It makes the lamp shine, so no page but the instrument's own may ask: browsers say so themselves
-        (`Sec-Fetch-Site`), and everybody else gives any `X-Controller`, which no foreign page can.
-        """
-        live = owner.preview(after, EYES if eye is None else (eye,))
-        if live is None:
-            return Response(status_code=204)
-        age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
-        told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
-        return Response(live.jpeg, media_type="image/jpeg", headers=told)
-
-    @app.get("/api/events")
-    async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:
-        """What happens, as server-sent events, with a heartbeat (`beat`) every second.
-
-        `state` (what the instrument does), `aim` (what to do so that a picture can be taken), `stage` (how far a
-        picture is: `fraction`, `left_s`), `verdict`, `kept` (a capture), `failed` (`code`, `message`, `remedy`), and
-        `notice`: a state of the page by its `code` stands from now on, with the numbers of its words (`n`, `date`,
-        `wait_s`), or is over (`over`). What stands already is in the status. `calibration` is news of its findings.
-        """
-
-        async def lines() -> AsyncIterator[str]:
-            async for event in owner.house.bulletin.follow(last_event_id):
-                if event.kind == "kept":
-                    if (capture := _still_kept(owner.house.store, event.data["id"])) is None:
-                        continue
-                    event = replace(event, data=shown(capture))
-                yield event.as_sse()
-
-        return StreamingResponse(lines(), media_type="text/event-stream")
-
-
-def _still_kept(store: Store, id: str) -> Capture | None:
-    """A kept capture; None if it has been damaged since, because the news after it must arrive all the same."""
-    try:
-        return store.get(id)
-    except StoreError:
-        return None
 
 
 def _page(app: FastAPI) -> None:
