@@ -13,7 +13,8 @@ DiffuscopeError
 │   ├── CameraPacked             the camera gives no plain counts
 │   ├── LightFault               the lamp does not do what it was told
 │   ├── LightLimit               the guard refuses more light
-│   │   └── LightCut             the guard ended a light before its exposure was over
+│   │   ├── LightCut             the guard ended a light before its exposure was over
+│   │   └── LightDay             an eye has had all the light of a day
 │   ├── BusFault                 a chip on the I2C bus does not answer
 │   │   └── MemoryDamaged        the head's memory answers, and holds no whole identity
 │   ├── HeadMismatch             the head's memory names another head
@@ -67,14 +68,19 @@ from typing import ClassVar
 
 
 class DiffuscopeError(Exception):
-    """Something went wrong; `code` names it for the log, `remedy` says in plain words what to do."""
+    """Something went wrong; `code` names it for the log, `remedy` says in plain words what to do.
+
+    `n` and `wait_s` are what the page's own words need: how many (minutes, people), and how long until it is over.
+    """
 
     code: ClassVar[str] = "fault"
     default_remedy: ClassVar[str] = "Turn the device off and on. If it happens again, call the technician."
 
-    def __init__(self, message: str, remedy: str | None = None) -> None:
+    def __init__(
+        self, message: str, remedy: str | None = None, *, n: int | None = None, wait_s: float | None = None
+    ) -> None:
         super().__init__(message)
-        self.message = message
+        self.message, self.n, self.wait_s = message, n, wait_s
         self.remedy = remedy if remedy is not None else self.default_remedy
 
 
@@ -166,6 +172,13 @@ class LightCut(LightLimit):
 
     code = "light.cut"
     default_remedy = "The light went out too early, so there is no picture. Take it again."
+
+
+class LightDay(LightLimit):
+    """An eye has had all the light of a day."""
+
+    code = "light.day"
+    default_remedy = "This eye has had today's full light. Do not take more pictures of it."
 
 
 class BusFault(HardwareError):

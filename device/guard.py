@@ -6,6 +6,7 @@ and given back down to what was really given once it is dark. Whoever dies in be
 
 from collections.abc import Sequence
 from contextlib import suppress
+from math import ceil
 from threading import Timer
 from types import TracebackType
 
@@ -73,7 +74,9 @@ class GuardedLight:
             raise LightLimit("the lamp is already lit by someone else")
         self._debt_s, self._dark_at_s = max(0.0, self._debt_s - (now_s - self._dark_at_s)), now_s  # counts once
         if self._debt_s >= self.max_on_s:
-            raise LightLimit(f"{self._debt_s:.1f} s of light have not yet been followed by darkness")
+            wait_s = max(1, ceil(self._debt_s - self.max_on_s))
+            message = f"{self._debt_s:.1f} s of light have not yet been followed by darkness"
+            raise LightLimit(message, f"Wait {wait_s} s, then press again.", wait_s=wait_s)
         self._reserve(glow, eyes)
         self._glow, self._lit_at_s, self._cut_at_s, self._late = glow, self._clock.now_s(), None, False
         self._held = self._light.on(glow)

@@ -12,9 +12,10 @@ from math import ceil
 from typing import Protocol
 
 from device.clock import Clock
-from device.errors import LightLimit
+from device.errors import LightDay, LightLimit
 from device.values import Eye
 
+LONGEST_REST_S = 3 * 3600.0  # nobody waits for longer: then it was the day's light
 SLOT_S = 600.0  # doses are added up in slots, so that the book stays short; a slot counts until its last light may
 
 
@@ -110,12 +111,14 @@ def refusal(eye: Eye, spent_j_per_cm2: float, stop_j_per_cm2: float, wait_s: flo
             f"one exposure would be more than the {stop_j_per_cm2:.3g} J/cm2 that {name} may have in a day",
             "Choose a dimmer light or another colour.",
         )
-    now = wall.astimezone()
-    then = now + timedelta(minutes=ceil(wait_s / 60))
+    now, minutes = wall.astimezone(), ceil(wait_s / 60)
+    then = now + timedelta(minutes=minutes)
     when = f"{then:%H:%M}" if then.date() == now.date() else f"{then:%H:%M on %Y-%m-%d}"
-    return LightLimit(
+    kind = LightDay if wait_s > LONGEST_REST_S else LightLimit
+    return kind(
         f"{name} has had {spent_j_per_cm2:.3g} of {stop_j_per_cm2:.3g} J/cm2; light is allowed again after {when}",
         f"Let this eye rest until {when}. The device must stay on: time counts only while it does.",
+        n=minutes,
     )
 
 

@@ -7,7 +7,7 @@ import { typedBy } from "./parts.js";
 import { cue, freshPicture, take, unlocked } from "./press.js";
 import { go } from "./routes.js";
 import { codeText } from "./screens/outcome.js";
-import { lower, raise } from "./states.js";
+import { dismiss, lower, raise } from "./states.js";
 import * as visits from "./visit.js";
 import { learn, t, today } from "./words.js";
 
@@ -137,8 +137,8 @@ const picture = {
 
 const ofState = {
   ok: ({ code }) => lower(code),
-  later: ({ code }) => lower(code),
-  dateIsRight: ({ code }) => lower(code),
+  later: dismiss,
+  dateIsRight: dismiss,
   retry: () => answers.refreshStatus(),
   useHere: async () => {
     const answer = await visits.politely(() => askForControls(true));

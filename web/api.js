@@ -48,6 +48,13 @@ export function send(method, path, { key = freshKey(), ...body } = {}) {
 export const askForControls = (take) =>
   send("POST", "/api/controller", take ? { key: controllerKey(), take } : { key: controllerKey() });
 
+/** Tell that this page closes; a browser sends this even when the page is gone. */
+export const letControlsGo = () =>
+  navigator.sendBeacon?.(
+    "/api/controller",
+    new Blob([JSON.stringify({ key: controllerKey(), release: true })], { type: "application/json" }),
+  );
+
 // Sixteen hex digits; crypto.randomUUID does not exist on plain http.
 export function freshKey() {
   return Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
@@ -67,9 +74,10 @@ function controllerKey() {
   return ownKey;
 }
 
-/** The next preview frame after number `after`, or null when none came; throws when the link is broken. */
-export async function getPreview(after, signal) {
-  const answer = await fetch(`/api/preview?after=${after}`, { cache: "no-store", signal });
+/** The next preview frame of an eye after number `after`, or null when none came; throws when the link is broken. */
+export async function getPreview(after, eye, signal) {
+  const headers = { "X-Controller": controllerKey() }; // the lamp shines for no stranger
+  const answer = await fetch(`/api/preview?after=${after}&eye=${eye}`, { cache: "no-store", headers, signal });
   if (answer.status === 204) return null;
   if (!answer.ok) throw new Error(`preview ${answer.status}`);
   return {

@@ -1,14 +1,14 @@
 // The page's story: where the person is, what the instrument tells, what is drawn. What a person can do stands in act.js.
 
 import { act, answers } from "./act.js";
-import { askForControls, EventLine, getProtocol, getStatus, Refusal } from "./api.js";
+import { askForControls, EventLine, getProtocol, getStatus, letControlsGo, Refusal } from "./api.js";
 import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
 import { get, set, store } from "./memory.js";
 import { cue, freshPicture, heardOfShots, lock, openPicture, settleShots, take } from "./press.js";
 import { follow, go } from "./routes.js";
-import { lower, raise } from "./states.js";
+import { lower, over, raise, stands } from "./states.js";
 import { render } from "./vendor/lit-html.js";
 import { finishWhenMade, politely, refreshList, refreshVisit, saveRest } from "./visit.js";
 import { learn, t, today } from "./words.js";
@@ -120,8 +120,10 @@ const heard = {
   aim: (aim) => heardAim(aim),
 
   /** What only tells begins, changes (`n`), or is over. */
-  notice({ code, over, ...more }) {
-    if (over) lower(code);
+  notice({ code, over: gone, ...more }) {
+    noticed += 1;
+    if (code === "link.other") holdControls(); // whose turn it is, the instrument says to each page by itself
+    else if (gone) over(code);
     else raise({ code, ...more, from: "notice" });
   },
 
@@ -133,7 +135,10 @@ const heard = {
 
 let sweptTold = false;
 
+let noticed = 0;
+
 async function refreshStatus() {
+  const before = noticed;
   let status;
   try {
     status = await getStatus();
@@ -146,6 +151,7 @@ async function refreshStatus() {
   lower(({ from, told }) => from === "status" && told !== problem?.code);
   // A live picture whose light was cut tells it by its age; the next one is on its way.
   if (problem && problem.code !== "light.cut") raise({ ...problem, told: problem.code, from: "status" });
+  if (noticed === before) stands(status.standing ?? []); // else it is older than what was just told
   settleShots();
   tellFindings(status.notices ?? []);
   if (status.swept?.length && !sweptTold) tellSwept(status.swept);
@@ -211,6 +217,9 @@ function heardAim(aim) {
   }
   if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
 }
+
+// A page that closes lets the next screen take pictures; one that only loads itself anew is back before anybody asks.
+addEventListener("pagehide", letControlsGo);
 
 act.heardAim = ({ detail }) => heardAim(detail);
 act.heardLate = ({ detail: seconds }) => {

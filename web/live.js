@@ -16,6 +16,7 @@ export class EyeLive extends HTMLElement {
   #active = false;
   #running = false;
   #head = null;
+  #eye = "OD"; // whose light it is
   #link = "opening";
   #bitmap = null;
   #number = 0;
@@ -57,6 +58,10 @@ export class EyeLive extends HTMLElement {
     this.#draw();
   }
 
+  set eye(eye) {
+    this.#eye = eye;
+  }
+
   set hint(hint) {
     if (hint === this.#hint) return;
     this.#hint = hint;
@@ -92,7 +97,7 @@ export class EyeLive extends HTMLElement {
     const patience = setTimeout(() => abort.abort(), ANSWER_MS);
     this.#abort = abort;
     try {
-      const frame = await getPreview(this.#number, abort.signal);
+      const frame = await getPreview(this.#number, this.#eye, abort.signal);
       if (!frame) this.#number = 0; // perhaps the server started anew while nobody looked, with small numbers
       if (!frame || !this.#active) return;
       this.#bitmap?.close();

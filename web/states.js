@@ -2,12 +2,12 @@
 // "state.CODE" (English master); what stops stands in the prompt bar and in the shutter ("stop.CODE"), what only tells is a chip.
 
 import { get, lostShots, set } from "./memory.js";
-import { has, t } from "./words.js";
+import { calendarDay, has, t } from "./words.js";
 
 const SAID_ALOUD = /^(link\.lost|light\.|heat\.)/;
 
 // Worst first. `stop`: no press while it stands. `tell`: a chip. `shot`: about one picture, on its card. `ask`: a question there.
-// `wait`: how long until it is over by itself; "n" means the n minutes that the instrument named.
+// `wait`: how long until it is over by itself; "n" means the n minutes that the instrument named. Its own `wait_s` goes first.
 const TABLE = [
   ["link.lost", "stop", []],
   ["link.other", "stop", ["useHere"]],
@@ -65,6 +65,7 @@ const SAME = {
   "calibration.mode": "cal.mismatch",
   "calibration.stale": "cal.mismatch",
   "head.mismatch": "cal.mismatch",
+  "technician.locked": "lock.idle",
 };
 
 // Stops that the server has and the table has not are as bad as a fault of the light; refusals without a fault only tell.
@@ -82,8 +83,31 @@ const filled = ({ eye, other, slot, ...vars }) => ({
   ...vars,
   ...(eye ? { eye: t(`eye.${eye}`) } : {}),
   ...(other ? { other: t(`eye.${other}.word`) } : {}),
+  ...(/^\d{4}-/.test(vars.date) ? { date: calendarDay(vars.date) } : {}),
   ...(slot ? { part: t(`field.${slot.split("-")[1] ?? slot}`) } : {}),
 });
+
+const putOff = new Set(); // what somebody has read and put away is not told again before it was over
+
+/** Somebody has read it: it stands no longer, on this page. */
+export function dismiss({ code }) {
+  putOff.add(code);
+  lower(code);
+}
+
+/** What the instrument says stands now, whole: whatever it told before and is not in here is over. */
+export function stands(all) {
+  const codes = new Set(all.map(({ code }) => code));
+  for (const code of putOff) if (!codes.has(code)) putOff.delete(code);
+  lower(({ from, level, code }) => from === "notice" && level !== "ask" && !codes.has(code));
+  for (const one of all) raise({ ...one, from: "notice" });
+}
+
+/** What the instrument told is over, and would be news if it came again. */
+export function over(code) {
+  putOff.delete(code);
+  lower(code);
+}
 
 /**
  * A state begins, or is told anew. `from` says who takes it back: "status" (gone when the next status has no problem),
@@ -91,8 +115,9 @@ const filled = ({ eye, other, slot, ...vars }) => ({
  */
 export function raise({ code: told, from, ...vars }) {
   const code = SAME[told] ?? told;
+  if (from === "notice" && putOff.has(code)) return;
   const known = STATES[code] ?? { ...UNKNOWN, code, level: from === "press" ? "refused" : "stop", rank: 3 };
-  const wait = known.wait_s === "n" ? vars.n * 60 : known.wait_s;
+  const wait = vars.wait_s ?? (known.wait_s === "n" ? vars.n * 60 : known.wait_s);
   const before = get().states.find((state) => state.code === code);
   const until = before?.until || (wait ? Date.now() + wait * 1000 : 0);
   const state = Object.freeze({ ...known, ...vars, code, from, until });

@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
+from device.recon.quality import LEAST_THROUGH
 from device.recon.verdict import (
     LEAST_COVERAGE,
-    LEAST_THROUGH,
     LEAST_WIDE,
     MOST_SATURATED,
     MOST_WIDE,

@@ -9,7 +9,8 @@ from device.recon.evidence import BINS, Evidence, PowerLaw
 from device.values import Geometry, Image
 
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
-ENOUGH_NATS = 0.005  # per frequency: noise alone stays below a tenth of it, a retina at 200 e- above ten times
+LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
+SURELY = 3.0  # standard errors
 FAINT_DN = 1e-9
 Series = NDArray[np.float64]
 
@@ -40,19 +41,20 @@ def cutoff(evidence: Evidence, law: PowerLaw, noise_dn2: float, n: int, geometry
     return Limit(per_px, 0.5 / per_deg * RETINA_UM_PER_DEG)
 
 
-def structure_nats(evidence: Evidence, seen: Series, levels: Series, noise_dn2: float) -> float:
-    """Q7: how much better the PSF's own speckle explains the spectrum than a smooth one, in nats per frequency.
+def structure(evidence: Evidence, seen: Series, levels: Series, noise_dn2: float) -> tuple[float, float]:
+    """Q7: how much better the PSF's own speckle explains the spectrum than a smooth one, and how sure that is.
 
-    Near zero where no light passed the diffuser (a lid, a hand), where nothing has structure, or where the PSF is not
-    this head's. The rival is the ring mean of what was seen: any smooth spectrum.
+    The first in nats per frequency, the second in its standard errors. Surely below zero where the PSF is not this
+    head's. Near zero says nothing: in little light the whole of a good picture is in the lowest frequencies, and their
+    share of all falls with the light. The rival is the ring mean of what was seen: any smooth spectrum.
     """
     rings = np.bincount(evidence.bins, minlength=BINS)
     smooth = (np.bincount(evidence.bins, seen, BINS) / np.maximum(rings, 1))[evidence.bins]
     smooth = np.maximum(smooth, FAINT_DN)
     model = evidence.power * levels[evidence.bins] + noise_dn2
-    rival = np.log(smooth) + seen / smooth
-    ours = np.log(model) + seen / model
-    return float((rival - ours).mean())
+    better = (np.log(smooth) + seen / smooth) - (np.log(model) + seen / model)
+    mean = float(better.mean())
+    return mean, mean * float(better.size) ** 0.5 / max(float(better.std()), FAINT_DN)
 
 
 def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
@@ -69,9 +71,11 @@ def complaints(quality: dict[str, float | None]) -> tuple[str, ...]:
     said = []
     if (quality["saturated"] or 0) > 0.001:
         said.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
-    nats = quality.get("structure_nats")
-    if nats is not None and nats < ENOUGH_NATS:
-        said.append("No eye was seen, or this is not this head's PSF. Centre the ring on the pupil.")
+    through = quality.get("through")
+    if through is not None and through < LEAST_THROUGH:
+        said.append("No eye was seen: the light came from everywhere. Centre the ring on the pupil.")
+    elif (sure := quality.get("structure_sure")) is not None and sure < -SURELY:
+        said.append("This is not this head's PSF. Calibrate the head, or give the PSF that belongs to the frame.")
     share = quality.get("coverage")
     if share is not None and share < 0.75:
         said.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")

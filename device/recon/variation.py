@@ -8,6 +8,7 @@ the noise that the evidence-prior Wiener filter would reject, so neither is chos
 the shading fit plus the Wiener solution of what that leaves, so eight rounds do what a hundred do from zero.
 """
 
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -77,13 +78,17 @@ class EvidenceWiener:
         self.facts = {
             "prior_slope": self.law.slope, "prior_log_power": self.law.log_power, "flat_dn": self.level,
             "background_dn": self.stray, "noise_dn": self.noise.variance_dn2(mean) ** 0.5, "mean_dn": mean,
-            "quality": self._quality(fit),
+            "quality": self._quality(fit, mean),
         }  # fmt: skip
 
-    def _quality(self, fit: Fit) -> dict[str, float | None]:
+    def _quality(self, fit: Fit, mean_dn: float) -> dict[str, float | None]:
         limit = quality.cutoff(self.evidence, fit.law, self.noise_dn2, self.model.grid.n, self.geometry)
+        nats, sure = quality.structure(self.evidence, fit.seen, fit.levels, self.noise_dn2)
         return {
-            "structure_nats": quality.structure_nats(self.evidence, fit.seen, fit.levels, self.noise_dn2),
+            "structure_nats": nats,
+            "structure_sure": sure,
+            "through": 1 - self.stray / mean_dn if mean_dn > 0 else None,
+            "coverage": None,
             "cutoff_per_px": limit.cycles_per_px,
             "resolution_um": limit.half_period_um,
         }
@@ -104,7 +109,8 @@ class EvidenceWiener:
         np.maximum(self.x, 0, out=out)
         out *= self.model.mask
         noise_dn = float(self.noise.variance_dn2(self.level) ** 0.5)
-        self.facts["quality"]["coverage"] = quality.coverage(out, self.model.mask, noise_dn)
+        if isfinite(self.model.grid.radius_samples):  # without a known field, nothing says where light should be
+            self.facts["quality"]["coverage"] = quality.coverage(out, self.model.mask, noise_dn)
 
 
 class Variation(EvidenceWiener):

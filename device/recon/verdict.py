@@ -12,10 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from device.errors import FrameError
 from device.recon.kernels import Pixels
 from device.recon.model import Model, field_radius_px, tight_model
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
+from device.recon.quality import LEAST_THROUGH
 from device.recon.reconstructor import plane
 from device.recon.variation import EvidenceWiener
 from device.values import Calibration, Image
@@ -23,7 +25,7 @@ from device.values import Calibration, Image
 Word = Literal["good", "again"]
 Code = Literal[
     "shot.saturated", "shot.dark", "shot.moved", "shot.noeye", "shot.pupil", "shot.blink", "shot.edge", "shot.halo",
-    "shot.poor",
+    "shot.poor", "make.failed",
 ]  # fmt: skip
 
 # Limits. How often they hit and how often they cry wolf is measured in tests/hard/test_verdict.py.
@@ -31,7 +33,6 @@ MOST_SATURATED = 0.001  # share of pixels, as in `quality.complaints`
 # `wide` of a saturated frame: too much light flattens its middle, a reflex, which is small, does not.
 LARGEST_SPOT, SPOT, SPOT_PER_SHARE = 0.15, 0.975, 0.6
 LEAST_E_PER_UM2 = 0.5  # a human eye's photon budget gives 3.0, and a PCC of 0.91; 0.3 gives 0.81, 0.1 gives 0.67
-LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 LEAST_COVERAGE = 0.9  # good fields have 0.975 and more
 LEAST_WIDE, MOST_WIDE = 0.93, 1.025  # good fields have 0.97 to 1.005
 ONE_SIDED = 0.1
@@ -136,7 +137,12 @@ class Gate:
         plain = Reading(saturated, light_e_per_um2=self._light(light_dn))
         if self._eye is None or saturated > HOPELESS or light_dn <= 0:
             return plain
-        return self._eye.read(plain, counts, dark)
+        try:
+            return self._eye.read(plain, counts, dark)
+        except FrameError:
+            if saturated <= MOST_SATURATED:
+                raise
+            return plain  # too few pixels are left, and why is known
 
     @property
     def picture(self) -> Image | None:

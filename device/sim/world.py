@@ -18,7 +18,9 @@ from device.spec import InstrumentSpec, OpticsSpec
 from device.values import Charge, Colour, Eye, Geometry, Glow, Identity, Image
 
 REFERENCE_C = 25.0  # where a scene's dark current is that of its file
-FAULTS = frozenset({"camera.missing", "camera.stalled", "camera.mode", "light.fault", "light.silent", "bus.silent"})
+FAULTS = frozenset({
+    "camera.missing", "camera.stalled", "camera.mode", "light.fault", "light.silent", "bus.silent", "eye.closed",
+})  # fmt: skip
 
 Choice = Callable[[Scene], tuple[Decision, ...]]
 
@@ -31,7 +33,8 @@ class World:
     stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it, and it
     moves by `shake_px` columns and back from one frame to the next.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "camera.mode" (it gives every other pixel),
-    "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent".
+    "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent", "eye.closed" (a
+    lid, or no eye at all: the lamp's light comes back from everywhere alike).
     """
 
     def __init__(
@@ -137,7 +140,10 @@ class World:
         glow = self.glow  # once: a guard may darken the lamp at any moment
         if glow is None:
             return np.broadcast_to(always_e, self.shape)
-        return self.electrons_per_s(glow.colour) * np.float32(glow.level * exposure_s) + always_e
+        returned: Image | float = self.electrons_per_s(glow.colour)
+        if self.broken("eye.closed"):
+            returned = np.full(self.shape, np.mean(returned), np.float32)
+        return returned * np.float32(glow.level * exposure_s) + always_e
 
     @property
     def dark_e_per_s(self) -> float:

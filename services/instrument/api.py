@@ -1,10 +1,9 @@
 """The HTTP face of the instrument: what DESIGN.md fixes, errors in one table, and the page itself."""
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -12,7 +11,7 @@ from typing import Annotated, Any, Self
 from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, Response
 from fastapi import Path as InPath
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
@@ -49,7 +48,6 @@ from device.errors import (
     StickFull,
     StickGone,
     StoreDamaged,
-    StoreError,
     StoreFull,
     TechnicianLocked,
     TooHot,
@@ -65,6 +63,8 @@ from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
+from services.instrument.live_api import live_routes
+from services.instrument.notices import Notices, is_old
 from services.instrument.owner import Owner
 from services.instrument.page import page
 from services.instrument.promised import Promised
@@ -74,7 +74,6 @@ from services.instrument.visits_api import NAME, exports_router, visits_router
 from services.instrument.wellbeing import facts
 from services.records.people import People
 from services.records.protocol import Protocol, load_protocol
-from services.records.store import Store
 
 STATUS: dict[type[DiffuscopeError], int] = {
     NotKept: 404,
@@ -128,11 +127,16 @@ LARGEST_BODY_BYTES = 10_000
 
 
 class Refusal(BaseModel):
-    """Why something was not done: a code for the log, what happened, and what to do, in plain words."""
+    """Why something was not done: a code for the log, what happened, and what to do, in plain words.
+
+    `n` (minutes to wait) and `wait_s` are there where they are known.
+    """
 
     code: str
     message: str
     remedy: str
+    n: int | None = None
+    wait_s: float | None = None
 
 
 class Press(BaseModel):
@@ -162,16 +166,20 @@ def create_app(
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
     lease, promised = Lease(clock), Promised()
+    notices = Notices(owner, people, lease)
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
+        notices.begin()
         yield
+        notices.close()
         owner.house.bulletin.close()
 
     app = FastAPI(
         title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
         docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
+    app.state.notices = notices
     _words_for_errors(app)
     app.add_middleware(OwnPageOnly, names=own_names() if names is None else names, answer=refusal)
     app.add_middleware(SafeHeaders)
@@ -179,8 +187,8 @@ def create_app(
     _captures(app, owner, people, promised, only_one)
     app.include_router(visits_router(people, lease, promised), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
-    _state(app, owner, people, lease)
-    _live(app, owner)
+    _state(app, owner, people, notices)
+    live_routes(app, owner, shown)
     technician_routes(app, owner, door, rooms)
     page(app)
     return app
@@ -204,9 +212,11 @@ def refusal(error: DiffuscopeError) -> JSONResponse:
     return JSONResponse(words(error), status)
 
 
-def words(error: DiffuscopeError) -> dict[str, str]:
+def words(error: DiffuscopeError) -> dict[str, Any]:
     """What happened and what to do, as the page shows it."""
-    return {"code": error.code, "message": error.message, "remedy": error.remedy}
+    return Refusal(
+        code=error.code, message=error.message, remedy=error.remedy, n=error.n, wait_s=error.wait_s
+    ).model_dump(exclude_none=True)
 
 
 def _words_for_errors(app: FastAPI) -> None:
@@ -225,7 +235,7 @@ def _words_for_errors(app: FastAPI) -> None:
     async def _(request: Request, error: HTTPException) -> JSONResponse:
         message = f"{request.method} {request.url.path}: {error.detail}"
         answer = Refusal(code=f"http.{error.status_code}", message=message, remedy="Go back to the page.")
-        return JSONResponse(answer.model_dump(), error.status_code, error.headers)
+        return JSONResponse(answer.model_dump(exclude_none=True), error.status_code, error.headers)
 
     @app.exception_handler(Exception)  # answered outside every middleware, and then logged by the server
     async def _(request: Request, _: Exception) -> JSONResponse:
@@ -318,7 +328,7 @@ def _captures(app: FastAPI, owner: Owner, people: People, promised: Promised, on
         return Response(content, media_type=MEDIA[Path(name).suffix])
 
 
-def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
+def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None:
     store = owner.house.store
 
     @app.get("/api/status")
@@ -330,10 +340,11 @@ def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
             "name": spec.name, "kind": kind_of(spec), "state": owner.state,
             "shape": head.camera.shape if head is not None else (spec.camera.rows, spec.camera.cols),
             "field_px": 2 * radius_px if radius_px < float("inf") else None, "version": app.version,
-            "swept": store.swept, "space_left": store.space_left(),
-            "people_left": store.people_left(len(people.protocol.slots)), "controller": lease.holder,
+            "swept": [asdict(one) for one in notices.lost()], "space_left": store.space_left(),
+            "people_left": store.people_left(len(people.protocol.slots)), "controller": notices.lease.holder,
             "problem": words(problem) if problem else None,
-            "notices": [one.remedy for one in owner.findings if not one.ok],
+            "standing": [{"code": code, **facts} for code, facts in notices.standing().items()],
+            "notices": [one.remedy for one in owner.findings if not one.ok and not is_old(one)],
         }  # fmt: skip
 
     @app.get("/api/health")
@@ -346,37 +357,3 @@ def _state(app: FastAPI, owner: Owner, people: People, lease: Lease) -> None:
             "battery": known.battery if isinstance(known.battery, float) else None, "checks": as_json(checks),
             "calibration": shown_findings(owner.findings),
         }  # fmt: skip
-
-
-def _live(app: FastAPI, owner: Owner) -> None:
-    @app.get("/api/preview")
-    def preview(after: int = Query(0, ge=0)) -> Response:
-        """The next live picture after number `after`; 204 when none comes in 2 s."""
-        live = owner.preview(after)
-        if live is None:
-            return Response(status_code=204)
-        age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
-        told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
-        return Response(live.jpeg, media_type="image/jpeg", headers=told)
-
-    @app.get("/api/events")
-    async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:
-        """What happens, as server-sent events, with a heartbeat every second."""
-
-        async def lines() -> AsyncIterator[str]:
-            async for event in owner.house.bulletin.follow(last_event_id):
-                if event.kind == "kept":
-                    if (capture := _still_kept(owner.house.store, event.data["id"])) is None:
-                        continue
-                    event = replace(event, data=shown(capture))
-                yield event.as_sse()
-
-        return StreamingResponse(lines(), media_type="text/event-stream")
-
-
-def _still_kept(store: Store, id: str) -> Capture | None:
-    """A kept capture; None if it has been damaged since, because the news after it must arrive all the same."""
-    try:
-        return store.get(id)
-    except StoreError:
-        return None

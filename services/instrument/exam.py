@@ -8,7 +8,7 @@ Every way out of the story leaves the lamp dark.
 import json
 import logging
 import secrets
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
@@ -17,24 +17,26 @@ from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
-from device.errors import Busy, DiffuscopeError, LightFault
+from device.errors import Busy, DiffuscopeError, FrameError, LightFault, StoreError
 from device.head import Head
 from device.recon.focus import sharpest
-from device.recon.model import field_box
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.sequence import lit
-from device.values import EYES, Calibration, Capture, Eye, Frame, Glow, Image, Reconstruction, Shot
+from device.values import EYES, Calibration, Capture, Eye, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
-from services.instrument.filing import QUICK_PX, as_json, capture_files
+from services.instrument.exposing import expose, eye_in
+from services.instrument.filing import QUICK_PX, as_json, capture_files, unmade
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
 from services.instrument.pace import BUDGET_S, LAST_S, SEATS
-from services.instrument.press import Exposed, Press, Preview
+from services.instrument.press import Exposed, Keys, Press, Preview
+from services.instrument.progress import Progress
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.errand import NO_ERRAND, Errand
 from services.records.store import Store
+from services.records.underway import Lost, Underway
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +45,6 @@ PREVIEW_PX = 480
 RETRY_S = 1.0
 LIVE_S = 0.4  # while a picture is refined, pages hear this often how far it is, and who aims sees a live picture
 WANTED_S = 3.0  # the preview goes on this long after somebody last asked for it, then the lamp rests
-REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
 
 class Exam:
@@ -68,10 +69,13 @@ class Exam:
         self._exposing = self._closing = self._ended = False
         self._exposed: deque[Exposed] = deque()
         self._in_the_making = 0
-        self._wanted_until_s, self._alive_s, self._took_s = 0.0, 0.0, budget_s()
+        self._wanted_until_s = self._alive_s = 0.0
+        self._aimed: tuple[Eye, ...] = EYES
         self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
-        self._pressed: OrderedDict[str, Future[Capture]] = OrderedDict()
+        self._pressed = Keys()
+        self.progress = Progress(bulletin, clock, head.spec.camera.exposure_s, budget_s)
+        self.underway = Underway(store)
         self.fitness = Fitness(head, store, bulletin, clock, lambda: self._press is not None or self._closing)
         self._owner = Thread(target=self._own_the_head, name="head", daemon=True)
         self._owner.start()
@@ -97,8 +101,8 @@ class Exam:
         The same `key` again gives the same picture, however often the network repeats the request.
         """
         with self._turn:
-            if key is not None and key in self._pressed:
-                return self._pressed[key]
+            if (known := self._pressed.known(key)) is not None:
+                return known
             if self._closing or self._ended:
                 raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
             if self._is_busy():
@@ -109,15 +113,17 @@ class Exam:
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
             self._in_the_making += 1
             if key is not None:
-                self._pressed[key] = future
-                while len(self._pressed) > REMEMBERED:
-                    self._pressed.popitem(last=False)
+                self._pressed.remember(key, future)
             self._turn.notify_all()
         return future
 
-    def preview(self, after: int, wait_s: float = 2.0) -> Preview | None:
-        """The next live picture after number `after`; None when none comes in `wait_s`."""
+    def preview(self, after: int, wait_s: float = 2.0, eyes: tuple[Eye, ...] = EYES) -> Preview | None:
+        """The next live picture after number `after`, whose light counts for `eyes`; None when none comes in `wait_s`.
+
+        For both while nobody knows which eye looks.
+        """
         with self._turn:
+            self._aimed = eyes
             self._wanted_until_s = self.clock.now_s() + WANTED_S
             self._turn.notify_all()
             self._turn.wait_for(lambda: self._preview.number > after or self._closing, wait_s)
@@ -177,7 +183,7 @@ class Exam:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
         if len(calibration.psfs) == 1:
             return 0
-        frame, _ = self._expose(EYES)
+        frame, _ = expose(self.head, EYES)
         return sharpest(calibration, frame.counts, planner)[0]
 
     def _end(self) -> None:
@@ -212,12 +218,13 @@ class Exam:
             self._wanted_until_s = 0.0  # aiming is over; who aims on will ask, and the lamp shines for nobody else
         assert press is not None
         self._tell_state()
-        with self._answering(press):
-            taken_at = self.clock.wall()
-            id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
-            self._tell_stage(press, id, "expose", 0.1)
+        taken_at = self.clock.wall()
+        id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
+        with self._answering(press, id):
+            self.underway.begin(Lost(id, press.eye, press.errand.visit, press.errand.slot, press.errand.tries))
+            self._tell_stage(press, id, "expose")
             begin_s = self.clock.now_s()
-            frame, dark = self._expose((press.eye,))
+            frame, dark = expose(self.head, (press.eye,))
             exposed = press, id, taken_at, frame, dark, self.clock.now_s() - begin_s
             verdict = self._eyes.judge(id, frame.counts, dark.counts, begin_s)
             self._exposed.append(Exposed(*exposed, light=self.head.light.account(), verdict=verdict))
@@ -227,21 +234,23 @@ class Exam:
     def _develop(self) -> None:
         """Make and keep the picture of the oldest exposure."""
         shot = self._exposed.popleft()
-        with self._answering(shot.press):
+        with self._answering(shot.press, shot.id):
             kept = self._make(shot)
+            self._over(shot.id, kept=True)
             self._report_problem(None)
             self._leave(shot.press)
             shot.press.answer.set_result(kept)
         self._quick.pop(shot.id, None)
 
     @contextmanager
-    def _answering(self, press: Press) -> Iterator[None]:
+    def _answering(self, press: Press, id: str) -> Iterator[None]:
         """Whatever happens to a press, the lamp is dark after it, and whoever waits for it hears."""
         try:
             yield
         except DiffuscopeError as error:
             log.warning("press failed: %s", error, extra={"code": error.code})
-            self.bulletin.tell("failed", code=error.code, message=error.message, remedy=error.remedy)
+            self.bulletin.tell("failed", id=id, code=error.code, message=error.message, remedy=error.remedy)
+            self._over(id, kept=False)
             self._leave(press)
             press.answer.set_exception(error)
         except BaseException:
@@ -250,6 +259,12 @@ class Exam:
             raise
         finally:
             self.head.light.off()
+
+    def _over(self, id: str, kept: bool) -> None:
+        """Whatever became of a press, it is under way no longer."""
+        self.progress.over(id, kept)
+        with suppress(StoreError):  # then a restart believes that it was lost, and asks for it again
+            self.underway.end(id)
 
     def _leave(self, press: Press) -> None:
         """The press gives its seat to another."""
@@ -261,7 +276,11 @@ class Exam:
     def _make(self, shot: Exposed) -> Capture:
         """The rest of the story, which needs no eye."""
         budget_s = self._budget_s()
-        made = self._reconstruct(shot, budget_s)
+        try:
+            made = self._reconstruct(shot, budget_s)
+        except FrameError as error:  # light was spent for it: the shot is kept all the same
+            log.warning("no picture could be made of it: %s", error, extra={"code": error.code, "about": shot.id})
+            made = unmade(shot.frame, error)
         verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
         report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
         report["budget_s"] = budget_s
@@ -269,29 +288,17 @@ class Exam:
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
-        self._tell_stage(shot.press, shot.id, "keep", 0.9)
-        kept = self.store.keep(capture, self._files(shot, capture, made), shot.press.errand.beside)
+        self._tell_stage(shot.press, shot.id, "keep")
+        shown, quick = eye_in(made.picture, self.head), self._quick.get(shot.id)
+        files = capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, quick)
+        kept = self.store.keep(capture, files, shot.press.errand.beside)
         self.bulletin.tell("kept", id=shot.id)
         took_s = sum(report["seconds"].values())
         log.info("a picture was kept after %.1f s, made by %s", took_s, report["method"], extra={"about": shot.id})
         self.fitness.kept(kept)
         return kept
 
-    def _expose(self, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
-        """A lit frame and a dark one, if the head is well; the light counts for these eyes."""
-        self.head.check()
-        camera, light, exposure_s = self.head.camera, self.head.light, self.head.spec.camera.exposure_s
-        camera.prepare(Shot(exposure_s))
-        try:
-            with light.on(Glow(self.head.spec.light.colour), eyes):
-                frame = lit(camera.expose(Shot(exposure_s)))
-            return frame, camera.expose(Shot(exposure_s))
-        finally:
-            light.off()
-
     def _reconstruct(self, shot: Exposed, budget_s: float) -> Reconstruction:
-        begin_s = self._alive_s = self.clock.now_s()
-
         def show(stage: Stage) -> None:
             if not stage.last:
                 self._show_quick(shot, stage.picture)
@@ -301,20 +308,19 @@ class Exam:
             if self._press is not None and not self._closing:
                 self._let_in()
             elif self.clock.now_s() - self._alive_s > LIVE_S:
-                self._show_life(shot, self.clock.now_s() - begin_s)
+                self._show_life(shot)
 
-        made = self._reconstructor(
+        self._alive_s = self.clock.now_s()
+        return self._reconstructor(
             shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated,
             deadline=Deadline.after(self.clock, budget_s), watch=show, between=between,
         )  # fmt: skip
-        self._took_s = max(LIVE_S, self.clock.now_s() - begin_s)
-        return made
 
-    def _show_life(self, shot: Exposed, gone_s: float) -> None:
-        """Between two rounds: pages hear how far it is, by what the last picture took; who aims sees a live picture."""
-        self._alive_s, left_s = self.clock.now_s(), max(0.0, self._took_s - gone_s)
-        self._tell_stage(shot.press, shot.id, "refine", 0.9 - 0.5 * left_s / self._took_s, left_s=left_s)
-        if self.clock.now_s() < self._wanted_until_s:
+    def _show_life(self, shot: Exposed) -> None:
+        """Between two rounds: pages hear how far it is, and who aims sees a live picture."""
+        self._alive_s = self.clock.now_s()
+        self.progress.goes_on(shot.press, shot.id)
+        if self._alive_s < self._wanted_until_s:
             self._look()
 
     def _let_in(self) -> None:
@@ -322,22 +328,15 @@ class Exam:
         self._answer()
         if self._exposed:
             shot = self._exposed.pop()
-            with self._answering(shot.press):
-                quick = self._reconstructor(shot.frame.counts, shot.dark.counts, quick=True)
-                self._show_quick(shot, self._eye(quick.picture))
+            with self._answering(shot.press, shot.id):
+                with suppress(FrameError):  # its own turn will say so
+                    quick = self._reconstructor(shot.frame.counts, shot.dark.counts, quick=True)
+                    self._show_quick(shot, eye_in(quick.picture, self.head))
                 self._exposed.append(shot)
 
     def _show_quick(self, shot: Exposed, image: Image) -> None:
         self._quick[shot.id] = picture.to_jpeg(image, QUICK_PX, shot.frame.simulated)
-        self._tell_stage(shot.press, shot.id, "quick", 0.4, url=f"/api/captures/{shot.id}/quick.jpg")
-
-    def _files(self, shot: Exposed, capture: Capture, made: Reconstruction) -> dict[str, bytes]:
-        shown = self._eye(made.picture)
-        return capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, self._quick.get(capture.id))
-
-    def _eye(self, image: Image) -> Image:
-        """The part of a picture that people look at: the illuminated field."""
-        return image[field_box(self.head.calibration, self.head.camera.shape)]
+        self._tell_stage(shot.press, shot.id, "quick", f"/api/captures/{shot.id}/quick.jpg")
 
     def _look(self) -> None:
         """One live picture; what goes wrong is shown, and tried again a second later."""
@@ -366,7 +365,7 @@ class Exam:
         spec = self.head.spec
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
-            with self.head.light.on(Glow(spec.light.preview_colour)):
+            with self.head.light.on(Glow(spec.light.preview_colour), self._aimed):
                 exposed_s = self.clock.now_s()
                 frame = lit(self.head.camera.expose(Shot(spec.camera.preview_exposure_s)))
         finally:
@@ -376,7 +375,7 @@ class Exam:
             return None
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)
         made = self._live(frame.counts, simulated=frame.simulated, deadline=deadline, quick=True)
-        jpeg = picture.to_jpeg(self._eye(made.picture), PREVIEW_PX, made.simulated)
+        jpeg = picture.to_jpeg(eye_in(made.picture, self.head), PREVIEW_PX, made.simulated)
         aim = self._eyes.aim(frame.counts, exposed_s)
         return Preview(self._preview.number + 1, jpeg, exposed_s, aim), dark_s
 
@@ -393,8 +392,6 @@ class Exam:
             self.bulletin.tell("state", state=self._told)
             self._watchdog.status(self._told)
 
-    def _tell_stage(self, press: Press, id: str, stage: str, fraction: float, **more: object) -> None:
-        """How far a picture is; it says whose press it is, for no page may take another's picture for its own."""
+    def _tell_stage(self, press: Press, id: str, stage: str, url: str | None = None) -> None:
         self._watchdog.beat()
-        more = {"left_s": 0.0, "url": None, "key": press.key} | more | press.errand.facts
-        self.bulletin.tell("stage", id=id, stage=stage, fraction=fraction, **more)
+        self.progress.stage(press, id, stage, url)

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from device.values import Capture, Frame, Image
+from device.errors import DiffuscopeError
+from device.values import Capture, Frame, Image, Reconstruction, Report
 from services.records import picture
 
 QUICK_PX = 640
+UNMADE = "none"  # in place of the method, in the report of a shot whose picture could not be made
 
 
 def capture_files(
@@ -31,6 +33,12 @@ def capture_files(
         "quick.jpg": quick or picture.to_jpeg(shown, QUICK_PX, capture.simulated),
         "report.json": as_json(capture.report | {"simulated": capture.simulated}),
     }
+
+
+def unmade(frame: Frame, error: DiffuscopeError) -> Reconstruction:
+    """What is kept of a shot whose picture could not be made: the frame itself, as the sensor saw it, and why."""
+    report = Report(method=UNMADE, rounds=0, stopped=error.code, warnings=(error.message,))
+    return Reconstruction(frame.counts.astype(np.float32), report, frame.simulated)
 
 
 def as_json(data: dict[str, Any]) -> bytes:

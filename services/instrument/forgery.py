@@ -1,4 +1,9 @@
-"""Who may ask: requests by the instrument's own names, and changes from its own page or from no page at all."""
+"""Who may ask: requests by the instrument's own names, and changes and light for its own page or no page at all.
+
+A live picture is a GET that makes the lamp shine, and any page in the world may hold an <img> with its address. So
+whoever asks must be known: by `Sec-Fetch-Site`, which browsers write themselves (over https, or at this computer), or
+by `X-Controller`, which no foreign page can write without being asked first whether it may.
+"""
 
 import ipaddress
 import socket
@@ -12,6 +17,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from device.errors import DiffuscopeError, Forged, WrongHost
 
 SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+SHINING = frozenset({"/api/preview"})
+OWN = frozenset({"same-origin", "none"})  # `none`: a person typed the address
 Answer = Callable[[DiffuscopeError], Response]
 
 
@@ -33,7 +40,14 @@ class OwnPageOnly:
             return WrongHost(f"{host[:80]!r} is not a name of this camera")
         if scope["method"] not in SAFE and origin is not None and _authority(origin) != (host or "").lower():
             return Forged(f"a page of {origin[:80]!r} asked for a change")
+        if scope["path"] in SHINING and not _is_known(headers):
+            return Forged("nobody knows which page asked for light", "Open the camera's own page to aim.")
         return None
+
+
+def _is_known(headers: Headers) -> bool:
+    site = headers.get("sec-fetch-site")
+    return "x-controller" in headers if site is None else site in OWN
 
 
 def is_own(host: str, names: frozenset[str]) -> bool:

@@ -2,15 +2,18 @@
 
 from dataclasses import asdict
 
+from device.errors import FrameError
 from device.recon.aim import Aim, Aimer
 from device.recon.kernels import Pixels
 from device.recon.plan import Planner
 from device.recon.verdict import Gate, Verdict, after, judge
 from device.values import Calibration, Report
 from services.instrument.bulletin import Bulletin
+from services.instrument.filing import UNMADE
 from services.records.errand import Errand
 
 NOWHERE = Aim("noeye", 0.0)
+FAILED = Verdict("again", "make.failed", {})
 
 
 class Watch:
@@ -34,10 +37,16 @@ class Watch:
 
     def judge(self, id: str, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
         """Whether a frame is good, from its raw counts, told to pages before anything is made of it."""
-        return self._say(id, judge(self._gate(counts, dark), self._aimer.saw_an_eye(begin_s)))
+        try:
+            reading = self._gate(counts, dark)
+        except FrameError:  # of another shape than the calibration, or with no pixel that is good
+            return self._say(id, FAILED)
+        return self._say(id, judge(reading, self._aimer.saw_an_eye(begin_s)))
 
     def judge_again(self, id: str, first: Verdict, report: Report, errand: Errand) -> Verdict:
         """The last word, when the picture is made; pages are told if it is another."""
+        if report.method == UNMADE and first.code is None:
+            first = FAILED
         again = after(first, report.residual, report.quality.get("coverage"), errand.tries, errand.retakes)
         return again if (again.word, again.code) == (first.word, first.code) else self._say(id, again)
 

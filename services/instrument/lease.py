@@ -8,6 +8,7 @@ from device.clock import Clock
 from device.errors import OtherScreen
 
 LASTS_S = 10.0
+RELOAD_S = 2.0  # a page that leaves may only be loading itself anew
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,10 @@ class Held:
 
 
 class Lease:
-    """Held by a screen's secret key, known to others by a name made from it; ends 10 s after its last request."""
+    """Held by a screen's secret key, known to others by a name made from it; ends 10 s after its last request.
+
+    Sooner where it was let go.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self._clock, self._lock = clock, Lock()
@@ -38,6 +42,13 @@ class Lease:
             if mine:
                 self._hold(key)
             return Held(_name(self._key), mine)
+
+    def release(self, key: str) -> Held:
+        """This screen closes: whoever asks may have it a moment later, unless it is back by then."""
+        with self._lock:
+            if self._is_live() and key == self._key:
+                self._until_s = min(self._until_s, self._clock.now_s() + RELOAD_S)
+            return Held(_name(self._key), False)
 
     def touch(self, key: str) -> None:
         """A request of this screen: if it holds the lease, that goes on."""

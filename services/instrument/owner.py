@@ -13,6 +13,7 @@ from device.clock import Clock
 from device.errors import Busy, CalibrationError, DiffuscopeError, HeadMismatch
 from device.head import Bench, Head, refuse_recording
 from device.spec import CalibrationTable, InstrumentSpec
+from device.values import EYES, Eye
 from services.instrument.bulletin import Bulletin
 from services.instrument.calibrating import Wish
 from services.instrument.exam import Exam
@@ -92,17 +93,22 @@ class Owner:
         return "idle" if self._exam is not None and self._exam.ready.is_set() else "starting"
 
     @property
+    def exam_now(self) -> Exam | None:
+        """The exam, while it has the head."""
+        return self._exam
+
+    @property
     def head(self) -> Head | None:
         """The head as the exam has it; None while it does not."""
         return self._exam.head if self._exam is not None else None
 
-    def preview(self, after: int) -> Preview | None:
+    def preview(self, after: int, eyes: tuple[Eye, ...] = EYES) -> Preview | None:
         """The exam's next live picture; while it does not have the head, none ever comes."""
         exam = self._exam
         if exam is None:
             self.house.clock.sleep(NO_PREVIEW_S)
             return None
-        return exam.preview(after)
+        return exam.preview(after, eyes=eyes)
 
     def quick(self, id: str) -> bytes | None:
         """The quick look of a press under way."""

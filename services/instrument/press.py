@@ -1,5 +1,6 @@
 """What travels through the exam: a live picture, a press, and a press whose light is done."""
 
+from collections import OrderedDict
 from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import datetime
@@ -8,6 +9,8 @@ from device.recon.aim import Aim
 from device.recon.verdict import Verdict
 from device.values import Capture, Eye, Frame
 from services.records.errand import Errand
+
+REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
 
 @dataclass(frozen=True)
@@ -42,3 +45,20 @@ class Exposed:
     expose_s: float
     light: dict[str, object]
     verdict: Verdict
+
+
+class Keys:
+    """The last presses by the names that pages gave them; whoever uses it holds the exam's turn."""
+
+    def __init__(self) -> None:
+        self._answers: OrderedDict[str, Future[Capture]] = OrderedDict()
+
+    def known(self, key: str | None) -> Future[Capture] | None:
+        """The answer to a press with this key, if there was one lately."""
+        return None if key is None else self._answers.get(key)
+
+    def remember(self, key: str, answer: Future[Capture]) -> None:
+        """From now on this key is that press."""
+        self._answers[key] = answer
+        while len(self._answers) > REMEMBERED:
+            self._answers.popitem(last=False)

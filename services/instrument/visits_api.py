@@ -68,9 +68,10 @@ class Away(Order):
 
 
 class Asking(Order):
-    """A screen that wants to take pictures; `take`: even if another does."""
+    """A screen that wants to take pictures; `take`: even if another does; `release`: it closes, and wants no more."""
 
     take: bool = False
+    release: bool = False
 
 
 def visits_router(people: People, lease: Lease, promised: Promised) -> APIRouter:
@@ -86,8 +87,8 @@ def visits_router(people: People, lease: Lease, promised: Promised) -> APIRouter
 
     @router.post("/api/controller")
     def controller(asking: Asking) -> dict[str, Any]:
-        """Ask for the right to take pictures, or take it from another screen."""
-        held = lease.ask(asking.key, asking.take)
+        """Ask for the right to take pictures, take it from another screen, or let it go."""
+        held = lease.release(asking.key) if asking.release else lease.ask(asking.key, asking.take)
         return {"lease": held.lease, "mine": held.mine}
 
     return router

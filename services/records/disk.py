@@ -34,11 +34,12 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """Make a new folder holding `files`, all of it on the disk when this returns (the folder's own name is not yet)."""
     folder.mkdir()
     for name, content in files.items():
-        _write_file(folder / name, content)
+        write_file(folder / name, content)
     settle(folder)
 
 
-def _write_file(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes) -> None:
+    """Write a new file, on the disk when this returns (its name is not yet)."""
     with path.open("xb") as file:
         file.write(content)
         file.flush()

@@ -12,7 +12,20 @@ from alembic import command
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import REAL, URL, CheckConstraint, Connection, Engine, ForeignKey, Index, Text, create_engine, event
+from sqlalchemy import (
+    REAL,
+    URL,
+    CheckConstraint,
+    Connection,
+    Engine,
+    ForeignKey,
+    Index,
+    Integer,
+    Text,
+    create_engine,
+    event,
+    literal_column,
+)
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
@@ -54,6 +67,9 @@ class CaptureRow(Shelf):
         Index("captures_by_time", "taken_at", "id"),
         {"sqlite_strict": True},
     )
+
+
+KEPT = literal_column("captures.rowid", Integer)  # grows with each capture that is kept, as no date does
 
 
 class FileRow(Shelf):

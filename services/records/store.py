@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from sqlalchemy import distinct, func, select, tuple_
+from sqlalchemy import distinct, func, select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
@@ -110,15 +110,17 @@ class Store:
         return capture
 
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
-        """The newest captures, newest first; with `before`, those older than the capture of that name (NotKept)."""
+        """The newest captures, newest first; with `before`, those kept before the capture of that name (NotKept).
+
+        In the order in which they were kept, whatever the date was set to meanwhile.
+        """
         if limit < 1:
             raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
-        when = (CaptureRow.taken_at, CaptureRow.id)
-        query = select(CaptureRow).order_by(*(column.desc() for column in when)).limit(limit)
+        query = select(CaptureRow).order_by(schema.KEPT.desc()).limit(limit)
         with self._reading() as session:
             if before is not None:
-                row = _row(session, before)
-                query = query.where(tuple_(*when) < tuple_(row.taken_at, row.id))
+                known = select(schema.KEPT).where(CaptureRow.id == _row(session, before).id)
+                query = query.where(session.scalars(known).one() > schema.KEPT)
             return [schema.capture_of(row) for row in session.scalars(query)]
 
     def get(self, id: str) -> Capture:

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from device.errors import NotKept
 from services.records.protocol import Protocol
-from services.records.schema import CaptureRow, FieldRow, IdentifierRow, ShotRow, SlotRow, VisitRow
+from services.records.schema import KEPT, CaptureRow, FieldRow, IdentifierRow, ShotRow, SlotRow, VisitRow
 from services.records.visit import Decided, Outcome, SlotState, Taken, Visit
 
 _ID = re.compile(r"[0-9A-Za-z-]{1,60}", re.ASCII)
@@ -85,7 +85,7 @@ def _taken(session: Session, ids: Sequence[str]) -> dict[Pair, list[Taken]]:
         select(ShotRow.visit, ShotRow.slot, ShotRow.capture, verdict)
         .join(CaptureRow, CaptureRow.id == ShotRow.capture)
         .where(ShotRow.visit.in_(ids))
-        .order_by(CaptureRow.taken_at, CaptureRow.id)
+        .order_by(KEPT)
     )
     out: dict[Pair, list[Taken]] = defaultdict(list)
     for visit, slot, capture, thought in session.execute(query):

@@ -77,7 +77,8 @@ class Stub:
     kind: str = "simulated"
     problem: dict[str, str] | None = None
     notices: list[str] = field(default_factory=list)
-    swept: list[str] = field(default_factory=list)
+    standing: dict[str, dict[str, Any]] = field(default_factory=dict)  # what `notice` told, and is not over
+    swept: list[dict[str, Any]] = field(default_factory=list)
     refuse: tuple[int, dict[str, str]] | None = None
     warnings: list[str] = field(default_factory=list)
     busy: bool = False
@@ -97,6 +98,10 @@ class Stub:
         vars(self).update(vars(Stub()))
 
     def tell(self, kind: str, data: dict[str, Any]) -> None:
+        if kind == "notice" and data.get("over"):
+            self.standing.pop(data["code"], None)
+        elif kind == "notice" and data["code"] != "eye.side":
+            self.standing[data["code"]] = data
         self.events.append((kind, data))
 
     async def release(self, what: str) -> None:
@@ -197,10 +202,14 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
-                "controller": stub.controller and "a public name", "notices": stub.notices}  # fmt: skip
+                "controller": stub.controller and "a public name", "notices": stub.notices,
+                "standing": list(stub.standing.values())}  # fmt: skip
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:
+        if wish.get("release") and stub.controller == wish["key"]:
+            stub.controller = None
+            return {"lease": "a public name", "mine": False}
         if stub.controller is None or wish.get("take"):
             stub.controller = wish["key"]
         return {"lease": "a public name", "mine": stub.controller == wish["key"]}

@@ -48,11 +48,17 @@ CAUSES = ["saturated", "dark", "pupil", "moved", "blink", "noeye", "edge", "halo
 
 
 def tell(stub: Stubbed, page: Page, code: str, **more: Any) -> None:
-    stub.stub.tell("notice", {"code": code, **NUMBERS, **more})
+    if code == "link.other":
+        stub.stub.controller = "another screen"
+        stub.stub.events.append(("notice", {"code": code}))
+    else:
+        stub.stub.tell("notice", {"code": code, **NUMBERS, **more})
     page.locator(f"[data-code='{code}']").wait_for()
 
 
 def over(stub: Stubbed, page: Page, code: str) -> None:
+    if code == "link.other":
+        stub.stub.controller = None
     stub.stub.tell("notice", {"code": code, "over": True})
     expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
 
@@ -174,7 +180,7 @@ def test_power_that_went_off_names_the_eye_and_goes_there(open_page: Open, stub:
 
 
 def test_old_sweepings_are_told_without_names(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.swept = ["a", "b"]
+    stub.stub.swept = [{"id": name, "eye": None, "visit": None, "slot": None, "tries": 0} for name in "ab"]
     page = open_page(stub.url)
     expect(page.locator("[data-code='power.lost']")).to_contain_text("Power went off during 2 pictures.")
     page.get_by_role("button", name="OK").tap()

@@ -14,6 +14,7 @@ from device.sim.world import World
 from device.spec import load_head
 from device.values import Calibration, Glow, Psf, Shot
 from tests import scenes
+from tests.simulated import SCENES, coarse, exposed, having
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 SMALL = {"rows": 540, "cols": 960, "pitch_um": 10.08}
@@ -58,8 +59,20 @@ def test_less_light_resolves_less(good, world: World, calibration: Calibration) 
     assert dim.quality["resolution_um"] > 1.15 * good.quality["resolution_um"]
 
 
+@pytest.mark.parametrize("times", [1.0, 0.3])
+def test_a_dim_eye_is_an_eye_and_an_even_screen_as_bright_is_none(times: float) -> None:
+    """In little light a good picture is explained by few frequencies; a rule that asked all of them saw no eye."""
+    spec = coarse(load_head(SCENES / "dim.toml"), 4)
+    dim = World(having(spec, peak_e=spec.sim.peak_e * times), VirtualClock())
+    calibration = simulated_calibration(World(spec, VirtualClock()))
+    dim.electrons_per_s("green")
+    assert look(calibration, exposed(dim)).warnings == ()
+    dim.faults.add("eye.closed")
+    assert look(calibration, exposed(dim)).warnings[0].startswith("No eye was seen")
+
+
 @pytest.mark.parametrize("case", ["noise", "mirrored psf"])
-def test_what_this_psf_did_not_make_is_said_to_be_no_eye(case: str, world: World, calibration: Calibration) -> None:
+def test_what_this_psf_did_not_make_is_said_so(case: str, world: World, calibration: Calibration) -> None:
     counts = seen(world)
     if case == "noise":
         counts = np.random.default_rng(0).poisson(600, counts.shape).astype(np.uint16)
@@ -67,8 +80,9 @@ def test_what_this_psf_did_not_make_is_said_to_be_no_eye(case: str, world: World
         mirrored = Psf(np.ascontiguousarray(calibration.psfs[0].pixels[::-1]))
         calibration = Calibration((mirrored,), calibration.sensor, calibration.geometry, calibration.field_deg)
     report = look(calibration, counts)
-    assert report.quality["structure_nats"] < 0.005
-    assert any("No eye was seen" in words for words in report.warnings)
+    assert report.quality["structure_sure"] < -10
+    (words,) = [words for words in report.warnings if "lit" not in words]
+    assert words.startswith("No eye was seen" if case == "noise" else "This is not this head's PSF")
 
 
 def test_detail_that_the_frame_does_not_hold_is_not_painted(world: World, calibration: Calibration) -> None:

@@ -116,7 +116,10 @@ class Rig:
 
         async def told() -> Any:
             transport = httpx.ASGITransport(app=self.app, **options)
-            async with httpx.AsyncClient(transport=transport, base_url="http://eye.local", timeout=30) as client:
+            own = {"Sec-Fetch-Site": "same-origin"}  # as a browser says of the instrument's own page
+            async with httpx.AsyncClient(
+                transport=transport, base_url="http://eye.local", timeout=30, headers=own
+            ) as client:
                 return await story(client)
 
         return asyncio.run(told())
@@ -145,9 +148,18 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """A world whose light is already traced, and its calibration: the same for every test, and half as fine again."""
+    return coarsened(spec)
+
+
+def coarsened(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """The small head, half as fine again."""
     coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
-    world = World(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}), VirtualClock())
+    return traced(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}))
+
+
+def traced(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """A world whose light is already traced, and its calibration: the same for every test."""
+    world = World(spec, VirtualClock())
     for colour in (spec.light.colour, spec.light.preview_colour):
         world.electrons_per_s(colour)
     return world, simulated_calibration(world)
@@ -158,6 +170,10 @@ MakeRig = Callable[..., Rig]
 
 @pytest.fixture(scope="session")
 def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
+    return builder(template, plans)
+
+
+def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
     """Build an instrument: `camera` wraps the simulated one, `max_on_s` is the guard's, `head` changes it."""
     dark_world, calibration = template
 
@@ -173,8 +189,9 @@ def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig
         tinted: tuple[Colour, ...] = (),
         watchdog: str | None = None,
         head: Callable[[Head], Head] = lambda head: head,
+        clock: GateClock | None = None,
     ) -> Rig:
-        clock, died = GateClock(), Event()
+        clock, died = clock or GateClock(), Event()
         scene = copy(dark_world)
         scene.clock, scene.faults = clock, set()
         shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))

@@ -20,7 +20,7 @@ from services.instrument.api import STATUS, refusal
 CHOSEN = {  # every leaf has a status that somebody chose
     "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
     "CameraMissing": 503, "CameraStalled": 503, "CameraWrong": 503, "CameraPacked": 503, "LightFault": 423,
-    "LightLimit": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
+    "LightDay": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
     "CalibrationMissing": 423, "CalibrationDamaged": 423, "CalibrationRefused": 423, "CalibrationFormat": 423,
     "CalibrationUntrusted": 423, "CalibrationOld": 423, "CalibrationStale": 423, "CalibrationOtherMode": 423,
     "CalibrationStopped": 423, "TechnicianLocked": 401, "PinWrong": 403, "PinTooSoon": 429,
@@ -306,7 +306,7 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
     press = book["paths"]["/api/captures"]["post"]["responses"]
     assert "201" in press
     assert press["4XX"]["content"]["application/json"]["schema"]["$ref"].endswith("/Refusal")
-    assert set(book["components"]["schemas"]["Refusal"]["properties"]) == {"code", "message", "remedy"}
+    assert set(book["components"]["schemas"]["Refusal"]["properties"]) == {"code", "message", "remedy", "n", "wait_s"}
     assert "HTTPValidationError" not in book["components"]["schemas"]  # a shape that is never answered
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from device.errors import Busy, CameraMissing, CameraStalled, DiffuscopeError, FrameError, LightFault, StoreFull
+from device.errors import Busy, CameraMissing, CameraStalled, DiffuscopeError, LightFault, StoreFull
 from device.errors import LightLimit as Limit
 from device.ports import Camera
 from device.values import Frame, Shot
@@ -203,13 +203,13 @@ def test_a_press_that_fails_in_the_pause_leaves_the_refinement_alone(make_rig: A
     eager = Eager()
     rig = make_rig(bulletin=eager)
 
-    def press_in_daylight() -> Any:
-        rig.world.ambient_e_per_s = 1e7
+    def press_without_a_lamp() -> Any:
+        rig.world.faults.add("light.fault")
         return rig.exam.press("OS")
 
-    eager.press = press_in_daylight
+    eager.press = press_without_a_lamp
     first = rig.exam.press("OD").result(30)
-    with pytest.raises(FrameError, match="cannot be used"):
+    with pytest.raises(LightFault):
         eager.pressed[0].result(30)
     assert rig.store.captures() == [first]
     assert rig.exam.state == "aim"
@@ -293,15 +293,19 @@ def test_a_full_shelf_keeps_nothing_half_and_works_again_with_room(make_rig: Any
     assert rig.store.captures() == [kept]
 
 
-def test_a_frame_that_cannot_be_reconstructed_is_told_and_not_kept(rig: Any) -> None:
+def test_a_shot_of_which_no_picture_can_be_made_is_kept_as_it_is(rig: Any) -> None:
     rig.world.ambient_e_per_s = 1e7  # daylight: every pixel is full
-    with pytest.raises(FrameError, match="cannot be used") as refused:
-        rig.exam.press("OD").result(30)
-    assert "Too bright" in refused.value.remedy
-    assert_dark_and_empty(rig)
+    bright = rig.exam.press("OD").result(30)
+    assert bright.report["verdict"]["code"] == "shot.saturated"
+    assert (bright.report["method"], bright.report["stopped"]) == ("none", "input.frame")
+    assert "cannot be used" in bright.report["warnings"][0]
+    raw, facts = read_raw_tiff(rig.store.read(bright.id, "raw.tiff"))
+    assert raw.min() == raw.max() > 4000
+    assert facts["glow"] == {"colour": "green", "level": 1.0}
     rig.world.ambient_e_per_s = 0.0
     kept = rig.exam.press("OD").result(30)
-    assert rig.store.captures() == [kept]
+    assert rig.store.captures() == [kept, bright]
+    assert kept.report["verdict"]["word"] == "good"
 
 
 def test_a_camera_that_hangs_does_not_keep_the_lamp_on(make_rig: Any, wait_until: Callable[..., None]) -> None:

@@ -62,7 +62,10 @@ class Shop:
         async def told() -> httpx.Response:
             transport = httpx.ASGITransport(app=self.app)
             async with httpx.AsyncClient(
-                transport=transport, base_url="http://eye.local", cookies=self.cookies
+                transport=transport,
+                base_url="http://eye.local",
+                cookies=self.cookies,
+                headers={"X-Controller": "test"},
             ) as client:
                 answer = await client.request(method, path, json=body, timeout=30)
                 self.cookies = client.cookies

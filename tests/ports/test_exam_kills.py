@@ -57,7 +57,7 @@ class Instrument:
         raise AssertionError("the instrument did not get ready")
 
     def ask(self, path: str, body: bytes | None = None) -> bytes | None:
-        head = {"Content-Type": "application/json"} if body else {}
+        head = {"X-Controller": "test"} | ({"Content-Type": "application/json"} if body else {})
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}{path}", data=body, headers=head)
         with urllib.request.urlopen(request, timeout=20) as answer:
             return answer.read() if answer.status != 204 else None

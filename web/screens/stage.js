@@ -18,6 +18,7 @@ export function stage(state, act) {
           class=${none ? "" : "behind"}
           .head=${state.status}
           .link=${state.link}
+          .eye=${eyeOf(state, state.route.slot)}
           .hint=${standing(state) ? null : state.prompt}
           .active=${state.route.screen === "aim"}
           @aim=${act.heardAim}

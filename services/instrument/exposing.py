@@ -1,0 +1,25 @@
+"""What the head gives for a picture, and which part of a picture is the eye."""
+
+from device.head import Head
+from device.recon.model import field_box
+from device.sequence import lit
+from device.values import Eye, Frame, Glow, Image, Shot
+
+
+def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
+    """A lit frame and a dark one, if the head is well; the light counts for these eyes."""
+    head.check()
+    shot = Shot(head.spec.camera.exposure_s)
+    head.camera.prepare(shot)
+    try:
+        with head.light.on(Glow(head.spec.light.colour), eyes):
+            frame = lit(head.camera.expose(shot))
+        return frame, head.camera.expose(shot)
+    finally:
+        head.light.off()
+
+
+def eye_in(image: Image, head: Head) -> Image:
+    """The part of a picture that people look at: the illuminated field."""
+    whole = image.shape[:2] != head.camera.shape  # of a camera in another mode
+    return image if whole else image[field_box(head.calibration, head.camera.shape)]

@@ -1,0 +1,406 @@
+"""Every state that the page can tell, and the fault of simulated head, shelf or clock that brings it about.
+
+A scenario makes the fault happen on a `Rig` and answers with what the real server then says of it: `Said`, with the
+code, the numbers that the page's words need, and what to do where it is a refusal.
+"""
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from device.calibration.archive import Provenance
+from device.clock import VirtualClock
+from device.head import Chips, Head
+from device.sim.chips import SimBattery, SimThermometer
+from device.sim.world import World
+from device.spec import BusSpec
+from device.values import Charge
+from services.instrument.bulletin import Bulletin
+from tests.journey.conftest import Rig, until
+from tests.simulated import having
+
+BUS = BusSpec(backend="sim", thermometer=0x48, battery=0x36)
+WEEKS = 30  # the calibration's age in the scenario of an old one
+MAKE_WEEKS = 10  # and in all others
+VISIT = {"key": "0" * 16}
+MOST_BYTES = 10**12
+
+
+@dataclass
+class Shelf:
+    """How much room the shelf believes it has, and what it costs to ask."""
+
+    free_bytes: int = MOST_BYTES
+    asked: Callable[[], None] = lambda: None
+
+    def __call__(self, folder: Path) -> int:
+        self.asked()
+        return self.free_bytes
+
+
+class Attentive(Bulletin):
+    """News at which something else happens: once, when a press begins."""
+
+    at_the_press: Callable[[], None] | None = None
+
+    def tell(self, kind: str, **data: Any) -> None:
+        super().tell(kind, **data)
+        if data.get("stage") == "expose" and self.at_the_press is not None:
+            act, self.at_the_press = self.at_the_press, None
+            act()
+
+
+@dataclass(frozen=True)
+class Said:
+    """What the server said: by which way, its code, its numbers, and its remedy where it refused."""
+
+    way: str
+    code: str
+    facts: dict[str, Any] = field(default_factory=dict)
+    remedy: str = ""
+
+
+def equipped(head: Head) -> Head:
+    """The small head with a thermometer, a battery, and a calibration of ten weeks ago."""
+    world = head.camera._world  # type: ignore[attr-defined]  # of the simulated camera
+    made_at = VirtualClock().wall() - timedelta(weeks=MAKE_WEEKS)
+    return replace(
+        head, spec=head.spec.model_copy(update={"bus": BUS}), chips=Chips(SimThermometer(world), SimBattery(world)),
+        provenance=Provenance("D-1", made_at, "a technician", "0.1.0"),
+    )  # fmt: skip
+
+
+# ---- what is asked of the server
+
+
+def pressed(rig: Rig, eye: str = "OD", **more: Any) -> Said:
+    """The answer to a press: a refusal, or the verdict of the picture."""
+    answer = rig.request("POST", "/api/captures", json={"eye": eye} | more)
+    body = answer.json()
+    if answer.status_code == 201:
+        verdict = body["verdict"]
+        return Said("verdict", verdict["code"] or "good", {"method": body["report"]["method"]})
+    known = {name: value for name, value in body.items() if name not in ("code", "message", "remedy")}
+    return Said(str(answer.status_code), body["code"], known, body["remedy"])
+
+
+def aimed(rig: Rig) -> Said:
+    """The problem that the status has while somebody aims."""
+    for _ in range(200):
+        rig.request("GET", "/api/preview?after=0&eye=OD")
+        if (problem := rig.request("GET", "/api/status").json()["problem"]) is not None:
+            known = {name: value for name, value in problem.items() if name not in ("code", "message", "remedy")}
+            return Said("status", problem["code"], known, problem["remedy"])
+    raise AssertionError("the status has no problem")
+
+
+def live(rig: Rig, after: int, eye: str = "OD") -> int:
+    """The number of the next live picture after number `after`."""
+    for _ in range(20):
+        answer = rig.request("GET", f"/api/preview?after={after}&eye={eye}")
+        if answer.status_code == 200:
+            return int(answer.headers["x-frame"])
+    raise AssertionError("no live picture came")
+
+
+def stands(rig: Rig, code: str) -> Said:
+    """What stands in the status; and the same as news to the pages that are open."""
+    before = rig.bulletin.last_number
+    standing = {one.pop("code"): one for one in rig.request("GET", "/api/status").json()["standing"]}
+    rig.app.state.notices.look()
+    since = [event for event in rig.bulletin._events if event.number > before]
+    news = [event.data for event in since if event.kind == "notice" and event.data["code"] == code]
+    assert len(news) == 1, since
+    assert code in standing, standing
+    assert {"code": code} | standing[code] == news[0]
+    return Said("notice", code, standing[code])
+
+
+# ---- what goes wrong
+
+
+@contextmanager
+def seen(rig: Rig, times: float = 1.0, **keys: Any) -> Iterator[None]:
+    """Another eye stands there for as long: `times` as much light, and other keys of [sim]."""
+    spec = rig.world.spec
+    other = World(having(spec, peak_e=spec.sim.peak_e * times, **keys), rig.clock)  # type: ignore[union-attr]
+    for colour in ("green", "red"):
+        other.electrons_per_s(colour)
+    own = {name: getattr(rig.world, name) for name in ("_rates", "_setups")}
+    vars(rig.world).update({name: getattr(other, name) for name in own})
+    yield
+    vars(rig.world).update(own)
+
+
+def shot(times: float = 1.0, **keys: Any) -> Callable[[Rig, Shelf], Said]:
+    def scenario(rig: Rig, shelf: Shelf) -> Said:
+        with seen(rig, times, **keys):
+            return pressed(rig)
+
+    return scenario
+
+
+def fault(name: str, ask: Callable[[Rig], Said]) -> Callable[[Rig, Shelf], Said]:
+    def scenario(rig: Rig, shelf: Shelf) -> Said:
+        rig.world.faults.add(name)
+        return ask(rig)
+
+    return scenario
+
+
+def no_eye(rig: Rig, shelf: Shelf) -> Said:
+    rest(rig)
+    rig.clock.sleep(60)
+    rig.world.faults.add("eye.closed")
+    return pressed(rig)
+
+
+def blink(rig: Rig, shelf: Shelf) -> Said:
+    live(rig, live(rig, 0))
+    assert isinstance(rig.bulletin, Attentive)
+    rig.bulletin.at_the_press = lambda: rig.world.faults.add("eye.closed")
+    return pressed(rig)
+
+
+def spent(rig: Rig, ago_s: float) -> None:
+    """The right eye has had nearly all the light of a day, so long ago; what a press reserves does not fit any more."""
+    light = rig.exam.head.light
+    left = light.hazard.limits.stop_j_per_cm2 - light.ledger.spent_j_per_cm2("OD")
+    light.ledger.reserve(("OD",), 0.999 * left, light.hazard.limits.stop_j_per_cm2)
+    rig.clock.sleep(ago_s)
+
+
+def light_limit(rig: Rig, shelf: Shelf) -> Said:
+    spent(rig, 22.5 * 3600)
+    said = pressed(rig)
+    assert 0 < said.facts["n"] <= 180
+    assert pressed(rig, "OS").way == "verdict", "the other eye can go on"
+    number = live(rig, 0, "OS") + 1
+    ledger = rig.exam.head.light.ledger
+    before = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
+    live(rig, number, "OS")
+    assert ledger.spent_j_per_cm2("OD") == before[0], "aiming at one eye costs the other nothing"
+    assert ledger.spent_j_per_cm2("OS") > before[1]
+    rest(rig)
+    rig.clock.sleep(60 * said.facts["n"])
+    assert pressed(rig).way == "verdict", "after its rest the eye gets light again"
+    return said
+
+
+def light_day(rig: Rig, shelf: Shelf) -> Said:
+    spent(rig, 0.0)
+    said = pressed(rig)
+    assert pressed(rig, "OS").way == "verdict", "the other eye can go on"
+    rig.clock.sleep(25 * 3600)
+    return said
+
+
+def warm(celsius: float, code: str) -> Callable[[Rig, Shelf], Said]:
+    def scenario(rig: Rig, shelf: Shelf) -> Said:
+        rig.world.celsius = celsius
+        said = stands(rig, code)
+        if code == "heat.hot":
+            assert said.facts == {"wait_s": 300}
+            rig.clock.sleep(48)
+            standing = rig.request("GET", "/api/status").json()["standing"]
+            assert {"code": code, "wait_s": 252} in standing
+            refused = pressed(rig)
+            assert (refused.way, refused.code) == ("423", "head.hot")
+            return replace(said, remedy=refused.remedy)
+        assert pressed(rig).way == "verdict"
+        return said
+
+    return scenario
+
+
+def charged(fraction: float, code: str) -> Callable[[Rig, Shelf], Said]:
+    def scenario(rig: Rig, shelf: Shelf) -> Said:
+        rig.world.charge = Charge(fraction, 3.5)
+        said = stands(rig, code)
+        if code == "batt.empty":
+            refused = pressed(rig)
+            assert (refused.way, refused.code) == ("423", "power.low")
+            return replace(said, remedy=refused.remedy)
+        assert pressed(rig).way == "verdict"
+        return said
+
+    return scenario
+
+
+def full(rig: Rig, shelf: Shelf) -> Said:
+    kept = rig.request("GET", "/api/captures").json()
+    shelf.free_bytes = 0
+    said = stands(rig, "store.full")
+    refused = pressed(rig)
+    assert (refused.way, refused.code) == ("507", "store.full")
+    assert rig.request("GET", "/api/captures").json() == kept, "nothing that was kept is lost"
+    shelf.free_bytes = MOST_BYTES
+    rig.app.state.notices.look()
+    assert rig.told()[-1] == ("notice", {"code": "store.full", "over": True})
+    assert pressed(rig).way == "verdict", "space is back: it goes on"
+    return replace(said, remedy=refused.remedy)
+
+
+def low(rig: Rig, shelf: Shelf) -> Said:
+    shelf.free_bytes = (
+        5 * 4 * 10_000_000
+        if not rig.store.captures(1)
+        else 40
+        * sum(path.stat().st_size for path in (rig.store.folder / "captures" / rig.store.captures(1)[0].id).iterdir())
+    )
+    return stands(rig, "store.low")
+
+
+def slow(rig: Rig, shelf: Shelf) -> Said:
+    """The disk takes its time: the picture is in the making for ten seconds, and the page hears of it meanwhile."""
+    heard: list[Said] = []
+
+    def dawdle() -> None:
+        if rig.exam.progress.longest_s and not heard:
+            shelf.asked = lambda: None
+            rig.clock.sleep(10)
+            heard.append(stands(rig, "make.slow"))
+
+    shelf.asked = dawdle
+    assert pressed(rig).way == "verdict"
+    return heard[0]
+
+
+def unmade(rig: Rig, shelf: Shelf) -> Said:
+    rig.world.faults.add("camera.mode")
+    said = pressed(rig)
+    assert said.facts["method"] == "none"
+    return said
+
+
+def poor(rig: Rig, shelf: Shelf) -> Said:
+    visit = rig.request("POST", "/api/visits", json={"key": "b" * 16}).json()["id"]
+    with seen(rig, 0.003):
+        told = [pressed(rig, visit=visit, slot="R-centre").code for _ in range(3)]
+    assert told[:2] == ["shot.dark"] * 2
+    return Said("verdict", told[2], {"n": 3})
+
+
+def other_screen(rig: Rig, shelf: Shelf) -> Said:
+    ours, theirs = "1" * 16, "2" * 16
+    assert rig.request("POST", "/api/controller", json={"key": theirs}).json()["mine"]
+    answer = rig.request("POST", "/api/captures", json={"eye": "OD"}, headers={"X-Controller": ours})
+    rig.request("POST", "/api/controller", json={"key": theirs, "release": True})
+    rig.clock.sleep(3)
+    assert rig.request("POST", "/api/controller", json={"key": ours}).json()["mine"], "a closed page lets go"
+    return Said(str(answer.status_code), answer.json()["code"], {}, answer.json()["remedy"])
+
+
+def locked(rig: Rig, shelf: Shelf) -> Said:
+    rig.door.set_pin("2468", None)
+    answer = rig.request("GET", "/api/calibration")
+    return Said(str(answer.status_code), answer.json()["code"], {}, answer.json()["remedy"])
+
+
+def wrong_date(rig: Rig, shelf: Shelf) -> Said:
+    rig.clock.start -= timedelta(days=365 * 6)
+    return stands(rig, "clock.wrong")
+
+
+def old(rig: Rig, shelf: Shelf) -> Said:
+    rig.clock.sleep((WEEKS - MAKE_WEEKS) * 7 * 86400.0)
+    said = stands(rig, "cal.old")
+    assert said.facts["n"] >= WEEKS
+    assert pressed(rig).way == "verdict"
+    return said
+
+
+def cut_off(rig: Rig, again: Callable[[], Rig], folder: Path) -> Said:
+    """The power goes while the second picture of a visit is in the making: the shelf as it is then is opened anew."""
+    visit = rig.request("POST", "/api/visits", json={"key": "c" * 16}).json()["id"]
+    assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"
+    rig.hang()
+    errand = {"eye": "OS", "visit": visit, "slot": "L-nerve"}
+    answer = rig.exam.press("OS", None, people(rig).errand("OS", None, visit, "L-nerve"))
+    rig.wait_for_hanging()
+    shutil.copytree(rig.store.folder, folder / "shelf")
+    rig.clock.gate.set()
+    answer.result(30)
+    started = again()
+    lost = started.request("GET", "/api/status").json()["swept"]
+    assert len(lost) == 1
+    assert errand.items() <= lost[0].items()
+    assert pressed(started, "OS", visit=visit, slot="L-nerve").way == "verdict"
+    assert started.request("GET", "/api/status").json()["swept"] == [], "it was taken again"
+    return Said("status", "power.lost", {"eye": lost[0]["eye"], "slot": lost[0]["slot"]})
+
+
+def people(rig: Rig) -> Any:
+    return rig.app.state.notices._people
+
+
+EYE = {"eye": {}}
+SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
+    "camera.missing": fault("camera.missing", pressed),
+    "camera.stalled": fault("camera.stalled", aimed),
+    "light.fault": fault("light.fault", pressed),
+    "light.limit": light_limit,
+    "light.day": light_day,
+    "cal.old": old,
+    "shot.saturated": shot(6.0),
+    "shot.dark": shot(0.003),
+    "shot.pupil": shot(eye={"pupil_um": 1500.0}),
+    "shot.moved": shot(eye={"drift_deg_per_s": 20.0}),
+    "shot.blink": blink,
+    "shot.noeye": no_eye,
+    "shot.edge": shot(eye={"pupil_um": 4000.0, "decentred_um": 2500.0}),
+    "shot.halo": shot(light={"polariser_leak": 0.1, "ring_um": 3500.0}),
+    "shot.poor": poor,
+    "make.slow": slow,
+    "make.failed": unmade,
+    "store.low": low,
+    "store.full": full,
+    "batt.low": charged(0.12, "batt.low"),
+    "batt.empty": charged(0.03, "batt.empty"),
+    "heat.warm": warm(52.0, "heat.warm"),
+    "heat.hot": warm(61.0, "heat.hot"),
+    "link.other": other_screen,
+    "lock.idle": locked,
+    "clock.wrong": wrong_date,
+}
+# These need an instrument of their own: see test_fault_states.py.
+APART = frozenset({"cal.missing", "cal.mismatch", "power.lost"})
+# The page alone knows that nothing arrives: the tests that cut or slow a real browser's link.
+OF_THE_PAGE = {
+    "link.lost": ("test_page.py", "test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three"),
+    "link.slow": ("test_page_states.py", "test_an_old_live_picture_says_its_age"),
+}
+# No fault can bring these about, because the server does not do yet what could go wrong.
+NOT_YET = {
+    "send.waiting": "nothing is sent: there is no outbox",
+    "send.stuck": "nothing is sent: there is no outbox",
+    "eye.side": "which eye a picture shows is not looked at",
+}
+
+
+def page_code(web: Path, code: str) -> str:
+    """The page's own name of what the server calls `code` (web/states.js)."""
+    table = (web / "states.js").read_text().split("const SAME = {")[1].split("};")[0]
+    same = dict(re.findall(r'"([\w.]+)": "([\w.]+)"', table))
+    return same.get(code, code)
+
+
+def rest(rig: Rig) -> None:
+    """Nobody aims any more: time may jump, and no lamp shines meanwhile."""
+    until(lambda: rig.clock.now_s() >= rig.exam._wanted_until_s and rig.world.glow is None and rig.exam.state == "aim")
+
+
+def mended(rig: Rig) -> None:
+    """All is well again, whatever a scenario broke."""
+    world = rig.world
+    world.faults.clear()
+    world.celsius, world.charge = 25.0, Charge(0.775, 3.88)
+    rest(rig)
+    until(lambda: not rig.exam.fitness.due)
+    for heap in (rig.exam.fitness._sights, rig.exam.fitness._spheres_dpt):
+        heap.clear()  # what was broken here says nothing about the next scenario
