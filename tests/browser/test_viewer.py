@@ -81,20 +81,24 @@ def test_both_painters_make_one_picture_with_every_tool_at_every_size(bench: Pag
 
 @pytest.mark.parametrize("painter", ["gl", "2d"])
 def test_the_tools_do_what_their_formula_says(bench: Page, painter: str) -> None:
-    for tools in TOOLS[3::7]:
-        name, pivot, got = bench.evaluate(
-            """async ([painter, tools]) => {
-            const { Studio, picture, pixels } = window.bench;
-            const { study } = await import("/web/tone.js");
-            const studio = painter === "gl" ? new Studio() : new Studio(() => null);
+    chosen = TOOLS[3::7]
+    name, pivot, drawn = bench.evaluate(
+        """async ([painter, every]) => {
+        const { Studio, picture, pixels } = window.bench;
+        const { study } = await import("/web/tone.js");
+        const studio = painter === "gl" ? new Studio() : new Studio(() => null);
+        const drawn = every.map((tools) => {
             const shown = pixels(studio.develop(picture, tools));
             const some = [];
             for (let i = 0; i < shown.length; i += 4 * 31) some.push(shown[i], shown[i + 1], shown[i + 2]);
-            return [studio.painter.name, study(picture).pivot, some];
-        }""",
-            [painter, tools],
-        )
-        assert name == painter
+            return some;
+        });
+        return [studio.painter.name, study(picture).pivot, drawn];
+    }""",
+        [painter, chosen],
+    )
+    assert name == painter
+    for tools, got in zip(chosen, drawn, strict=True):
         wanted = textbook(tools, pivot).reshape(-1, 3)[::31].ravel()
         assert np.abs(np.array(got) - wanted).max() <= 0.51, tools  # rounded to the nearest whole value
 
