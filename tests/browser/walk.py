@@ -1,9 +1,10 @@
 """How the tests walk through the page: to a live picture, through a press, to a verdict."""
 
+import re
 import time
 from collections.abc import Callable
 
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.stub import Stubbed
 
@@ -70,6 +71,13 @@ def double_tap(page: Page, x: float, y: float) -> None:
 def drawn(page: Page, tools: str, which: str = "#picture") -> None:
     """Wait until the final picture is on the glass under these tools ("red-free 0 1": brightness, contrast)."""
     expect(page.locator(which)).to_have_attribute("data-drawn", f"final {tools}", timeout=20_000)
+
+
+def place_of(pic: Locator) -> tuple[float, float]:
+    """Where the loupe is, in widths of the picture from its middle."""
+    expect(pic).to_have_attribute("data-loupe", re.compile("."))
+    u, v = (pic.get_attribute("data-loupe") or "").split(",")
+    return float(u), float(v)
 
 
 def spoken(page: Page, language: str) -> None:
