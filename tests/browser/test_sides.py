@@ -261,6 +261,7 @@ def test_four_pictures_as_fast_as_the_real_camera_allows(
 ) -> None:
     complaints.expect("409", "423")
     page = open_page(server.url)  # type: ignore[attr-defined]
+    page.set_default_timeout(60_000)
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
     if settled(page).locator("[data-do=useHere]").count():
         page.locator("[data-do=useHere]").tap()
