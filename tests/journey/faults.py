@@ -391,8 +391,9 @@ def page_code(web: Path, code: str) -> str:
 
 
 def rest(rig: Rig) -> None:
-    """Nobody aims any more: time may jump, and no lamp shines meanwhile."""
-    until(lambda: rig.clock.now_s() >= rig.exam._wanted_until_s and rig.world.glow is None and rig.exam.state == "aim")
+    """Nobody aims any more: time may jump, and no lamp shines meanwhile. Until then a busy computer makes pictures."""
+    wanted_until_s = rig.exam._wanted_until_s
+    until(lambda: rig.clock.now_s() >= wanted_until_s and rig.world.glow is None and rig.exam.state == "aim", 120)
 
 
 def mended(rig: Rig) -> None:
@@ -401,6 +402,6 @@ def mended(rig: Rig) -> None:
     world.faults.clear()
     world.celsius, world.charge = 25.0, Charge(0.775, 3.88)
     rest(rig)
-    until(lambda: not rig.exam.fitness.due)
+    until(lambda: not rig.exam.fitness.due, 120)
     for heap in (rig.exam.fitness._sights, rig.exam.fitness._spheres_dpt):
         heap.clear()  # what was broken here says nothing about the next scenario
