@@ -6,6 +6,7 @@ real RAUC everything runs in `tests/appliance`. A bundle is a line of JSON and s
 """
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -27,12 +28,14 @@ AUTOBOOT = "[all]\ntryboot_a_b=1\nboot_partition=2\n[tryboot]\nboot_partition=3\
 RAUC = ROOT / "tests" / "rauc.py"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Board:
-    """The device's folders; `runs` is which version is in each slot."""
+    """The device's folders; `first_on_path` is where the updater's Python looks first: what its version is called."""
 
     folder: Path
     instrument: str = NOWHERE
+    first_on_path: Path | None = None
+    patience_s: float = 2.0
 
     @classmethod
     def new(cls, folder: Path, instrument: str = NOWHERE) -> "Board":
@@ -65,7 +68,7 @@ class Board:
         known: dict[str, object] = {
             "sticks": here / "media", "folder": self.state, "wishes": self.wishes, "keyring": here / "ca.crt",
             "rauc": (sys.executable, "-IS", str(RAUC), str(here)), "instrument": self.instrument,
-            "restart": ("touch", str(here / "off")), "answer_s": 2.0, "patience_s": 2.0,
+            "restart": ("touch", str(here / "off")), "answer_s": 2.0, "patience_s": self.patience_s,
         }  # fmt: skip
         return UpdateSettings(**known | changed)  # type: ignore[arg-type]
 
@@ -101,8 +104,20 @@ class Board:
 
     def run(self, word: str, version: str) -> str:
         """One call of the updater as systemd makes it."""
-        words = [sys.executable, "-m", "tests.updates", word, str(self.folder), version, self.instrument]
-        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
+        words = [
+            sys.executable,
+            "-m",
+            "tests.updates",
+            word,
+            str(self.folder),
+            version,
+            self.instrument,
+            str(self.patience_s),
+        ]
+        place = {"PYTHONPATH": str(self.first_on_path)} if self.first_on_path else {}
+        done = subprocess.run(
+            words, cwd=ROOT, env=os.environ | place, capture_output=True, text=True, timeout=150, check=False
+        )
         return done.stdout + done.stderr
 
     @contextmanager
@@ -126,6 +141,6 @@ class Board:
 
 
 if __name__ == "__main__":
-    word, folder, runs, at = sys.argv[1:]
+    word, folder, runs, at, patience_s = sys.argv[1:]
     assert word in ("answer", "tidy", "settle")
-    getattr(Board(Path(folder), at).updater(runs), word)()
+    getattr(Board(Path(folder), at, patience_s=float(patience_s)).updater(runs), word)()
