@@ -210,7 +210,7 @@ export const TECHNICIAN = {
   "why.update.older": "This camera has that version, or a newer one.",
   "why.update.step": "A version in between is needed first.",
   "why.update.room": "There is not enough room.",
-  "why.update.failed": "It did not work.",
+  "why.update.failed": "Something went wrong.",
 
   "rooms": "Rooms",
   "room.calibration": "Calibration",

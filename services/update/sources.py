@@ -67,8 +67,8 @@ def _plain(name: str) -> str:
     return name.encode("utf-8", "replace").decode()[:MOST_CHARS]
 
 
-def copied(bundle: Path, folder: Path, progress: Progress) -> Path:
-    """A copy of a stick's bundle; UpdateSourceGone if the stick goes away, UpdateNoRoom if the disk is full."""
+def copied(bundle: Path, folder: Path, progress: Progress, name: str = "update.raucb") -> Path:
+    """A copy of somebody's bundle; UpdateSourceGone if the stick goes away, UpdateNoRoom if the disk is full."""
     part = folder / "stick.raucb.part"
     part.unlink(missing_ok=True)
     with _gone():
@@ -82,7 +82,7 @@ def copied(bundle: Path, folder: Path, progress: Progress) -> Path:
     except (UpdateSourceGone, UpdateNoRoom):
         part.unlink(missing_ok=True)
         raise
-    return part.rename(folder / "update.raucb")
+    return part.rename(folder / name)
 
 
 class Web:

@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 
 ASK_AGAIN_S = 2.0
 GONE = "Put the USB stick back in, look for updates once more, and choose again."
+LOOKED_AT = "looked-at.raucb"
 FORGIVEN = ("camera", "calibration")  # of the head: if they failed before, another version is not to blame
 
 
@@ -63,9 +64,10 @@ class Updater:
 
     def look(self) -> tuple[Found, ...]:
         """What could be installed, from sticks, tablet and channel, each judged by what it says of itself."""
-        self._journal.write(state="looking", found=(), version="", looked=True)
-        there = sources.listed(self._settings.sticks, self._settings.tablet)
-        found = [self._judged(one, path) for one, path in there]
+        with gate.alone(self._settings.folder):
+            self._journal.write(state="looking", found=(), version="", looked=True)
+            there = sources.listed(self._settings.sticks, self._settings.tablet)
+            found = [self._judged(one, path) for one, path in there]
         trouble = None
         if self._settings.channel:
             try:
@@ -185,12 +187,16 @@ class Updater:
         raise UpdateSourceGone("what was chosen is not there any more", GONE)
 
     def _judged(self, found: Found, path: Path) -> Found:
+        """RAUC reads only what belongs to root and cannot change: so a copy, which nobody else can reach."""
+        folder = self._settings.folder
         try:
-            release = self._rauc.release(path)
+            release = self._rauc.release(sources.copied(path, folder, self._quietly, LOOKED_AT))
             found = found.model_copy(update={"version": release.version})
             gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
         except UpdateError as error:
             return found.model_copy(update={"trouble": Trouble.of(error)})
+        finally:
+            (folder / LOOKED_AT).unlink(missing_ok=True)
         return found
 
     def _offer(self) -> tuple[sources.Web, channel.Offer]:

@@ -40,7 +40,7 @@ cookie = ask("POST", "technician/" + door, {"pin": "2580"}).headers["Set-Cookie"
 told = json.load(ask("GET", "update", cookie=cookie))
 if sys.argv[1] == "install":
     ask("POST", "update/check", {}, cookie)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 110
     while (told := json.load(ask("GET", "update", cookie=cookie)))["state"] in ("asked", "looking"):
         assert time.monotonic() < end, told
         time.sleep(0.2)
