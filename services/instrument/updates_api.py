@@ -4,7 +4,9 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Cookie, Depends, Header, Request
 from pydantic import Field
+from starlette.requests import ClientDisconnect
 
+from device.errors import InputError
 from services.instrument.technician import Door
 from services.instrument.technician_api import COOKIE, Body
 from services.instrument.updating import UpdateDesk
@@ -52,7 +54,10 @@ def update_routes(desk: UpdateDesk, door: Door) -> APIRouter:
     @router.put("/file", status_code=201, dependencies=[Depends(acting)])
     async def receive(request: Request, content_length: Annotated[int, Header(ge=0)]) -> dict[str, Any]:
         """Take an update from the tablet, as the body; then look, and it is among those that are found."""
-        await desk.receive(content_length, request.stream())
+        try:
+            await desk.receive(content_length, request.stream())
+        except ClientDisconnect as error:  # nobody hears this, but the diary does
+            raise InputError("the tablet went away before all had arrived", "Send the file again.") from error
         return desk.told()
 
     return router
