@@ -31,7 +31,7 @@ from services.records.update_notes import (
 )  # fmt: skip
 
 MOST_BYTES = 2_000_000_000  # of a tablet's file; a bundle has some 350 MB
-PATIENCE_S = 30.0  # for whoever takes wishes to take one
+PATIENCE_S = 90.0  # for whoever takes wishes to take one, on a computer that has much to do
 NEWS = Path(__file__).parents[2] / "CHANGELOG.md"
 NOT_HERE = "Updates are for the device. On another computer, put the new version in as its README says."
 

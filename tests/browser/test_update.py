@@ -72,13 +72,13 @@ def entered(open_page: Open, device: Device) -> Page:
 
 
 def at(page: Page, state: str) -> None:
-    page.wait_for_selector(f".update[data-state='{state}']", timeout=60_000)
+    page.wait_for_selector(f".update[data-state='{state}']", timeout=120_000)
     page.wait_for_timeout(700)  # the page ignores a tap on what has only just appeared
 
 
 def back_inside(page: Page) -> None:
     """The device has restarted, and its door is shut."""
-    page.wait_for_selector("[data-view=door]", timeout=60_000)
+    page.wait_for_selector("[data-view=door]", timeout=120_000)
     page.wait_for_timeout(700)
     come_in(page)
 
@@ -99,12 +99,12 @@ def test_from_a_stick_to_the_next_version(device: Device, open_page: Open, compl
     expect(page.locator(".update")).to_contain_text("Version 1.0 is running.")
     with board.path_unit("1.0"):
         page.locator("#look").tap()
-        expect(page.locator(".update")).to_contain_text("No update was found.", timeout=30_000)
+        expect(page.locator(".update")).to_contain_text("No update was found.", timeout=90_000)
         board.bundle("two.raucb", "2.0")
         page.wait_for_timeout(700)
         page.locator("#look").tap()
         install = page.get_by_role("button", name="Install 2.0")
-        expect(install).to_be_visible(timeout=30_000)
+        expect(install).to_be_visible(timeout=90_000)
         board.hold()
         page.wait_for_timeout(700)
         install.tap()
@@ -133,7 +133,7 @@ def test_a_version_that_is_not_well_is_taken_back(device: Device, open_page: Ope
     board.bundle("three.raucb", "3.0")
     with board.path_unit(before):
         page.locator("#look").tap()
-        expect(page.locator("li[data-code='update.older']")).to_be_visible(timeout=30_000)
+        expect(page.locator("li[data-code='update.older']")).to_be_visible(timeout=90_000)
         page.wait_for_timeout(700)
         page.get_by_role("button", name="Install 3.0").tap()
         at(page, "restarting")
@@ -160,7 +160,7 @@ def test_a_tablet_sends_the_update(device: Device, open_page: Open, complaints: 
     with board.path_unit(device.version):
         page.set_input_files("input[type=file]", {"name": "x.raucb", "mimeType": "a/b", "buffer": content})
         expect(page.locator("li[data-id]", has_text="Sent from a tablet")).to_contain_text(
-            "Version 9.0", timeout=30_000
+            "Version 9.0", timeout=90_000
         )
     page.set_input_files("input[type=file]", {"name": "x.raucb", "mimeType": "a/b", "buffer": b""})
     expect(page.locator(".alert")).to_have_attribute("data-code", "input")
