@@ -48,6 +48,7 @@ DiffuscopeError
 │   └── NotKept (LookupError)    no such capture
 └── UpdateError                  another version is not installed
     ├── UpdateBusy               one is under way
+    ├── UpdateNotUnderstood      what was asked for is nothing that can be asked for
     ├── UpdateUncommitted        the version that runs is itself being tried
     ├── UpdateDuringExam         a picture is being taken
     ├── UpdatePowerLow           the battery is less than half full
@@ -413,9 +414,14 @@ class UpdateBusy(UpdateError):
     """Another update is under way."""
 
     code = "update.busy"
-    default_remedy = (
-        "An update is under way already. Wait until it is done; `diffuscope update status` says how far it is."
-    )
+    default_remedy = "An update is under way already. Wait until it is done."
+
+
+class UpdateNotUnderstood(UpdateError):
+    """What was asked for is nothing that can be asked for."""
+
+    code = "update.request"
+    default_remedy = "Reload the page, look for updates once more, and choose one of those that are listed."
 
 
 class UpdateUncommitted(UpdateError):

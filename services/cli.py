@@ -49,6 +49,12 @@ def run(
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
     protocol: Annotated[Path | None, typer.Option(help="What a screening consists of, as TOML.")] = None,
     name: Annotated[list[str] | None, typer.Option(help="A name of this computer in the network.")] = None,
+    updates: Annotated[
+        Path | None, typer.Option(help="The updater's folder, for the page to show.", readable=False)
+    ] = None,
+    wishes: Annotated[
+        Path | None, typer.Option(help="Where the updater takes what the page asks for.", readable=False)
+    ] = None,
 ) -> None:
     """Serve the page: one button, one true picture."""
     from services.instrument.serve import bound, handed_over, serve  # opens the web stack; others do not need it
@@ -61,7 +67,7 @@ def run(
     served, at = address.getsockname()[:2]
     serve(
         spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
-        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()),
+        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()), (updates, wishes),
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from device.spec import load_head
 from services.cli import app
 from services.instrument.pace import BUDGET_S, LAST_S
 from services.instrument.watchdog import BEAT_S
+from services.records.update_notes import TABLET, WISH
 from services.update.command import app as update_app
 from services.update.settings import UpdateSettings
 from services.update.settings import load as load_settings
@@ -238,7 +239,9 @@ HARDENING = re.findall(
 )
 
 
-UNITS = [name for name in files() if re.fullmatch(r"systemd/(image/card/luks/)?[^/]+\.(service|socket|timer)", name)]
+UNITS = [
+    name for name in files() if re.fullmatch(r"systemd/(image/card/luks/)?[^/]+\.(service|socket|timer|path)", name)
+]
 IMAGE_SETTINGS = ROOT / "systemd" / "image" / "update.toml"
 BLANKER = "/usr/bin/python3 -I -S /opt/diffuscope/device/drivers/blank.py --device /dev/spidev0.0"
 
@@ -295,7 +298,7 @@ def test_systemd_has_nothing_to_say_about_any_unit(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update"])
+@pytest.mark.parametrize("name", ["diffuscope-settle", "diffuscope-update", "diffuscope-wish"])
 def test_what_updates_is_locked_in_and_called_with_words_that_exist(name: str) -> None:
     """It runs as root, who owns RAUC: so without capabilities, and on a disk that is read-only but for its journal."""
     service = unit_of(f"systemd/{name}.service")["Service"]
@@ -305,6 +308,23 @@ def test_what_updates_is_locked_in_and_called_with_words_that_exist(name: str) -
     assert not [key for key in HARDENING if service.get(key) != "yes"]
     assert (service["ProtectSystem"], service["CapabilityBoundingSet"]) == ("strict", "")
     assert service["StateDirectory"] == UpdateSettings().folder.name
+    assert service["StateDirectoryMode"] == "0711", "the page reads the journal in it"
+
+
+def test_page_updater_and_systemd_mean_the_same_folders() -> None:
+    """Who leaves a wish where nobody looks waits for ever."""
+    state, wishes = str(UpdateSettings().folder), str(UpdateSettings().wishes)
+    instrument = unit_of("systemd/diffuscope.service")["Service"]
+    assert f"--updates {state} --wishes {wishes}" in instrument["ExecStart"]
+    assert instrument["ReadWritePaths"] == f"-{wishes} -{state}/{TABLET} -/media"
+    assert unit_of("systemd/diffuscope-wish.path")["Path"]["PathExists"] == f"{wishes}/{WISH}"
+    assert unit_of("systemd/diffuscope-wish.service")["Service"]["ReadWritePaths"] == wishes
+    made = [line.split() for line in text("systemd/diffuscope.tmpfiles").splitlines() if line.startswith("d ")]
+    shared = ["2770", "root", "diffuscope-update", "-"]
+    own = ["0711", "root", "root", "-"]
+    assert made == [["d", wishes, *shared], ["d", state, *own], ["d", f"{state}/{TABLET}", *shared]]
+    assert "\ng diffuscope-update -\n" in text("systemd/diffuscope.sysusers")
+    assert "diffuscope-update" in instrument["SupplementaryGroups"].split()
 
 
 def test_a_version_that_is_tried_has_its_patience_and_then_goes_back() -> None:

@@ -3,6 +3,7 @@
 import "./diary.js";
 import "./explorer.js";
 import "./health.js";
+import "./update.js";
 import { html } from "./vendor/lit-html.js";
 import { t } from "./words.js";
 
@@ -11,6 +12,7 @@ const ROOMS = {
   health: html`<instrument-health class="column"></instrument-health>`,
   explorer: html`<accuracy-time class="column"></accuracy-time>`,
   diary: html`<instrument-diary class="column"></instrument-diary>`,
+  update: html`<software-update class="column"></software-update>`,
 };
 
 /** The way from room to room, and the room; `calibration` is the one that the wizard draws. */

@@ -51,6 +51,8 @@ from device.errors import (
     StoreFull,
     TechnicianLocked,
     TooHot,
+    UpdateError,
+    UpdateNoRoom,
     VisitFinished,
     WrongHost,
 )  # fmt: skip
@@ -70,6 +72,7 @@ from services.instrument.page import page
 from services.instrument.promised import Promised
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
+from services.instrument.updates_api import UPLOAD_PATH
 from services.instrument.visits_api import NAME, exports_router, visits_router
 from services.instrument.wellbeing import facts
 from services.records.people import People
@@ -108,6 +111,8 @@ STATUS: dict[type[DiffuscopeError], int] = {
     PinTooSoon: 429,
     StoreFull: 507,
     StickFull: 507,
+    UpdateNoRoom: 507,
+    UpdateError: 409,
     StickGone: 503,
     StoreDamaged: 500,
     DiffuscopeError: 500,
@@ -266,7 +271,8 @@ class SafeHeaders:
                 MutableHeaders(scope=message).update(rules(scope["path"]))
             await send(message)
 
-        app = _TOO_LARGE if _is_too_large(Headers(scope=scope)) else self.app
+        is_upload = scope["path"] == UPLOAD_PATH  # the only body that is a file; who receives it has its own limit
+        app = _TOO_LARGE if not is_upload and _is_too_large(Headers(scope=scope)) else self.app
         await app(scope, receive, with_headers)
 
 

@@ -7,6 +7,7 @@ import signal
 import socket
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
+from importlib.metadata import version
 from pathlib import Path
 
 import uvicorn
@@ -26,6 +27,8 @@ from services.instrument.explorer_api import explorer_routes
 from services.instrument.forgery import own_names
 from services.instrument.owner import House, Owner, archive_of, calibrated
 from services.instrument.technician import Door
+from services.instrument.updates_api import update_routes
+from services.instrument.updating import UpdateDesk
 from services.instrument.watchdog import Watchdog
 from services.records.light_book import LightBook
 from services.records.protocol import Protocol
@@ -75,12 +78,12 @@ def _remedy(error: OSError, port: int) -> str:
 
 def serve(
     spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
-    protocol: Protocol, names: tuple[str, ...] = (),
+    protocol: Protocol, names: tuple[str, ...] = (), updater: tuple[Path | None, Path | None] = (None, None),
 ) -> None:  # fmt: skip
     """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
     The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
-    `names`, beside the computer's own, its addresses, and local ones.
+    `names`, beside the computer's own, its addresses, and local ones. `updater`: its folder, and where it takes wishes.
     """
     clock = SystemClock()
     with address, Store(data, clock=clock) as store, ExitStack() as undo:
@@ -88,7 +91,6 @@ def serve(
         archive = Archive(archive_of(spec, data))
         diary = undo.enter_context(closing(Diary(data / "diary")))
         house = House(spec, archive, store, Bulletin(), clock, watchdog, _stop_the_process)
-
         explorer = Explorer(data / "explorer", data / "plans", clock, spec, house.bulletin.tell)
 
         def exam() -> Exam:
@@ -98,8 +100,12 @@ def serve(
             )
 
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
-        rooms = (explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration),)
         door = Door(data / "technician.json", clock)
+        desk = UpdateDesk(*updater, clock, version("diffuscope"))
+        rooms = (
+            explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration),
+            update_routes(desk, door),
+        )
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)

@@ -4,12 +4,14 @@
 `openssl cms -sign -nodetach -binary -outform DER`. Its validity in time is not judged: the device has no trusted clock.
 """
 
+import hashlib
 import subprocess
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from device.errors import UpdateDamaged, UpdateForeign
+from services.records.update_notes import Found
 
 NAME = "channel.cms"
 
@@ -37,3 +39,9 @@ def opened(signed: bytes, keyring: Path) -> Offer:
         return Offer.model_validate_json(done.stdout)
     except ValidationError as error:
         raise UpdateDamaged(f"the channel is signed and says nothing that can be used: {error}") from error
+
+
+def as_found(offer: Offer) -> Found:
+    """An offer as a technician chooses it, by a name that only this offer has."""
+    id = hashlib.sha256(f"channel {offer.version} {offer.sha256}".encode()).hexdigest()[:16]
+    return Found(id=id, where="channel", name=offer.bundle, bytes=offer.bytes, version=offer.version)

@@ -1,8 +1,7 @@
-"""`diffuscope update check|install|restart|settle|status`: what a technician, a timer and a boot call."""
+"""`diffuscope update check|install|restart|settle|answer|tidy|status`: what a technician, a timer and a boot call."""
 
 import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -57,13 +56,25 @@ def settle(settings: Settings = PLACE) -> None:
 
 
 @app.command()
+def answer(settings: Settings = PLACE) -> None:
+    """Do what was tapped on the technician's page; systemd calls this when the page has left a wish."""
+    _updater(settings).answer()
+
+
+@app.command()
+def tidy(settings: Settings = PLACE) -> None:
+    """Write down that an update was interrupted, if nobody is at it any more."""
+    _updater(settings).tidy()
+
+
+@app.command()
 def status(
     settings: Settings = PLACE,
     as_json: Annotated[bool, typer.Option("--json", help="Print it for a program.")] = False,
 ) -> None:
     """Say which version runs and what became of the last update."""
     entry, words = _updater(settings).status()
-    typer.echo(json.dumps(asdict(entry) | {"words": words}, indent=1) if as_json else words)
+    typer.echo(json.dumps(entry.model_dump() | {"words": words}, indent=1) if as_json else words)
 
 
 def main() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from device.errors import SpecError
+from services.records.update_notes import TABLET
 
 PLACE = Path("/etc/diffuscope/update.toml")
 
@@ -18,6 +19,7 @@ class UpdateSettings(BaseModel):
     authority: Path | None = None  # who vouches for that web server, if not the usual ones
     sticks: Path = Path("/media")  # where sticks appear, one folder each
     folder: Path = Path("/var/lib/diffuscope-update")
+    wishes: Path = Path("/run/diffuscope-update")  # where the page leaves what a technician tapped
     keyring: Path = Path("/etc/rauc/keyring.pem")
     rauc: tuple[str, ...] = ("rauc",)
     restart: tuple[str, ...] = ("systemctl", "reboot")
@@ -25,6 +27,11 @@ class UpdateSettings(BaseModel):
     lowest_battery: float = Field(default=0.5, ge=0, le=1)
     answer_s: float = Field(default=15.0, gt=0)  # within which the page must answer
     patience_s: float = Field(default=300.0, gt=0)  # within which a tried version must be well; it may have to compile
+
+    @property
+    def tablet(self) -> Path:
+        """Where the page puts what a tablet sent."""
+        return self.folder / TABLET
 
 
 def load(path: Path) -> UpdateSettings:

@@ -4,7 +4,9 @@ What arrives is `NAME.part` until it is whole. A stick that is pulled out and a 
 """
 
 import hashlib
+import os
 import ssl
+import stat
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,9 +19,11 @@ from device.clock import Clock
 from device.errors import UpdateDamaged, UpdateNoRoom, UpdateNowhere, UpdateSourceGone, UpdateUnreachable
 from services.records import disk
 from services.records.store import RESERVE_BYTES
+from services.records.update_notes import PLAINLY, UPLOAD, Found
 from services.update.channel import Offer
 
 PIECE_BYTES = 1 << 20
+MOST_LISTED, MOST_CHARS = 8, 100  # updates on sticks, each of which is read whole; letters of a name
 WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0)  # between tries; whoever polls comes again later
 SILENCE_S = 30.0
 Progress = Callable[[float, str], None]
@@ -28,32 +32,57 @@ Progress = Callable[[float, str], None]
 def on_stick(place: Path) -> Path:
     """The bundle at a place: itself, or the only one in a folder or on one of its sticks; else UpdateNowhere."""
     if place.is_file():
-        return place
+        return place.resolve()
     found = sorted({*place.glob("*.raucb"), *place.glob("*/*.raucb")})
     if len(found) == 1:
-        return found[0]
+        return found[0].resolve()
     if not found:
         raise UpdateNowhere(f"{place} holds no file that ends in .raucb")
     names = ", ".join(path.name for path in found)
     raise UpdateNowhere(f"{place} holds several updates: {names}", "Leave only the update that you mean on the stick.")
 
 
-def copied(bundle: Path, folder: Path, progress: Progress) -> Path:
-    """A copy of a stick's bundle; UpdateSourceGone if the stick goes away, UpdateNoRoom if the disk is full."""
+def listed(sticks: Path, tablet: Path) -> list[tuple[Found, Path]]:
+    """Every bundle on a stick, and the one that a tablet sent, with a name that changes when the file does.
+
+    Plain files only: a stick's links lead nowhere.
+    """
+    on_sticks = [("stick", path) for path in sorted({*sticks.glob("*.raucb"), *sticks.glob("*/*.raucb")})]
+    found = []
+    for where, path in [("tablet", tablet / UPLOAD), *on_sticks]:
+        try:
+            known = path.lstat()
+        except OSError:  # nothing was sent, or the stick was pulled out just now
+            continue
+        if stat.S_ISREG(known.st_mode) and not path.parent.is_symlink():
+            id = hashlib.sha256(os.fsencode(path) + f" {known.st_size} {known.st_mtime_ns}".encode()).hexdigest()[:16]
+            stick = _plain(path.parent.name) if where == "stick" else ""
+            one = {"id": id, "where": where, "stick": stick, "name": _plain(path.name), "bytes": known.st_size}
+            found.append((Found.model_validate(one), path))
+    return found[:MOST_LISTED]
+
+
+def _plain(name: str) -> str:
+    """A file's name as text that can be shown, whatever somebody wrote on a stick."""
+    return name.encode("utf-8", "replace").decode()[:MOST_CHARS]
+
+
+def copied(bundle: Path, folder: Path, progress: Progress, name: str = "update.raucb") -> Path:
+    """A copy of somebody's bundle; UpdateSourceGone if the stick goes away, UpdateNoRoom if the disk is full."""
     part = folder / "stick.raucb.part"
     part.unlink(missing_ok=True)
     with _gone():
         size = bundle.stat().st_size
     _refuse_without_room(folder, size)
     try:
-        with _gone(), bundle.open("rb") as source:
+        with _gone(), open(os.open(bundle, PLAINLY), "rb") as source:
             _append(part, _pieces(source), size, progress)
             if part.stat().st_size != size:
                 raise OSError(f"{part.stat().st_size} of {size} bytes")
     except (UpdateSourceGone, UpdateNoRoom):
         part.unlink(missing_ok=True)
         raise
-    return part.rename(folder / "update.raucb")
+    return part.rename(folder / name)
 
 
 class Web:

@@ -7,18 +7,22 @@ from importlib.metadata import version
 from pathlib import Path
 
 from device.clock import Clock, Deadline
-from device.errors import UpdateFailed, UpdateNowhere
+from device.errors import DiffuscopeError, UpdateError, UpdateFailed, UpdateNowhere, UpdateSourceGone
 from services.health import probe
 from services.health.checks import Check
+from services.records import update_notes
+from services.records.update_notes import UNDER_WAY, Entry, Found, Trouble
 from services.update import channel, gate, sources
 from services.update.bootchooser import BootChooser, other
 from services.update.engine import Rauc
-from services.update.journal import Entry, Journal, in_words
+from services.update.journal import Journal, in_words
 from services.update.settings import UpdateSettings
 
 log = logging.getLogger(__name__)
 
 ASK_AGAIN_S = 2.0
+GONE = "Put the USB stick back in, look for updates once more, and choose again."
+LOOKED_AT = "looked-at.raucb"
 FORGIVEN = ("camera", "calibration")  # of the head: if they failed before, another version is not to blame
 
 
@@ -52,19 +56,66 @@ class Updater:
 
         Every refusal is an UpdateError of its own; the slot that runs, and the data, are never written.
         """
+        self._install(lambda: self._fetched(place), restart)
+
+    def install_found(self, id: str) -> None:
+        """The same with something that is found now under a name that `look` gave it; UpdateSourceGone if it is not."""
+        self._install(lambda: self._fetched_found(id), restart=True)
+
+    def look(self) -> tuple[Found, ...]:
+        """What could be installed, from sticks, tablet and channel, each judged by what it says of itself."""
+        with gate.alone(self._settings.folder):
+            self._journal.write(state="looking", found=(), version="", looked=True)
+            there = sources.listed(self._settings.sticks, self._settings.tablet)
+            found = [self._judged(one, path) for one, path in there]
+        trouble = None
+        if self._settings.channel:
+            try:
+                if (offer := self.check()) is not None:
+                    found.append(channel.as_found(offer))
+            except UpdateError as error:  # what is on the stick can be installed without a network
+                trouble = Trouble.of(error)
+        self._journal.write(state="none", found=tuple(found), trouble=trouble)
+        return tuple(found)
+
+    def answer(self) -> None:
+        """Do what the page wished; why it was not done stands in the journal."""
+        self.tidy()
+        try:
+            wish = update_notes.take(self._settings.wishes)
+            match wish and wish.do:
+                case "check":
+                    self.look()
+                case "install":
+                    assert wish is not None
+                    assert wish.id is not None
+                    self.install_found(wish.id)
+                case "restart":
+                    self.restart()
+        except DiffuscopeError as error:
+            self._journal.write(trouble=Trouble.of(error))
+            self._tell(f"{error.message}\n{error.remedy}")
+
+    def tidy(self) -> None:
+        """Say of an update that it was interrupted, if whoever was at it is gone."""
+        if self._journal.read().state in UNDER_WAY and not gate.is_under_way(self._settings.folder):
+            self._journal.write(state="interrupted")
+
+    def _install(self, fetch: Callable[[], Path], restart: bool) -> None:
         settings = self._settings
         gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
             ill = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)
-            self._journal.write(state="fetching", version="", before=self.runs, share=0.0, said="", ill=ill)
-            bundle = self._fetched(place)
+            self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
+            bundle = fetch()
             release = self._rauc.release(bundle)
             gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
             gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)  # fetching took a while
-            self._journal.write(state="installing", version=release.version)
+            self._journal.write(state="installing", version=release.version, share=0.0)
             self._rauc.install(bundle, self._progress)
             bundle.unlink()
-            self._journal.write(state="installed", offered="")
+            (settings.tablet / update_notes.UPLOAD).unlink(missing_ok=True)
+            self._journal.write(state="installed", offered="", found=(), looked=False)
             self._tell(f"Version {release.version} is installed.")
             if restart:
                 self._restart()
@@ -93,12 +144,12 @@ class Updater:
         while wrong := self._wrong(forgiven):
             if deadline.left_s() <= 0:
                 said = "; ".join(f"{check.name}: {check.value}. {check.remedy}" for check in wrong)
-                self._journal.write(state="went back", said=said)
+                self._journal.write(state="went back", trouble=Trouble.of(UpdateFailed(said)))
                 self._rauc.mark("bad")
                 raise UpdateFailed(f"version {self.runs} is not well: {said}")
             self._clock.sleep(ASK_AGAIN_S)
         self._rauc.mark("good")
-        self._journal.write(state="committed", said="")
+        self._journal.write(state="committed")
         self._tell(f"Version {self.runs} is well, and committed.")
 
     def status(self) -> tuple[Entry, str]:
@@ -124,6 +175,29 @@ class Updater:
                 raise
         web, offer = self._offer()
         return web.download(offer, folder, self._progress)
+
+    def _fetched_found(self, id: str) -> Path:
+        for found, path in sources.listed(self._settings.sticks, self._settings.tablet):
+            if found.id == id:
+                return sources.copied(path, self._settings.folder, self._progress)
+        if self._settings.channel:
+            web, offer = self._offer()
+            if channel.as_found(offer).id == id:
+                return web.download(offer, self._settings.folder, self._progress)
+        raise UpdateSourceGone("what was chosen is not there any more", GONE)
+
+    def _judged(self, found: Found, path: Path) -> Found:
+        """RAUC reads only what belongs to root and cannot change: so a copy, which nobody else can reach."""
+        folder = self._settings.folder
+        try:
+            release = self._rauc.release(sources.copied(path, folder, self._quietly, LOOKED_AT))
+            found = found.model_copy(update={"version": release.version})
+            gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
+        except UpdateError as error:
+            return found.model_copy(update={"trouble": Trouble.of(error)})
+        finally:
+            (folder / LOOKED_AT).unlink(missing_ok=True)
+        return found
 
     def _offer(self) -> tuple[sources.Web, channel.Offer]:
         if not self._settings.channel:

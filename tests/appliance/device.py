@@ -21,12 +21,14 @@ NAMES = {"A": "root-a", "B": "root-b"}
 SLOT_MB, DATA_MB = 500, 1600
 FOLDERS = ("captures", "compiled", "update", "journal")
 
-# The kernel's words are the host's: ours are laid over them, and once more in the unit that has a /proc of its own.
+# The kernel's words are the host's: ours are laid over them, and once more in the units that have a /proc of their own.
 FIRST = """\
 mount --bind /run/cmdline /proc/cmdline
-place=/run/systemd/system/diffuscope-settle.service.d
-mkdir -p $place
-printf '[Service]\\nBindReadOnlyPaths=/run/cmdline:/proc/cmdline\\n' >$place/slot.conf
+for unit in settle wish; do
+	place=/run/systemd/system/diffuscope-$unit.service.d
+	mkdir -p $place
+	printf '[Service]\\nBindReadOnlyPaths=/run/cmdline:/proc/cmdline\\n' >$place/slot.conf
+done
 exec /lib/systemd/systemd
 """
 

@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,27 @@ PRESS = """\
 import urllib.request as u
 body = '{"eye": "OD"}'.encode()
 print(u.urlopen(u.Request("http://127.0.0.1:8000/api/captures", body, {"Content-Type": "application/json"})).status)
+"""
+
+TAP = """\
+import json, sys, time, urllib.request as u
+
+def ask(method, path, body=None, cookie=""):
+    words = {"Content-Type": "application/json", "Cookie": cookie}
+    data = None if body is None else json.dumps(body).encode()
+    return u.urlopen(u.Request("http://127.0.0.1:8000/api/" + path, data, words, method=method), timeout=60)
+
+door = "unlock" if json.load(ask("GET", "technician"))["has_pin"] else "pin"
+cookie = ask("POST", "technician/" + door, {"pin": "2580"}).headers["Set-Cookie"].split(";")[0]
+told = json.load(ask("GET", "update", cookie=cookie))
+if sys.argv[1] == "install":
+    ask("POST", "update/check", {}, cookie)
+    end = time.monotonic() + 110
+    while (told := json.load(ask("GET", "update", cookie=cookie)))["state"] in ("asked", "looking"):
+        assert time.monotonic() < end, told
+        time.sleep(0.2)
+    ask("POST", "update/install", {"id": told["found"][0]["id"]}, cookie)
+print(json.dumps(told))
 """
 
 
@@ -85,6 +107,20 @@ def update(device: Device, machine: Machine) -> None:
     print(f"installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
 
 
+def tapped(device: Device, machine: Machine) -> dict[str, Any]:
+    """The same by the technician's page, whose process has no rights: what it found on the stick."""
+    begin_s = time.monotonic()
+    told = json.loads(machine.run("python3", "-c", TAP, "install"))
+    device.restarts(machine)
+    print(f"tapped, found, installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+    return dict(told)
+
+
+def shown(machine: Machine) -> dict[str, Any]:
+    """What the update screen shows."""
+    return dict(json.loads(machine.run("python3", "-c", TAP, "look")))
+
+
 def status(machine: Machine) -> str:
     return machine.run(DIFFUSCOPE, "update", "status")
 
@@ -111,7 +147,9 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         kept = device.captures()
         assert len({name.split("/")[1] for name in kept}) == 2
         who = who_it_is(device)
-        update(device, machine)
+        assert (shown(machine)["here"], shown(machine)["runs"]) == (True, "1.0")
+        (found,) = tapped(device, machine)["found"]
+        assert (found["where"], found["stick"], found["version"], found["trouble"]) == ("stick", "stick", "2.0", None)
     assert (device.tried, device.autoboot()) == (True, ("A", "B"))
     with device.on() as machine:
         begin_s = time.monotonic()
@@ -120,6 +158,9 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         print(f"2.0 committed {time.monotonic() - begin_s:.0f} s after its boot")  # noqa: T201
         assert device.autoboot() == ("B", "A")
         assert "Updated to 2.0" in status(machine)
+        told = shown(machine)
+        assert (told["state"], told["runs"], told["trouble"]) == ("committed", "2.0", None)
+        assert told["news"]
         only_root(machine)
         about = "/usr/share/diffuscope"
         assert json.loads(machine.run("cat", f"{about}/release.json"))["version"] == "2.0"
@@ -156,5 +197,7 @@ def test_version_3_is_broken_is_tried_and_taken_back_with_every_capture(
         said = status(machine)
         assert "Version 2.0 runs. Version 3.0 was tried and was not well, so 2.0 is back: page: does not answer" in said
         until_well(machine)
+        told = shown(machine)
+        assert (told["state"], told["version"], told["trouble"]["code"]) == ("went back", "3.0", "update.failed")
         assert machine.run(PYTHON, "-c", PRESS).strip() == "201"
     assert {name: digest for name, digest in device.captures().items() if name in kept} == kept

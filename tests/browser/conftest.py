@@ -1,5 +1,6 @@
 """The real server, the stand-in, and a touch page that fails its test for anything unexpected in the console."""
 
+import os
 import re
 import shutil
 import signal
@@ -35,6 +36,8 @@ class Server:
 
     def __init__(self, data: Path, source: str = "hardware/heads/sim.toml", kind: str = "--head") -> None:
         self.data, self._source = data, (kind, source)
+        self.more: list[str] = []  # words for `run`
+        self.first_on_path: Path | None = None  # where Python looks first: what a version is called
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._log = (data.parent / "server.log").open("ab")
@@ -43,8 +46,9 @@ class Server:
     def start(self) -> None:
         """Launch the process without waiting for it; the first start measures the computer for half a minute."""
         command = [str(Path(sys.executable).parent / "diffuscope"), "run", *self._source]
-        command += ["--port", str(self.port), "--data", str(self.data)]
-        self._process = subprocess.Popen(command, cwd=ROOT, stdout=self._log, stderr=self._log)
+        command += ["--port", str(self.port), "--data", str(self.data), *self.more]
+        place = {"PYTHONPATH": str(self.first_on_path)} if self.first_on_path else {}
+        self._process = subprocess.Popen(command, cwd=ROOT, env=os.environ | place, stdout=self._log, stderr=self._log)
 
     def wait_until_ready(self, limit_s: float = 120) -> None:
         end = time.monotonic() + limit_s
