@@ -123,5 +123,6 @@ def test_every_release_brings_what_the_table_of_the_image_says() -> None:
     assert beside - tools <= brought
     assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
         "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
+        "diffuscope-wish.path",
     }  # fmt: skip
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

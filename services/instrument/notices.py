@@ -55,16 +55,19 @@ class Notices:
         self._began = (self._clock.wall(), self._clock.now_s())
         self._hot, self._told, self._held = Hot(), Standing(), lease.holder
         self._lock, self._enough = Lock(), Event()
-        self._thread = Thread(target=self._watch, name="notices", daemon=True)
+        self._thread: Thread | None = None
 
     def begin(self) -> None:
         """Look every second from now on."""
+        self._enough.clear()
+        self._thread = Thread(target=self._watch, name="notices", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Look no more."""
         self._enough.set()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     def _watch(self) -> None:
         while not self._enough.wait(EVERY_S):

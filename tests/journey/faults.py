@@ -261,7 +261,7 @@ def slow(rig: Rig, shelf: Shelf) -> Said:
     heard: list[Said] = []
 
     def dawdle() -> None:
-        if rig.exam.progress.longest_s and not heard:
+        if rig.exam.state != "aim" and not heard:
             shelf.asked = lambda: None
             rig.clock.sleep(10)
             heard.append(stands(rig, "make.slow"))
@@ -374,6 +374,9 @@ APART = frozenset({"cal.missing", "cal.mismatch", "power.lost"})
 OF_THE_PAGE = {
     "link.lost": ("test_page.py", "test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three"),
     "link.slow": ("test_page_states.py", "test_an_old_live_picture_says_its_age"),
+    "light.cut": ("test_sides.py", "test_a_light_that_went_out_too_early_leaves_one_on_that_tile"),
+    "shot.lost": ("test_sides.py", "test_a_good_picture_that_is_lost_after_next_is_told_until_it_is_taken"),
+    "shot.crossed": ("test_sides.py", "test_a_tile_can_be_crossed_while_aiming_and_uncrossed"),
 }
 # No fault can bring these about, because the server does not do yet what could go wrong.
 NOT_YET = {

@@ -17,6 +17,7 @@ from device.errors import LightLimit as Limit
 from device.ports import Camera
 from device.values import Frame, Shot
 from services.instrument.bulletin import Bulletin
+from services.instrument.exposing import eye_in
 from services.records.picture import read_raw_tiff, to_png
 
 FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
@@ -163,7 +164,7 @@ def test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture(make
     assert first.report["rounds"] == second.report["rounds"] > 5
     raw, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in ("raw.tiff", "dark.tiff"))
     rig.exam.close()  # or it would look, with the same workspace, whether the calibration still fits
-    alone = rig.exam._eye(rig.exam._reconstructor(raw, dark, simulated=True).picture)
+    alone = eye_in(rig.exam._reconstructor(raw, dark, simulated=True).picture, rig.exam.head)
     kept = rig.store.read(a, "picture.png")
     assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # to the last bit
 

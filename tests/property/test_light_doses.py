@@ -261,7 +261,7 @@ class EyesOnTheShelf(Eyes):
             self.folder = self.undo.enter_context(TemporaryDirectory())
         engine = schema.open_engine(f"{self.folder}/shelf.sqlite")
         self.undo.callback(engine.dispose)
-        schema.migrate(engine)
+        schema.migrate(engine, lambda _: None)
         return LightBook(engine, self.times, DAY_S, boot=str(self.boots))
 
 
