@@ -26,6 +26,7 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Real]:
 
 @pytest.fixture
 def real(instrument: Real) -> Iterator[Real]:
+    instrument.rig.app.state.notices.lease._until_s = 0.0  # the tablet of the test before is gone, without a word
     yield instrument
     rig, world = instrument.rig, instrument.rig.world
     world.faults.clear()
@@ -125,7 +126,7 @@ def test_a_full_shelf_in_the_middle_of_a_visit_loses_nothing_and_goes_on(open_pa
     assert real.rig.store.captures() == kept
     real.shelf.free_bytes = sum(
         path.stat().st_size for path in (real.rig.store.folder / "captures" / kept[0].id).iterdir()
-    ) * 40  # fmt: skip
+    ) * 30  # fmt: skip
     is_over(page, "store.full")
     tells(page, "store.low", r"Space for \d+ more")
     real.shelf.free_bytes = MOST_BYTES
@@ -134,7 +135,7 @@ def test_a_full_shelf_in_the_middle_of_a_visit_loses_nothing_and_goes_on(open_pa
     assert len(real.rig.store.captures()) == len(kept) + 1
 
 
-@pytest.mark.parametrize("to", [datetime(2020, 1, 2, 12, tzinfo=UTC), datetime.now(UTC) + timedelta(days=365)])
+@pytest.mark.parametrize("to", [datetime(2020, 1, 2, 12, tzinfo=UTC), datetime.now(UTC) + timedelta(days=300)])
 def test_a_date_that_jumps_is_asked_about_and_changes_neither_order_nor_dose(
     open_page: Open, real: Real, to: datetime
 ) -> None:
@@ -149,7 +150,7 @@ def test_a_date_that_jumps_is_asked_about_and_changes_neither_order_nor_dose(
     is_over(page, "clock.wrong")
     taken(page)
     second = real.rig.store.captures(1)[0]
-    assert second.taken_at.year == to.year != first.taken_at.year
+    assert second.taken_at.date() == to.date() != first.taken_at.date()
     assert [one.id for one in real.rig.store.captures(2)] == [second.id, first.id]
     slot = page.evaluate(f"fetch('/api/visits/{visit_of(page)}').then((answer) => answer.json())")["slots"]["R-centre"]
     assert slot["captures"] == [first.id, second.id]

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -65,10 +65,10 @@ class Said:
     remedy: str = ""
 
 
-def equipped(head: Head) -> Head:
+def equipped(head: Head, now: datetime | None = None) -> Head:
     """The small head with a thermometer, a battery, and a calibration of ten weeks ago."""
     world = head.camera._world  # type: ignore[attr-defined]  # of the simulated camera
-    made_at = VirtualClock().wall() - timedelta(weeks=MAKE_WEEKS)
+    made_at = (now or VirtualClock().wall()) - timedelta(weeks=MAKE_WEEKS)
     return replace(
         head, spec=head.spec.model_copy(update={"bus": BUS}), chips=Chips(SimThermometer(world), SimBattery(world)),
         provenance=Provenance("D-1", made_at, "a technician", "0.1.0"),
