@@ -21,7 +21,7 @@ FLAGS = {"gl": [], "2d": ["--use-gl=disabled"]}
 SIDE, ROUNDS = 1024, 40
 
 SHOWN = """async (side) => {
-  await import("/web/viewer.js");
+  await import(new URL("viewer.js", document.querySelector("script[type=module]").src).href);
   const drawing = Object.assign(document.createElement("canvas"), { width: side, height: side });
   const context = drawing.getContext("2d");
   const pixels = context.createImageData(side, side);

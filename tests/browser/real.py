@@ -41,7 +41,8 @@ class Real:
         build = builder(coarsened(load_head(folder / "head.toml")), folder / "plans")
         self.bulletin = Attentive()
         self.rig: Rig = build(
-            folder, self._undo, head=lambda head: equipped(head, self.clock.wall()), store={"free_bytes": self.shelf}, clock=self.clock,
+            folder, self._undo, head=lambda head: equipped(head, self.clock.wall()),
+            store={"free_bytes": self.shelf}, clock=self.clock,
             bulletin=self.bulletin, wait=False,
         )  # fmt: skip
         assert self.rig.exam.ready.wait(300), "a busy computer makes plans for minutes"

@@ -47,7 +47,7 @@ def test_axe_finds_nothing_on_any_screen(open_page: Open, stub: Stubbed) -> None
     looked.go("visit/v142/person", ".person")
     looked.go("history", ".history .people")
     looked.go("visit/v142/film", ".film .pick")
-    looked.go(f"visit/v142/compare/{first}/{second}", ".two eye-pic[data-mark=final] ~ eye-pic[data-mark=final]")
+    looked.go(f"visit/v142/compare/{first}/{second}", ".two figure:last-child eye-pic[data-mark=final]")
     looked.go("visit/v142/outcome", ".outcome")
     looked.go("visit/v142/aim/R-nerve", "eye-live[data-frame]")
     tap(page, "#finish")

@@ -133,7 +133,7 @@ def test_a_version_that_is_not_well_is_taken_back(device: Device, open_page: Ope
     board.bundle("three.raucb", "3.0")
     with board.path_unit(before):
         page.locator("#look").tap()
-        expect(page.locator("li[data-code='update.older']")).to_be_visible(timeout=90_000)
+        expect(page.locator("li[data-code='update.older']", has_text="0.9")).to_be_visible(timeout=90_000)
         page.wait_for_timeout(700)
         page.get_by_role("button", name="Install 3.0").tap()
         at(page, "restarting")

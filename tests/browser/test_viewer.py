@@ -84,7 +84,7 @@ def test_the_tools_do_what_their_formula_says(bench: Page, painter: str) -> None
     name, pivot, drawn = bench.evaluate(
         """async ([painter, every]) => {
         const { Studio, picture, pixels } = window.bench;
-        const { study } = await import("/web/tone.js");
+        const { study } = await import(new URL("tone.js", document.querySelector("script[type=module]").src).href);
         const studio = painter === "gl" ? new Studio() : new Studio(() => null);
         const drawn = every.map((tools) => {
             const shown = pixels(studio.develop(picture, tools));
@@ -252,7 +252,7 @@ def test_large_pixels_stand_as_squares_and_small_ones_are_smooth(bench: Page) ->
     for scale, squares in ((2.5, False), (4, True), (8, True)):
         got = bench.evaluate(
             """async (scale) => {
-            const { place } = await import("/web/glass.js");
+            const { place } = await import(new URL("glass.js", document.querySelector("script[type=module]").src).href);
             const { pixels } = window.bench;
             const spot = Object.assign(document.createElement("canvas"), { width: 4, height: 4 });
             spot.getContext("2d", { alpha: false }).fillStyle = "#ffffff";
@@ -383,7 +383,7 @@ def test_home_needs_no_viewer_and_a_link_that_was_lost_meanwhile_is_made_good(
         else:
             route.continue_()
 
-    page.route("**/web/viewer.js*", gate)
+    page.route("**/viewer.js", gate)
     page.goto(stub.url)
     page.wait_for_selector("#new")
     settled(page)

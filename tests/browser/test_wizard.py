@@ -221,9 +221,9 @@ def test_a_wrong_pin_waits_and_the_door_can_be_shut(workshop: Server, open_page:
     complaints.expect("403", "401")
     page = open_page(f"{workshop.url}/technician")
     come_in(page)
-    page.wait_for_timeout(700)
-    page.locator("#lock").tap()
-    page.wait_for_selector("[data-view=door]")
+    while page.locator("[data-view=door]").count() == 0:  # a tap within 0.6 s of what the page shows anew does not count
+        page.locator("#lock").tap()
+        page.wait_for_timeout(700)
     page.wait_for_timeout(700)
     page.keyboard.press("Tab")
     page.locator("#pin").fill("0000")

@@ -1,8 +1,8 @@
 // Run inside the page by test_viewer.py and the bench: pictures through the page's own painters, read back from a canvas.
 (async () => {
-  const { Studio } = await import("/web/painter.js");
-  const { openGl } = await import("/web/painter_gl.js");
-  const { lens, place } = await import("/web/glass.js");
+  const { Studio } = await import(new URL("painter.js", document.querySelector("script[type=module]").src).href);
+  const { openGl } = await import(new URL("painter_gl.js", document.querySelector("script[type=module]").src).href);
+  const { lens, place } = await import(new URL("glass.js", document.querySelector("script[type=module]").src).href);
   const answer = await fetch("/api/captures/any/picture.png");
   const picture = await createImageBitmap(await answer.blob());
   const pixels = (source) => {
