@@ -221,7 +221,7 @@ def test_a_wrong_pin_waits_and_the_door_can_be_shut(workshop: Server, open_page:
     complaints.expect("403", "401")
     page = open_page(f"{workshop.url}/technician")
     come_in(page)
-    while page.locator("[data-view=door]").count() == 0:  # a tap within 0.6 s of what the page shows anew does not count
+    while page.locator("[data-view=door]").count() == 0:  # a tap within 0.6 s of a new view does not count
         page.locator("#lock").tap()
         page.wait_for_timeout(700)
     page.wait_for_timeout(700)
