@@ -106,6 +106,7 @@ def installed(opt: Path) -> list[str]:
         if name.startswith(("device/", "services/", "web/", "hardware/", "systemd/")):
             (opt / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, opt / name)  # with its time, by which numba knows what it has compiled
+    shutil.copytree(ROOT / "web" / "vendor", opt / "web" / "vendor")  # not ours, so not in `files`
     blanker = opt / "device" / "drivers" / "blank.py"
     blanker.write_text(Path(__file__).with_name("recorder.py").read_text() + blanker.read_text())
     python = f"python{sys.version_info.major}.{sys.version_info.minor}"
