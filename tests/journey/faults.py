@@ -180,13 +180,14 @@ def light_limit(rig: Rig, shelf: Shelf) -> Said:
     said = pressed(rig)
     assert 0 < said.facts["n"] <= 180
     assert pressed(rig, "OS").way == "verdict", "the other eye can go on"
-    number = live(rig, 0, "OS") + 1
+    live(rig, 0, "OS")
+    rest(rig)  # while a light shines, what it may cost at most is counted, and afterwards what it did cost
     ledger = rig.exam.head.light.ledger
     before = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
-    live(rig, number, "OS")
+    live(rig, rig.exam._preview.number, "OS")
+    rest(rig)
     assert ledger.spent_j_per_cm2("OD") == before[0], "aiming at one eye costs the other nothing"
     assert ledger.spent_j_per_cm2("OS") > before[1]
-    rest(rig)
     rig.clock.sleep(60 * said.facts["n"])
     assert pressed(rig).way == "verdict", "after its rest the eye gets light again"
     return said
