@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -25,12 +25,18 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
+# What a health worker does, on the real server and with every interruption; the rest of the page has a word of its own.
+JOURNEYS := tests/browser/test_page.py tests/browser/test_visit.py
+
 # A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
 # the summary names it, because it is then the test or the page that has to be mended.
 test: .venv/ready browser buses strace ## Run every test that needs no Raspberry Pi.
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd and not paper" --ignore tests/browser --ignore tests/ports --ignore tests/parts
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
-	@$(BIN)/python -m pytest tests/browser --reruns 1 -rR
+	@$(BIN)/python -m pytest $(JOURNEYS) --reruns 1 -rR
+
+test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, voice and technician's rooms.
+	@$(BIN)/python -m pytest tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
 
 test-paper: .venv/ready ## Run the paper's experiments again, and hold every claim that `diffuscope paper` prints.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics
