@@ -148,7 +148,7 @@ def test_the_first_boot_makes_a_data_partition_and_the_second_changes_nothing(ca
     definitions = tree_of(tmp_path) / "etc/repart.d"
     begin_s = time.monotonic()
     repart(definitions, file)
-    print(f"data partition made in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+    print(f"data partition made in {time.monotonic() - begin_s:.1f} s")  # noqa: T201  # a figure for who reads the log (-rP)
     found = partitions(file)
     assert list(found) == [*NAMES, "data"]
     assert found["data"]["bytes"] > 1_500_000_000, "all that is left on the card"
@@ -185,7 +185,7 @@ def test_a_first_boot_that_is_cut_is_finished_by_the_next(card: Path, tmp_path: 
         for name in NAMES:
             assert same(card, file, partitions(card)[name]), f"{name} is not what was written"
         file.unlink()
-    print(f"{sum(found)} of {len(found)} had a data partition when they were cut")  # noqa: T201
+    print(f"{sum(found)} of {len(found)} had a data partition when they were cut")  # noqa: T201  # a figure for who reads the log (-rP)
 
 
 def test_the_encrypted_card_has_a_key_before_it_has_a_partition(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def bundles(workshop: Workshop) -> dict[str, Path]:
     begin_s = time.monotonic()
     broken = {"opt/diffuscope/services/instrument/serve.py": BROKEN, "etc/diffuscope/update.toml": IMPATIENT}
     built = {"1.0": workshop.bundle("1.0"), "2.0": workshop.bundle("2.0"), "3.0": workshop.bundle("3.0", broken)}
-    print(f"three releases built in {time.monotonic() - begin_s:.0f} s")  # noqa: T201
+    print(f"three releases built in {time.monotonic() - begin_s:.0f} s")  # noqa: T201  # a figure for who reads the log (-rP)
     return built
 
 
@@ -79,7 +79,7 @@ def until_well(machine: Machine) -> None:
     """Wait by asking the page, which is cheap; then let the command judge, once."""
     asks = "import json, urllib.request as u; print(json.load(u.urlopen('http://127.0.0.1:8000/api/health'))['ok'])"
     machine.until(lambda: slowly() and "True" in machine.run("python3", "-c", asks, check=False), 240)
-    print(machine.run(DIFFUSCOPE, "health", "--look"))  # noqa: T201
+    print(machine.run(DIFFUSCOPE, "health", "--look"))  # noqa: T201  # a figure for who reads the log (-rP)
 
 
 def until_settled(device: Device, machine: Machine, state: str) -> None:
@@ -104,7 +104,7 @@ def update(device: Device, machine: Machine) -> None:
     begin_s = time.monotonic()
     machine.run("systemd-run", "--quiet", "--no-block", "--unit=technician", DIFFUSCOPE, "update", "install")
     device.restarts(machine)
-    print(f"installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+    print(f"installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201  # a figure for who reads the log (-rP)
 
 
 def tapped(device: Device, machine: Machine) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def tapped(device: Device, machine: Machine) -> dict[str, Any]:
     begin_s = time.monotonic()
     told = json.loads(machine.run("python3", "-c", TAP, "install"))
     device.restarts(machine)
-    print(f"tapped, found, installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201
+    print(f"tapped, found, installed and restarted in {time.monotonic() - begin_s:.1f} s")  # noqa: T201  # a figure for who reads the log (-rP)
     return dict(told)
 
 
@@ -155,7 +155,7 @@ def test_version_1_becomes_2_and_is_committed_by_its_own_health(device: Device, 
         begin_s = time.monotonic()
         assert device.booted == "B"
         until_settled(device, machine, "committed")
-        print(f"2.0 committed {time.monotonic() - begin_s:.0f} s after its boot")  # noqa: T201
+        print(f"2.0 committed {time.monotonic() - begin_s:.0f} s after its boot")  # noqa: T201  # a figure for who reads the log (-rP)
         assert device.autoboot() == ("B", "A")
         assert "Updated to 2.0" in status(machine)
         told = shown(machine)

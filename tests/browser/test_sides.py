@@ -3,7 +3,7 @@
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import Complaints
+from tests.browser.conftest import Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.stub import Stubbed
 from tests.browser.walk import SHUTTER, Open, aiming, live, new_person, settled, taken, tap
@@ -257,10 +257,10 @@ def test_a_picture_of_the_other_eye_is_moved_by_hand_and_back(open_page: Open, s
 
 
 def test_four_pictures_as_fast_as_the_real_camera_allows(
-    open_page: Open, server: object, complaints: Complaints
+    open_page: Open, server: Server, complaints: Complaints
 ) -> None:
     complaints.expect("409", "423")
-    page = open_page(server.url)  # type: ignore[attr-defined]
+    page = open_page(server.url)
     page.set_default_timeout(60_000)
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
     if settled(page).locator("[data-do=useHere]").count():

@@ -128,7 +128,7 @@ def stands(rig: Rig, code: str) -> Said:
 def seen(rig: Rig, times: float = 1.0, **keys: Any) -> Iterator[None]:
     """Another eye stands there for as long: `times` as much light, and other keys of [sim]."""
     spec = rig.world.spec
-    other = World(having(spec, peak_e=spec.sim.peak_e * times, **keys), rig.clock)  # type: ignore[union-attr]
+    other = World(having(spec, peak_e=spec.sim.peak_e * times, **keys), rig.clock)  # type: ignore[union-attr]  # a simulated head has [sim]
     for colour in ("green", "red"):
         other.electrons_per_s(colour)
     own = {name: getattr(rig.world, name) for name in ("_rates", "_setups")}

@@ -75,7 +75,7 @@ def test_a_first_boot_that_is_cut_is_finished_by_the_next_and_then_nothing_chang
     console = board.data.with_name("console")
     pulled_out(board.tree, console, lambda: part.exists() or whole.exists(), *board.words)
     cut = board.identity() if whole.exists() else None
-    print(f"when it was cut the identity was {'whole' if cut else 'not there yet'}")  # noqa: T201
+    print(f"when it was cut the identity was {'whole' if cut else 'not there yet'}")  # noqa: T201  # a figure for who reads the log (-rP)
     whos = []
     for _ in range(2):
         with board.boots() as machine:
