@@ -5,14 +5,12 @@ refinement it is exposed and gets its quick look, and then the refinement goes o
 Every way out of the story leaves the lamp dark.
 """
 
-import json
 import logging
 import secrets
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
 from pathlib import Path
 from threading import Condition, Event, Thread
 
@@ -24,9 +22,10 @@ from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.sequence import lit
 from device.values import EYES, Calibration, Capture, Eye, Glow, Image, Reconstruction, Shot
+from services.instrument.aside import aside
 from services.instrument.bulletin import Bulletin
 from services.instrument.exposing import expose, eye_in
-from services.instrument.filing import QUICK_PX, as_json, capture_files, unmade
+from services.instrument.filing import QUICK_PX, capture_files, report_of, unmade
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
 from services.instrument.pace import BUDGET_S, LAST_S, SEATS
@@ -282,16 +281,17 @@ class Exam:
             log.warning("no picture could be made of it: %s", error, extra={"code": error.code, "about": shot.id})
             made = unmade(shot.frame, error)
         verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
-        report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
-        report["budget_s"] = budget_s
-        report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
-        plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
+        report = report_of(shot, made.report, verdict, budget_s)
         calibration_id = self.head.calibration.id
-        capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, plain, {})
+        capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, report, {})
         self._tell_stage(shot.press, shot.id, "keep")
         shown, quick = eye_in(made.picture, self.head), self._quick.get(shot.id)
-        files = capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, quick)
-        kept = self.store.keep(capture, files, shot.press.errand.beside)
+
+        def keep() -> Capture:
+            files = capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, quick)
+            return self.store.keep(capture, files, shot.press.errand.beside)
+
+        kept = aside(keep, lambda: self._let_live(shot))
         self.bulletin.tell("kept", id=shot.id)
         took_s = sum(report["seconds"].values())
         log.info("a picture was kept after %.1f s, made by %s", took_s, report["method"], extra={"about": shot.id})
@@ -305,10 +305,7 @@ class Exam:
 
         def between() -> None:
             self._watchdog.beat()
-            if self._press is not None and not self._closing:
-                self._let_in()
-            elif self.clock.now_s() - self._alive_s > LIVE_S:
-                self._show_life(shot)
+            self._let_live(shot)
 
         self._alive_s = self.clock.now_s()
         return self._reconstructor(
@@ -316,15 +313,18 @@ class Exam:
             deadline=Deadline.after(self.clock, budget_s), watch=show, between=between,
         )  # fmt: skip
 
-    def _show_life(self, shot: Exposed) -> None:
-        """Between two rounds: pages hear how far it is, and who aims sees a live picture."""
-        self._alive_s = self.clock.now_s()
-        self.progress.goes_on(shot.press, shot.id)
-        if self._alive_s < self._wanted_until_s:
-            self._look()
+    def _let_live(self, shot: Exposed) -> None:
+        """While a picture is made: who pressed is let in; else pages hear how far it is, who aims sees a live picture."""
+        if self._press is not None and not self._closing:
+            return self._let_in()
+        if self.clock.now_s() - self._alive_s > LIVE_S:
+            self._alive_s = self.clock.now_s()
+            self.progress.goes_on(shot.press, shot.id)
+            if self._alive_s < self._wanted_until_s:
+                self._look()
 
     def _let_in(self) -> None:
-        """Between two rounds: who pressed meanwhile is exposed and sees a quick look; then the refinement goes on."""
+        """Who pressed meanwhile is exposed and sees a quick look; then the picture before it goes on."""
         self._answer()
         if self._exposed:
             shot = self._exposed.pop()

@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 
 from device.errors import DiffuscopeError
+from device.recon.verdict import Verdict
 from device.values import Capture, Frame, Image, Reconstruction, Report
+from services.instrument.press import Exposed
 from services.records import picture
 
 QUICK_PX = 640
@@ -33,6 +35,13 @@ def capture_files(
         "quick.jpg": quick or picture.to_jpeg(shown, QUICK_PX, capture.simulated),
         "report.json": as_json(capture.report | {"simulated": capture.simulated}),
     }
+
+
+def report_of(shot: Exposed, made: Report, verdict: Verdict, budget_s: float) -> dict[str, Any]:
+    """The report of a picture that was made within `budget_s`, as it will be read back: lists for tuples, no numpy."""
+    report = asdict(made) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict), "budget_s": budget_s}
+    plain: dict[str, Any] = json.loads(as_json(report | {"seconds": {"expose": shot.expose_s, **made.seconds}}))
+    return plain
 
 
 def unmade(frame: Frame, error: DiffuscopeError) -> Reconstruction:

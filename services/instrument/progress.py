@@ -9,6 +9,9 @@ from services.instrument.bulletin import Bulletin
 from services.instrument.press import Press
 
 STAGES = {"expose": 0.1, "quick": 0.4, "keep": 0.9}  # and where the page's bar stands then
+_AFTER = dict(zip(STAGES, [*list(STAGES.values())[1:], 1.0], strict=True))  # where it will stand at the next one
+_BETWEEN = {"quick": "refine"}  # what is told of the time after a stage, where that is not the stage itself
+KEEPING_S = 0.4
 LATELY = 5  # pictures by which the next is guessed
 
 
@@ -34,13 +37,14 @@ class Progress:
         self._bulletin.tell("stage", id=id, stage=stage, **facts, **press.errand.facts)
 
     def goes_on(self, press: Press, id: str) -> None:
-        """A picture that is refined is as far as its time, by which the last ones were done."""
-        now_s, begun_s = self._clock.now_s(), self._reached_s[id].get("quick", self._clock.now_s())
+        """A picture is as far between two stages as its time, by which the last ones were done: a guess."""
+        now_s = self._clock.now_s()
+        stage, begun_s = next(reversed(self._reached_s[id].items()))
         left_s = max(0.0, self._due_s[id] - now_s)
         share = (now_s - begun_s) / max(now_s - begun_s + left_s, 1e-9)
-        fraction = STAGES["quick"] + (STAGES["keep"] - STAGES["quick"]) * share
+        fraction = STAGES[stage] + (_AFTER[stage] - STAGES[stage]) * share
         facts = {"fraction": fraction, "left_s": round(left_s, 2), "url": None, "key": press.key}
-        self._bulletin.tell("stage", id=id, stage="refine", **facts, **press.errand.facts)
+        self._bulletin.tell("stage", id=id, stage=_BETWEEN.get(stage, stage), **facts, **press.errand.facts)
 
     def over(self, id: str, kept: bool) -> None:
         """A picture was kept, or will never be."""
@@ -64,5 +68,5 @@ class Progress:
     def _alone_s(self, stage: str) -> float:
         if self._took_s[stage]:
             return median(self._took_s[stage])
-        guess_s = {"expose": 2 * self._exposing_s + self._at_most_s(), "quick": self._at_most_s(), "keep": 0.0}
+        guess_s = {"expose": 2 * self._exposing_s + self._at_most_s(), "quick": self._at_most_s(), "keep": KEEPING_S}
         return guess_s[stage]
