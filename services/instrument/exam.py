@@ -314,10 +314,10 @@ class Exam:
         )  # fmt: skip
 
     def _let_live(self, shot: Exposed) -> None:
-        """While a picture is made: who pressed is let in; else pages hear how far it is, who aims sees a live picture."""
+        """Who pressed while a picture is made is let in; else pages hear how far it is, who aims sees a live one."""
         if self._press is not None and not self._closing:
-            return self._let_in()
-        if self.clock.now_s() - self._alive_s > LIVE_S:
+            self._let_in()
+        elif self.clock.now_s() - self._alive_s > LIVE_S:
             self._alive_s = self.clock.now_s()
             self.progress.goes_on(shot.press, shot.id)
             if self._alive_s < self._wanted_until_s:

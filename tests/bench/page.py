@@ -1,8 +1,9 @@
 """The page beside the instrument: from tap to quick look, how alive it is while a picture is refined, its memory.
 
 A real Chromium on the real server with the simulated head, both on the cores of this computer. What the page draws is
-timed in the page itself, by hooks on its requests, events and canvases. By itself: `make bench-page`; MINUTES=60 aims
-for an hour. The exposure is that of the simulated head, which computes for part of it, and is taken off as reported.
+timed in the page itself, by hooks on its requests, events and canvases. A tablet has cores of its own: so the server
+gives way to the browser (`nice`). By itself: `make bench-page`; MINUTES=60 aims for an hour. The exposure is that of
+the simulated head, which computes for part of it, and is taken off as reported.
 """
 
 import json
@@ -19,12 +20,13 @@ import numpy as np
 import tifffile
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from tests.bench.soak import memory
 from tests.bench.timing import head, row
 from tests.bench.wifi import aiming_at, sh
 from tests.browser.conftest import CHROMIUM, ROOT, Server
 
 PRESSES = 30
-MINUTES = 6.0
+MINUTES = 10.0
 HOOKS = """
 window.marks = [];
 const mark = (name, more) => window.marks.push([name, performance.now(), more]);
@@ -68,12 +70,19 @@ Object.defineProperty(HTMLProgressElement.prototype, "value", { ...valued, set(v
 Mark = tuple[str, float, Any]
 
 
-def opened(browser: Browser, url: str, hooks: str = HOOKS) -> Page:
+def opened(browser: Browser, url: str) -> Page:
     page = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True).new_page()
-    page.add_init_script(hooks)
+    page.add_init_script(HOOKS)
     page.goto(url)
     page.wait_for_selector("eye-live[data-frame]", timeout=60_000)
     return page
+
+
+def anew(page: Page, url: str) -> None:
+    """Aim at the next person, as if just loaded."""
+    page.goto("about:blank")
+    page.goto(aiming_at(url.split("/#")[0]))
+    page.wait_for_selector("eye-live[data-frame]")
 
 
 def marks(page: Page) -> list[Mark]:
@@ -97,6 +106,13 @@ def pressed(page: Page) -> list[Mark] | None:
     return marks(page) if page.locator("[data-phase=kept]").count() else None
 
 
+def without_a_step_ms(noted: list[Mark]) -> float:
+    """The longest time, from the quick look to the picture, in which nothing moved on the page."""
+    begin = first(noted, "shown quick")
+    seen = [at for name, at, _ in noted if name in ("progress", "shown quick", "shown final") and at >= begin]
+    return float(np.diff(sorted(seen)).max())
+
+
 PARTS = ("tap", "post", "expose", "quick", "fetched", "shown quick")
 NAMES = {
     "tap": "  tap to request", "post": "  request to exposure", "expose": "  frames to quick look, without exposure",
@@ -112,21 +128,16 @@ def quick_looks(browser: Browser, url: str) -> None:
             break
         if (noted := pressed(page)) is None:
             page.wait_for_timeout(3000)
-            page.goto("about:blank")
-            page.goto(aiming_at(url.split("/#")[0]))
-            page.wait_for_selector("eye-live[data-frame]")
+            anew(page, url)
             continue
         exposed_ms = 1000 * next(more for name, _, more in noted if name == "kept")["expose"]
         times = [first(noted, name) for name in PARTS]
         taken = np.diff(times) - np.array([0, 0, exposed_ms, 0, 0])
         parts.append(taken)
         whole.append(float(taken.sum()))
-        seen = [at for name, at, _ in noted if name in ("progress", "shown quick", "shown final") and at >= times[-1]]
-        gaps.append(float(np.diff(sorted(seen)).max()))
+        gaps.append(without_a_step_ms(noted))
         lasted.append(first(noted, "kept") - times[-1])
-        page.goto("about:blank")
-        page.goto(aiming_at(url.split("/#")[0]))
-        page.wait_for_selector("eye-live[data-frame]")
+        anew(page, url)
     head(f"press to quick look, {len(whole)} presses, s", "p50", "p95", "worst", "limit")
     show("tap to quick look on the screen, without exposure", whole, 0.35)
     for name, column in zip(PARTS, np.array(parts).T, strict=False):
@@ -139,6 +150,22 @@ def quick_looks(browser: Browser, url: str) -> None:
 def show(name: str, times_ms: list[float], limit_s: float | None = None) -> None:
     p50, p95, worst = (float(np.percentile(times_ms, q)) / 1000 for q in (50, 95, 100))
     row(name, p50, p95, worst, limit=limit_s, value=p95)
+
+
+def staying(browser: Browser, url: str, rounds: int = 8) -> None:
+    """Print how alive a page is that waits for the picture of a large sensor."""
+    page, gaps, lasted = opened(browser, url), [], []
+    for _ in range(rounds):
+        if (noted := pressed(page)) is None:
+            page.wait_for_timeout(3000)
+        else:
+            gaps.append(without_a_step_ms(noted))
+            lasted.append(first(noted, "shown final") - first(noted, "shown quick"))
+        anew(page, url)
+    head(f"waiting for the picture of a large sensor, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
+    show("longest time without a step of progress", gaps, 1.0)
+    show("  quick look to picture", lasted)
+    page.context.close()
 
 
 def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
@@ -163,41 +190,12 @@ def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
             gaps.append(float(np.diff([tapped, *seen]).max()))
             lasted.append(first(noted, "kept") - tapped)
             frames.append(sum(name == "live" for name, *_ in noted))
-        page.goto("about:blank")
-        page.goto(aiming_at(url.split("/#")[0]))
-        page.wait_for_selector("eye-live[data-frame]")
-    head(f"going on while a picture is refined, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
+        anew(page, url)
+    head(f"going on while that of a large sensor is refined, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
     show("tap to the next screen", answers, 0.1)
     show("longest time without a live picture", gaps, 1.0)
     show("  how long the picture was still made", lasted)
     row("  live pictures meanwhile, number", *(float(np.percentile(frames, q)) for q in (50, 5, 0)))
-    page.context.close()
-
-
-def renderers_mb(browser: Browser) -> float:
-    """The memory that the processes which draw pages have for themselves."""
-    told = browser.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
-    sizes = [Path(f"/proc/{one['id']}/status").read_text() for one in told if one["type"] == "renderer"]
-    return sum(int(line.split()[1]) for text in sizes for line in text.splitlines() if "RssAnon" in line) / 1024
-
-
-def memory(browser: Browser, url: str, minutes: float) -> None:
-    """Print by how much an hour of aiming fills the memory, by a straight line through the minutes after the first."""
-    page = opened(browser, url, hooks="")  # what they note would fill the memory
-    tools = page.context.new_cdp_session(page)
-    seen: list[tuple[float, float, float]] = []
-    for at_s in np.arange(0.0, 60 * minutes + 1, 10.0):
-        tools.send("HeapProfiler.collectGarbage")
-        heap_mb = tools.send("Runtime.getHeapUsage")["usedSize"] / 2**20
-        seen.append((at_s / 3600, heap_mb, renderers_mb(browser)))
-        page.wait_for_timeout(10_000)
-    number = page.locator("eye-live").get_attribute("data-frame")
-    hours, *kinds = np.array([one for one in seen if one[0] >= 1 / 60]).T
-    head(f"memory, {minutes:.0f} min of aiming, MB ({number} live pictures)", "begin", "end", "in 1 h", "sd", "limit")
-    for name, mb in zip(("heap of the page's code", "renderer, all that is its own"), kinds, strict=True):
-        (slope, _), spread = np.polyfit(hours, mb, 1, cov=True)
-        sd = float(np.sqrt(spread[0, 0]))
-        row(f"{name}, extrapolated", float(mb[0]), float(mb[-1]), float(slope), sd, limit=10.0, value=float(slope))
     page.context.close()
 
 
@@ -225,6 +223,7 @@ def serving(folder: Path, *source: str) -> Iterator[str]:
     """The address at which somebody aims, on a server of its own."""
     folder.mkdir()
     server = Server(folder / "data", *source)
+    server.before = ["nice", "-n", "5"]
     server.start()
     try:
         ready(server)
@@ -241,10 +240,11 @@ def main() -> None:
         with serving(Path(place) / "ours") as url:
             quick_looks(browser, url)
         with serving(Path(place) / "long", str(a_long_one(Path(place))), "--replay") as url:
+            staying(browser, url)
             going_on(browser, url)
-        with serving(Path(place) / "hour") as url:
-            memory(browser, url, minutes)
         browser.close()
+        with serving(Path(place) / "hour") as url:
+            memory(url, minutes)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ class Server:
 
     def __init__(self, data: Path, source: str = "hardware/heads/sim.toml", kind: str = "--head") -> None:
         self.data, self._source = data, (kind, source)
+        self.before: list[str] = []  # words before the command, such as `nice`
         self.more: list[str] = []  # words for `run`
         self.first_on_path: Path | None = None  # where Python looks first: what a version is called
         self.port = free_port()
@@ -45,7 +46,7 @@ class Server:
 
     def start(self) -> None:
         """Launch the process without waiting for it; the first start measures the computer for half a minute."""
-        command = [str(Path(sys.executable).parent / "diffuscope"), "run", *self._source]
+        command = [*self.before, str(Path(sys.executable).parent / "diffuscope"), "run", *self._source]
         command += ["--port", str(self.port), "--data", str(self.data), *self.more]
         place = {"PYTHONPATH": str(self.first_on_path)} if self.first_on_path else {}
         self._process = subprocess.Popen(command, cwd=ROOT, env=os.environ | place, stdout=self._log, stderr=self._log)
