@@ -1,0 +1,143 @@
+"""How much an hour of aiming fills the page's memory, in a Chromium that nobody is attached to.
+
+Playwright listens to the network of every page it opens, and the page's own process keeps what it may be asked for: by
+that alone it grew by 30 MB an hour. Here commands go through a pipe, and a page is attached to only while it is asked.
+What a renderer has for itself is what the kernel counts as its private, written memory, after its rubbish is collected.
+"""
+
+import json
+import os
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.bench.timing import head, row
+from tests.browser.conftest import CHROMIUM
+
+EVERY_S, LOOKS = 10.0, 30  # how often it is looked at, and how many times at the least
+WARM_H = 1 / 60  # until then fonts, code and caches arrive that no later minute brings again
+WORDS = ("--headless", "--no-sandbox", "--window-size=1280,800", "--remote-debugging-pipe")
+PIPED = 'exec "$0" "$@" 3<&{} 4>&{}'  # where Chromium reads its commands, and where it answers
+
+
+class Alone:
+    """A Chromium with one page, spoken to through a pipe; between two questions nothing listens to the page."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        reads, self._commands = os.pipe()
+        self._answers, writes = os.pipe()
+        words = (CHROMIUM, *WORDS, f"--user-data-dir={folder}", "about:blank")
+        piped = ["bash", "-c", PIPED.format(reads, writes), *words]
+        self._process = subprocess.Popen(piped, pass_fds=(reads, writes), stderr=subprocess.DEVNULL)
+        os.close(reads)
+        os.close(writes)
+        self._heard, self._number = b"", 0
+        self.ask("Page.navigate", url=url)
+
+    def ask(self, method: str, **words: Any) -> dict[str, Any]:
+        """What the page answers; it is attached to for that long."""
+        page = next(one for one in self._pages() if one["type"] == "page")
+        session = self._say("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+        answer = self._say(method, session, **words)
+        self._say("Target.detachFromTarget", sessionId=session)
+        return answer
+
+    def value(self, expression: str) -> Any:
+        """What an expression is worth in the page."""
+        return self.ask("Runtime.evaluate", expression=expression)["result"].get("value")
+
+    def own_mb(self) -> float:
+        """The private, written memory of the processes that draw pages."""
+        told = self._say("SystemInfo.getProcessInfo")["processInfo"]
+        sizes = [Path(f"/proc/{one['id']}/smaps_rollup").read_text() for one in told if one["type"] == "renderer"]
+        return (
+            sum(int(line.split()[1]) for text in sizes for line in text.splitlines() if "Private_Dirty" in line) / 1024
+        )
+
+    def close(self) -> None:
+        """End it."""
+        self._process.terminate()
+        self._process.wait(10)
+        os.close(self._commands)
+        os.close(self._answers)
+
+    def _pages(self) -> list[dict[str, Any]]:
+        while not (told := self._say("Target.getTargets")["targetInfos"]):
+            time.sleep(0.1)  # it begins without
+        targets: list[dict[str, Any]] = told
+        return targets
+
+    def _say(self, method: str, session: str | None = None, **words: Any) -> dict[str, Any]:
+        self._number += 1
+        command = {"id": self._number, "method": method, "params": words} | ({"sessionId": session} if session else {})
+        os.write(self._commands, json.dumps(command).encode() + b"\0")
+        while (answer := self._next()).get("id") != self._number:
+            pass  # an event: nobody listens
+        assert "result" in answer, answer
+        result: dict[str, Any] = answer["result"]
+        return result
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._heard:
+            more = os.read(self._answers, 1 << 16)
+            assert more, "the browser ended"
+            self._heard += more
+        one, self._heard = self._heard.split(b"\0", 1)
+        message: dict[str, Any] = json.loads(one)
+        return message
+
+
+class Seen(NamedTuple):
+    """One look: when, the heap of the page's code, and all that its process has for itself."""
+
+    at_h: float
+    heap_mb: float
+    own_mb: float
+
+
+def memory(url: str, minutes: float) -> None:
+    """Print the curve of the memory, whether it still rises in the second half, and what an hour would add by that."""
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        closing(Alone(Path(folder), url)) as browser,
+    ):
+        while not browser.value("document.querySelector('eye-live[data-frame]') !== null"):
+            time.sleep(0.5)
+        seen = np.array(list(watched(browser, minutes)))
+        number = browser.value("document.querySelector('eye-live').dataset.frame")
+    at_h, *kinds = seen.T
+    warm = at_h >= min(WARM_H, at_h[-1] / 2)
+    columns = ("1st min", "then", "mid", "end", "rise/h", "sd", "in 1 h", "limit")
+    head(f"memory, {minutes:.0f} min of aiming, MB ({number} live pictures)", *columns)
+    for name, mb in zip(("heap of the page's code", "its process, all that is its own"), kinds, strict=True):
+        told(f"{name}, extrapolated", at_h[warm], mb[warm], float(mb[0]))
+    print("rise/h: by a straight line through the second half; in 1 h: what was seen, and that rise for the rest")
+    parts = np.array_split(np.array(kinds[1]), min(len(at_h), 10))
+    print("its process, means of ten equal parts of the time: " + " ".join(f"{part.mean():.1f}" for part in parts))
+
+
+def watched(browser: Alone, minutes: float) -> Iterator[Seen]:
+    """A look every ten seconds, or oftener in a short run, after the rubbish was collected."""
+    begin_s = time.monotonic()
+    for at_s in np.arange(0.0, 60 * minutes + 1, min(EVERY_S, 60 * minutes / LOOKS)):
+        time.sleep(max(0.0, begin_s + at_s - time.monotonic()))
+        browser.ask("HeapProfiler.collectGarbage")
+        heap_mb = browser.ask("Runtime.getHeapUsage")["usedSize"] / 2**20
+        yield Seen((time.monotonic() - begin_s) / 3600, heap_mb, browser.own_mb())
+
+
+def told(name: str, at_h: NDArray[np.float64], mb: NDArray[np.float64], first_mb: float) -> None:
+    """One row: the curve, its rise in the second half, and what an hour adds to the first warm look."""
+    late = at_h >= (at_h[0] + at_h[-1]) / 2
+    (rise, _), spread = np.polyfit(at_h[late], mb[late], 1, cov=True)
+    few = max(1, len(mb) // 10)
+    begin, mid, end = (float(np.median(part)) for part in (mb[:few], mb[late][:few], mb[-few:]))
+    in_1_h = end - begin + float(rise) * max(0.0, 1.0 - (at_h[-1] - at_h[0]))
+    row(name, first_mb, begin, mid, end, float(rise), float(np.sqrt(spread[0, 0])), in_1_h, limit=10.0, value=in_1_h)
