@@ -103,7 +103,7 @@ bench-retinas: .venv/ready ## Print the acceptance figures on real photographs a
 bench-wifi: .venv/ready browser ## Print how the page fares at the end of a bad link (network namespace; needs root).
 	@$(BIN)/python -m tests.bench.wifi
 
-MINUTES ?= 6
+MINUTES ?= 10
 
 bench-page: .venv/ready browser ## Print the time from tap to quick look, how alive the page stays, its memory; MINUTES=60.
 	@$(BIN)/python -m tests.bench.page $(MINUTES)
