@@ -130,19 +130,21 @@ def test_a_power_cut_in_a_picture_names_its_eye_and_part(build: Callable[..., Ri
 
 
 def test_stages_say_how_long_it_still_takes(make_rig: MakeRig) -> None:
+    left_s: dict[tuple[str, str], float] = {}  # by capture and stage; between two stages pages hear more
+
     class Slow(Attentive):
         """Each stage takes a second more, as on a slow computer."""
 
         def tell(self, kind: str, **data: Any) -> None:
             super().tell(kind, **data)
-            if kind == "stage" and data["stage"] != "refine":
+            if kind == "stage" and data["stage"] != "refine" and (data["id"], data["stage"]) not in left_s:
+                left_s[data["id"], data["stage"]] = data["left_s"]
                 rig.clock.sleep(1.0)
 
     rig = make_rig(bulletin=Slow())
     for _ in range(2):
         rig.exam.press("OD").result(30)
-    left_s = [data["left_s"] for kind, data in rig.told() if kind == "stage" and data["stage"] != "refine"]
-    assert left_s == pytest.approx([5.2, 5.0, 0.0, 3.2, 2.0, 1.0], abs=0.11)
+    assert list(left_s.values()) == pytest.approx([5.2, 5.0, 0.4, 3.2, 2.0, 1.0], abs=0.11)
 
 
 @pytest.mark.parametrize(
