@@ -37,12 +37,12 @@ class Progress:
         self._bulletin.tell("stage", id=id, stage=stage, **facts, **press.errand.facts)
 
     def goes_on(self, press: Press, id: str) -> None:
-        """A picture is as far between two stages as its time, by which the last ones were done: a guess."""
+        """Between two stages a picture is as far as its time, by which the last ones were done: a guess."""
         now_s = self._clock.now_s()
         stage, begun_s = next(reversed(self._reached_s[id].items()))
-        left_s = max(0.0, self._due_s[id] - now_s)
-        share = (now_s - begun_s) / max(now_s - begun_s + left_s, 1e-9)
+        share = _share(now_s - begun_s, self._due_s[id] - begun_s)
         fraction = STAGES[stage] + (_AFTER[stage] - STAGES[stage]) * share
+        left_s = max(0.0, self._due_s[id] - now_s)
         facts = {"fraction": fraction, "left_s": round(left_s, 2), "url": None, "key": press.key}
         self._bulletin.tell("stage", id=id, stage=_BETWEEN.get(stage, stage), **facts, **press.errand.facts)
 
@@ -70,3 +70,10 @@ class Progress:
             return median(self._took_s[stage])
         guess_s = {"expose": 2 * self._exposing_s + self._at_most_s(), "quick": self._at_most_s(), "keep": KEEPING_S}
         return guess_s[stage]
+
+
+def _share(gone_s: float, guessed_s: float) -> float:
+    """How much of its time is gone: nine tenths when the guess is over, and then ever more slowly towards all of it."""
+    if gone_s <= guessed_s:
+        return 0.9 * gone_s / max(guessed_s, 1e-9)
+    return 1 - 0.1 * guessed_s / gone_s
