@@ -1,7 +1,8 @@
 """Power cuts: what a program wrote is noted down call by call, and cut off after each of them.
 
 A disk may forget whatever was not synced, any part of it, in any order. `Disk` is such a disk in memory: it follows the
-system calls that `strace` noted, and says what it could hold after a cut. See README.md for what it does not know.
+system calls that `strace` noted, and says what it could hold after a cut. A part of it may be FAT, where a rename is
+three writes. See README.md for what it does not know.
 """
 
 import random
@@ -52,8 +53,23 @@ class Thing:
         _apply(self.now, change)
 
     def sync(self) -> None:
-        self.sure = bytes(self.now) if isinstance(self.now, bytearray) else dict(self.now)
-        self.since.clear()
+        """All is on the disk; but on FAT, where a thing lies is written with the thing, not with its folder."""
+        if isinstance(self.now, bytearray):
+            self.sure, self.since = bytes(self.now), []
+            return
+        assert isinstance(self.sure, dict)
+        placed = [change for change in self.since if change[0] == "place"]
+        for change in self.since:
+            if change not in placed:
+                _apply(self.sure, change)
+        self.since = placed
+
+    def place(self, thing: "Thing") -> None:
+        """Where a thing in this folder lies is on the disk."""
+        assert isinstance(self.sure, dict)
+        for change in [change for change in self.since if change[0] == "place" and change[2] is thing]:
+            _apply(self.sure, change)
+            self.since.remove(change)
 
 
 def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> None:
@@ -64,8 +80,10 @@ def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> No
         case ("length", int(length)), bytearray():
             del to[length:]
             to.extend(bytes(length - len(to)))
-        case ("name", str(name), Thing() as thing), dict():
+        case ("name" | "place", str(name), Thing() as thing), dict():
             to[name] = thing
+        case ("freed",), bytearray():
+            to[:] = bytes(len(to))
         case ("forget", str(name)), dict():
             to.pop(name, None)
         case ("rename", str(name), str(new), Thing() as thing), dict():  # one step, if it is within one folder
@@ -80,10 +98,13 @@ Survives = Callable[[Thing, tuple[object, ...]], tuple[object, ...] | None]
 
 
 class Disk:
-    """A folder on a disk that forgets; everything in it at the beginning is there for certain."""
+    """A folder on a disk that forgets; everything in it at the beginning is there for certain.
 
-    def __init__(self, folder: Path, before: Path) -> None:
-        self._at = f"{folder}/"
+    `fat` names the folders in it that are FAT, without `sync` among the words of their mount.
+    """
+
+    def __init__(self, folder: Path, before: Path, fat: tuple[str, ...] = ()) -> None:
+        self._at, self._fat = f"{folder}/", fat
         self._root = _found(before)
         self._places: dict[tuple[str, int], int] = {}
         self.said = ""
@@ -119,6 +140,8 @@ class Disk:
                 return False
             case "fsync" | "fdatasync":
                 self._thing(paths[0]).sync()
+                if paths[0]:
+                    self._folder(paths[0]).place(self._thing(paths[0]))
             case "mkdir" | "mkdirat":
                 self._folder(paths[0]).do("name", name, Thing({}, {}))
             case "unlink" | "rmdir" | "unlinkat":
@@ -168,7 +191,9 @@ class Disk:
     def _rename(self, old: str, new: str) -> None:
         thing, source, target = self._thing(old), self._folder(old), self._folder(new)
         names = old.rpartition("/")[2], new.rpartition("/")[2]
-        if source is target:
+        if new.split("/")[0] in self._fat:
+            _rename_on_fat(source, target, names, thing)
+        elif source is target:
             source.do("rename", *names, thing)
         else:
             target.do("name", names[1], thing)
@@ -214,6 +239,21 @@ class Disk:
             left: dict[str, bytes | None] = {}
             _collect(self._root, "", way, left)
             yield left
+
+
+def _rename_on_fat(source: Thing, target: Thing, names: tuple[str, str], thing: Thing) -> None:
+    """Three writes, of which any may be left: a new entry that leads nowhere, where it leads, the old entry's end.
+
+    Of a file that was there before, the room is given back: its entry, if it is left as it was, leads to anything.
+    """
+    assert isinstance(target.now, dict)
+    before = target.now.get(names[1])
+    if before is None:
+        target.do("name", names[1], Thing(type(thing.now)(), type(thing.sure)()))
+    else:
+        before.do("freed")
+    target.do("place", names[1], thing)
+    source.do("forget", names[0])
 
 
 def _parsed(line: str) -> tuple[str, str, int]:
