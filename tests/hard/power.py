@@ -65,11 +65,11 @@ class Thing:
         self.since = placed
 
     def place(self, thing: "Thing") -> None:
-        """Where a thing in this folder lies is on the disk."""
+        """Where a thing in this folder lies is on the disk, and with it, in one entry, what it is called."""
         assert isinstance(self.sure, dict)
         for change in [change for change in self.since if change[0] == "place" and change[2] is thing]:
             _apply(self.sure, change)
-            self.since.remove(change)
+            self.since = [other for other in self.since if other[:2] not in (("name", change[1]), change[:2])]
 
 
 def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> None:

@@ -73,9 +73,10 @@ def export(folder: Path, say: Callable[[str], None]) -> None:
 def judge_export(folder: Path, said: list[str]) -> str:
     """Under the visit's own name lies the whole of it, or nothing; and it can be exported once more beside it."""
     visit = folder / "stick" / VISIT
+    outcome = "new" if visit.exists() else "old"
     found = {path.name: path.read_bytes() for path in visit.iterdir()} if visit.exists() else {}
     assert found in ({}, FILES)
     assert found == FILES or not said
     again = copied(folder / "stick", VISIT, FILES)
     assert {path.name: path.read_bytes() for path in again.iterdir()} == FILES
-    return "new" if found else "empty" if visit.exists() else "old"
+    return outcome if found or outcome == "old" else "empty"
