@@ -11,6 +11,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 CALLS = (
@@ -22,6 +23,7 @@ WORD = re.compile(r'"((?:\\x..)*)"')
 OPENED = re.compile(r"\d+<((?:\\x..)*)>")
 OPEN = re.compile(r"^(?:AT_FDCWD|\d+)<((?:\\x..)*)>")
 DRAWS = 3
+MOST_ALONE = 8  # changes of which each is once the only one that is left: the last ones
 SECTOR_BYTES = 512
 
 
@@ -48,9 +50,10 @@ class Thing:
     sure: "bytes | dict[str, Thing]"
     since: list[tuple[object, ...]] = field(default_factory=list)
 
-    def do(self, *change: object) -> None:
+    def do(self, *change: object) -> tuple[object, ...]:
         self.since.append(change)
         _apply(self.now, change)
+        return change
 
     def sync(self) -> None:
         """All is on the disk; but on FAT, where a thing lies is written with the thing, not with its folder."""
@@ -84,7 +87,7 @@ def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> No
             to[name] = thing
         case ("freed",), bytearray():
             to[:] = bytes(len(to))
-        case ("forget", str(name)), dict():
+        case ("forget", str(name), *_), dict():
             to.pop(name, None)
         case ("rename", str(name), str(new), Thing() as thing), dict():  # one step, if it is within one folder
             to[new] = thing
@@ -195,9 +198,8 @@ class Disk:
             _rename_on_fat(source, target, names, thing)
         elif source is target:
             source.do("rename", *names, thing)
-        else:
-            target.do("name", names[1], thing)
-            source.do("forget", names[0])
+        else:  # a journal does not forget the old name before it knows the new one
+            source.do("forget", names[0], target.do("name", names[1], thing))
 
     def _folder(self, path: str) -> Thing:
         return self._thing(path.rpartition("/")[0])
@@ -218,8 +220,11 @@ class Disk:
     def cuts(self, draw: random.Random) -> Iterator[dict[str, bytes | None]]:
         """What could be on the disk if the power went now, by path; None is a folder.
 
-        All that was not synced is gone; nothing is; only names are left; only content; and draws of any part of it.
+        All that was not synced is gone; nothing is; only names are left; only content; each change alone; and draws of
+        any part of it.
         """
+        waiting: list[tuple[object, ...]] = []
+        _collect(self._root, "", lambda thing, change: waiting.append(change) or change, {})  # type: ignore[func-returns-value]
         ways: list[Survives] = [
             lambda thing, change: None,
             lambda thing, change: change,
@@ -235,9 +240,10 @@ class Disk:
                     return "write", at, data[: SECTOR_BYTES * draw.randint(0, len(data) // SECTOR_BYTES)]
             return change
 
-        for way in (*ways, *[some] * DRAWS):
+        alone = [partial(_alone, one) for one in waiting[-MOST_ALONE:]]
+        for way in (*ways, *alone, *[some] * DRAWS):
             left: dict[str, bytes | None] = {}
-            _collect(self._root, "", way, left)
+            _collect(self._root, "", _together(way, waiting), left)
             yield left
 
 
@@ -254,6 +260,26 @@ def _rename_on_fat(source: Thing, target: Thing, names: tuple[str, str], thing: 
         before.do("freed")
     target.do("place", names[1], thing)
     source.do("forget", names[0])
+
+
+def _alone(one: tuple[object, ...], thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+    return change if change is one else None
+
+
+def _together(way: Survives, waiting: list[tuple[object, ...]]) -> Survives:
+    """The same, but the old name of what was moved to another folder goes only if the new one is there."""
+    kept: dict[int, tuple[object, ...] | None] = {}
+    ids = {id(change) for change in waiting}
+
+    def decide(thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+        if id(change) not in kept:
+            kept[id(change)] = way(thing, change)
+        match change:
+            case ("forget", _, tuple() as moved) if id(moved) in ids and decide(thing, moved) is None:
+                return None
+        return kept[id(change)]
+
+    return decide
 
 
 def _parsed(line: str) -> tuple[str, str, int]:
