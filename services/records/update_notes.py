@@ -67,7 +67,8 @@ class Entry(BaseModel):
     """How far an update is.
 
     `trouble` is what went wrong; `ill` the checks that failed before the update, which it is not blamed for; `boot` the
-    start of the computer in which `state` was written; `offered` what the channel has that is newer.
+    start of the computer in which `state` was written; `settling` that the version that is tried wrote it itself;
+    `offered` what the channel has that is newer.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # a later release may say more
@@ -82,6 +83,7 @@ class Entry(BaseModel):
     found: tuple[Found, ...] = ()
     looked: bool = False
     boot: str = ""
+    settling: bool = False
 
 
 class Wish(BaseModel):
@@ -156,6 +158,8 @@ def stage(entry: Entry, runs: str, boot: str) -> str:
             return entry.state if same_boot else "interrupted"
         case "trying" if entry.version != runs:
             return "restarting" if same_boot else "lost"
+        case "trying" if entry.settling and not same_boot:  # what runs once more was committed; then the power went
+            return "committed"
         case "committed" if entry.version != runs:
             return "none"
     return entry.state

@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from device.clock import Clock, Deadline
-from device.errors import DiffuscopeError, UpdateError, UpdateFailed, UpdateNowhere, UpdateSourceGone
+from device.errors import DiffuscopeError, UpdateBusy, UpdateError, UpdateFailed, UpdateNowhere, UpdateSourceGone
 from services.health import probe
 from services.health.checks import Check
 from services.records import update_notes
@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 ASK_AGAIN_S = 2.0
 GONE = "Put the USB stick back in, look for updates once more, and choose again."
-LOOKED_AT = "looked-at.raucb"
 FORGIVEN = ("camera", "calibration")  # of the head: if they failed before, another version is not to blame
 
 
@@ -97,15 +96,21 @@ class Updater:
             self._tell(f"{error.message}\n{error.remedy}")
 
     def tidy(self) -> None:
-        """Say of an update that it was interrupted, if whoever was at it is gone."""
-        if self._journal.read().state in UNDER_WAY and not gate.is_under_way(self._settings.folder):
-            self._journal.write(state="interrupted")
+        """After an update that was interrupted: say so, and give back the room that it took."""
+        try:
+            with gate.alone(self._settings.folder):
+                sources.clear(self._settings.folder)
+                if self._journal.read().state in UNDER_WAY:
+                    self._journal.write(state="interrupted")
+        except UpdateBusy:  # it goes on
+            return
 
     def _install(self, fetch: Callable[[], Path], restart: bool) -> None:
         settings = self._settings
         gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
             ill = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)
+            sources.clear(settings.folder)
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
             bundle = fetch()
             release = self._rauc.release(bundle)
@@ -113,7 +118,8 @@ class Updater:
             gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)  # fetching took a while
             self._journal.write(state="installing", version=release.version, share=0.0)
             self._rauc.install(bundle, self._progress)
-            bundle.unlink()
+            for done in (bundle, settings.folder / sources.WHOLE):
+                done.unlink(missing_ok=True)
             (settings.tablet / update_notes.UPLOAD).unlink(missing_ok=True)
             self._journal.write(state="installed", offered="", found=(), looked=False)
             self._tell(f"Version {release.version} is installed.")
@@ -139,7 +145,7 @@ class Updater:
         if not gate.is_trying(self._chooser):
             self._tell(f"Version {self.runs} is committed already.")
             return
-        forgiven = set(FORGIVEN) & set(self._journal.write(version=self.runs, state="trying").ill)
+        forgiven = set(FORGIVEN) & set(self._journal.write(version=self.runs, state="trying", settling=True).ill)
         deadline = Deadline.after(self._clock, self._settings.patience_s)
         while wrong := self._wrong(forgiven):
             if deadline.left_s() <= 0:
@@ -190,13 +196,13 @@ class Updater:
         """RAUC reads only what belongs to root and cannot change: so a copy, which nobody else can reach."""
         folder = self._settings.folder
         try:
-            release = self._rauc.release(sources.copied(path, folder, self._quietly, LOOKED_AT))
+            release = self._rauc.release(sources.copied(path, folder, self._quietly))
             found = found.model_copy(update={"version": release.version})
             gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
         except UpdateError as error:
             return found.model_copy(update={"trouble": Trouble.of(error)})
         finally:
-            (folder / LOOKED_AT).unlink(missing_ok=True)
+            sources.clear(folder)
         return found
 
     def _offer(self) -> tuple[sources.Web, channel.Offer]:

@@ -18,7 +18,7 @@ from tests.appliance.releases import Workshop
 from tests.house import ROOT
 
 NOWHERE = "http://127.0.0.1:9"  # no instrument: a device whose page does not answer may be updated
-SLOT_MB = 32
+SLOT_KB = 32_768
 BACKEND = """\
 #!{python} -I
 import sys
@@ -103,7 +103,7 @@ class Bench:
 
 
 @contextmanager
-def opened(here: Path, workshop: Workshop) -> Iterator[Bench]:
+def opened(here: Path, workshop: Workshop, slot_kb: int = SLOT_KB) -> Iterator[Bench]:
     """A bench with the committed slot A running, both slots empty."""
     bench = Bench(here, workshop)
     for name in ("chooser", "state", "media", "root"):
@@ -118,7 +118,7 @@ def opened(here: Path, workshop: Workshop) -> Iterator[Bench]:
         assert daemon.stdout is not None
         bench.bus = daemon.stdout.readline().strip()
         for slot in ("A", "B"):
-            run("truncate", "-s", f"{SLOT_MB}M", here / f"{slot}.img")
+            run("truncate", "-s", f"{slot_kb}K", here / f"{slot}.img")
             bench.loops[slot] = run("losetup", "-f", "--show", here / f"{slot}.img").strip()
         (here / "system.conf").write_text(_conf(bench))
         yield bench

@@ -46,12 +46,13 @@ class Workshop:
         compatible: str = "diffuscope-pi5",
         keys: Path | None = None,
         minimum: str = "0.9",
+        noise_bytes: int = 12_000_000,
     ) -> Path:
         """A bundle whose slot is a small filesystem with a number and noise: quick to write, and to check."""
         keys, folder, out = keys or self.keys, self.folder / f"{name}-parts", self.folder / f"{name}.raucb"
         (folder / "tree").mkdir(parents=True)
         (folder / "tree" / "version").write_text(version)
-        (folder / "tree" / "noise").write_bytes(random.randbytes(12_000_000))
+        (folder / "tree" / "noise").write_bytes(random.randbytes(noise_bytes))
         run("mksquashfs", folder / "tree", folder / "rootfs.img", "-quiet", "-no-progress", "-comp", "lz4")
         subprocess.run(["rm", "-r", str(folder / "tree")], check=True)
         (folder / "manifest.raucm").write_text(

@@ -9,7 +9,7 @@ import random
 import re
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -27,15 +27,39 @@ MOST_ALONE = 8  # changes of which each is once the only one that is left: the l
 SECTOR_BYTES = 512
 
 
-def noted(words: list[str], folder: Path, cwd: Path) -> list[str]:
-    """Run a program under strace; what it said, and the calls that did something below a folder, in order."""
+def noted(words: list[str], folder: Path, cwd: Path, devices: Mapping[str, Path] | None = None) -> list[str]:
+    """Run a program under strace; what it said, and the calls that did something below a folder, in order.
+
+    `devices` are read as if they were files in there.
+    """
     if shutil.which("strace") is None:
         raise RuntimeError("strace is missing; tests/hard/install installs it")
-    log, below = folder / "log", "".join(f"\\x{byte:02x}" for byte in bytes(folder))
+    log, below = folder / "log", _escaped(folder)
     trace = ["strace", "-f", "--seccomp-bpf", "-y", "-xx", "-s", "100000000", "-e", f"trace={CALLS}", "-o", str(log)]
     subprocess.run([*trace, "-e", "signal=none", *words], cwd=cwd, stdout=subprocess.DEVNULL, check=True)
-    calls = (line for line in log.read_text("ascii").splitlines() if below in line or " write(1<" in line)
+    said = log.read_text("ascii")
+    for device, file in (devices or {}).items():
+        for end in '>"':
+            said = said.replace(_escaped(Path(device)) + end, _escaped(file) + end)
+    calls = (line for line in _in_one(said.splitlines()) if below in line or " write(1<" in line)
     return [line for line in calls if " = -1 " not in line]
+
+
+def _in_one(lines: list[str]) -> Iterator[str]:
+    """Calls that strace noted in two halves, since others came between, stand where they ended."""
+    begun: dict[str, str] = {}
+    for line in lines:
+        pid, _, rest = line.partition(" ")
+        if rest.endswith("<unfinished ...>"):
+            begun[pid] = line.removesuffix("<unfinished ...>").rstrip()
+        elif resumed := re.match(r" *<\.\.\. \w+ resumed>", rest):
+            yield begun.pop(pid) + rest[resumed.end() :]
+        else:
+            yield line
+
+
+def _escaped(path: Path) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in bytes(path))
 
 
 def plain(escaped: str) -> bytes:
@@ -103,11 +127,13 @@ Survives = Callable[[Thing, tuple[object, ...]], tuple[object, ...] | None]
 class Disk:
     """A folder on a disk that forgets; everything in it at the beginning is there for certain.
 
-    `fat` names the folders in it that are FAT, without `sync` among the words of their mount.
+    `fat` names the folders in it that are FAT, without `sync` among the words of their mount; `parts` what of the folder
+    is on the disk, if not all of it.
     """
 
-    def __init__(self, folder: Path, before: Path, fat: tuple[str, ...] = ()) -> None:
+    def __init__(self, folder: Path, before: Path, fat: tuple[str, ...] = (), parts: tuple[str, ...] = ("",)) -> None:
         self._at, self._fat = f"{folder}/", fat
+        self._on_it = tuple(f"{folder}/{part}" for part in parts)
         self._root = _found(before)
         self._places: dict[tuple[str, int], int] = {}
         self.said = ""
@@ -119,7 +145,7 @@ class Disk:
             self.said += plain(WORD.findall(words)[0]).decode()
             return True
         paths = self._paths(call, words)
-        if not any(f"{path}/".startswith(self._at) for path in paths):
+        if not any(f"{path}/".startswith(self._on_it) for path in paths):
             return False
         return self._do(call, words, result, [f"{path}/".removeprefix(self._at).rstrip("/") for path in paths])
 
@@ -173,6 +199,8 @@ class Disk:
                 thing.do("write", 0, bytes(source[:result]))
             case "ftruncate":
                 thing.do("length", int(words.rsplit(",", 1)[1]))
+            case "fallocate":
+                thing.do("length", max(len(thing.now), sum(map(int, words.rsplit(",", 2)[1:]))))
             case _:
                 raise AssertionError(f"this disk does not know {call}")
         return True
@@ -217,7 +245,7 @@ class Disk:
         _collect(self._root, "", lambda thing, change: change, left)
         return left
 
-    def cuts(self, draw: random.Random) -> Iterator[dict[str, bytes | None]]:
+    def cuts(self, draw: random.Random, draws: int = DRAWS) -> Iterator[dict[str, bytes | None]]:
         """What could be on the disk if the power went now, by path; None is a folder.
 
         All that was not synced is gone; nothing is; only names are left; only content; each change alone; and draws of
@@ -241,7 +269,7 @@ class Disk:
             return change
 
         alone = [partial(_alone, one) for one in waiting[-MOST_ALONE:]]
-        for way in (*ways, *alone, *[some] * DRAWS):
+        for way in (*ways, *alone, *[some] * draws):
             left: dict[str, bytes | None] = {}
             _collect(self._root, "", _together(way, waiting), left)
             yield left

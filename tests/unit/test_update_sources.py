@@ -90,6 +90,14 @@ def test_what_is_not_what_the_channel_promised_is_removed(site: Site, keys: Path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_power_cut_kept_by_its_length_only_is_fetched_anew(site: Site, keys: Path, tmp_path: Path) -> None:
+    """Zeros where the content was not written yet; who waited for hours for it is not told that the file is damaged."""
+    (tmp_path / "two.raucb.part").write_bytes(bytes(4_000_000))
+    site.files = {"two.raucb": CONTENT}
+    assert Web(site.at, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
+    assert site.asked == ["bytes=4000000-", "all"]
+
+
 def test_what_is_there_already_is_not_asked_for_again(site: Site, keys: Path, tmp_path: Path) -> None:
     (tmp_path / "update.raucb").write_bytes(CONTENT)
     (tmp_path / "one.raucb.part").write_bytes(b"of an older version")
