@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from services.update.bootchooser import BootChooser
 from services.update.engine import Release
 
 Version = tuple[int, ...]
+WITHOUT_KERNEL = "Get the update that the maker of the device made for cards: it brings its kernel."
 
 
 @contextmanager
@@ -100,11 +102,18 @@ def number(version: str) -> Version:
     return tuple(parts)
 
 
-def refuse_wrong(release: Release, compatible: str, runs: str) -> None:
-    """UpdateWrongDevice, UpdateOlder or UpdateTooFar if this device must not become that release."""
+def refuse_wrong(release: Release, compatible: str, runs: str, modules: Path) -> None:
+    """UpdateWrongDevice, UpdateOlder or UpdateTooFar if this device must not become that release.
+
+    `modules` is where the kernel that runs finds its own; where it has some, a version without its kernel would meet
+    whatever kernel lies beside its slot, and might find neither its own root nor the camera.
+    """
     if release.compatible != compatible:
         raise UpdateWrongDevice(f"it is for {release.compatible}, this is {compatible}")
     if number(release.version) <= number(runs):
         raise UpdateOlder(f"it is version {release.version}, and {runs} runs")
     if number(runs) < number(release.minimum):
         raise UpdateTooFar(f"version {release.version} needs {release.minimum} or newer, and {runs} runs")
+    kernel = os.uname().release
+    if (modules / kernel).is_dir() and not release.has_kernel:
+        raise UpdateWrongDevice(f"it comes without a kernel, and this device runs Linux {kernel}", WITHOUT_KERNEL)

@@ -114,7 +114,7 @@ class Updater:
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
             bundle = fetch()
             release = self._rauc.release(bundle)
-            gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
+            gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
             gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)  # fetching took a while
             self._journal.write(state="installing", version=release.version, share=0.0)
             self._rauc.install(bundle, self._progress)
@@ -198,7 +198,7 @@ class Updater:
         try:
             release = self._rauc.release(sources.copied(path, folder, self._quietly))
             found = found.model_copy(update={"version": release.version})
-            gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
+            gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
         except UpdateError as error:
             return found.model_copy(update={"trouble": Trouble.of(error)})
         finally:

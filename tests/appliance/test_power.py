@@ -36,8 +36,9 @@ pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
 
 SLOT_KB, NOISE_BYTES = 96, 60_000
 DRAWS = 12
+KERNEL = random.Random(3).randbytes(20_000)
 STATUS = "/state/rauc.status"
-PARTS = ("chooser", "state", "B.img")
+PARTS = ("chooser", "state", "B.img", "boot-b.img")
 WORDS = {
     r"Version 1.0 runs\.": "nothing",
     r"Version 1.0 runs\. (Version 2.0|Another version) was interrupted: start anew\.": "interrupted",
@@ -56,21 +57,20 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Recording:
-    """An update that was done once: the bench, what its disks held before, every call, and the new version's image."""
+    """An update that was done once: the bench, what its disks held before, every call, and the new version's images."""
 
     bench: Bench
     before: Path
     calls: list[str]
-    image: bytes
+    images: dict[str, bytes]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
     folder = tmp_path_factory.mktemp("power")
     workshop = releases.opened(folder / "workshop")
-    one, two = (
-        workshop.small(name, f"{number}.0", noise_bytes=NOISE_BYTES) for number, name in ((1, "one"), (2, "two"))
-    )
+    one = workshop.small("one", "1.0", noise_bytes=NOISE_BYTES)
+    two = workshop.small("two", "2.0", noise_bytes=NOISE_BYTES, boot=KERNEL)
     with benches.opened(folder / "bench", workshop, SLOT_KB) as bench:
         for slot in "AB":
             bench.fill(slot, one)  # the slot that is written holds something else, whole
@@ -82,9 +82,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
             subprocess.run(["cp", "-a", str(bench.here / name), str(before)], check=True)
         words = [sys.executable, "-m", "tests.appliance.power", str(bench.here), str(workshop.folder)]
         words += [bench.loops["A"], bench.loops["B"], bench.bus]
-        calls = noted(words, bench.here, ROOT, {bench.loops["B"]: bench.here / "B.img"})
+        devices = {bench.loops[name]: bench.here / f"{name}.img" for name in ("B", "boot-b")}
+        calls = noted(words, bench.here, ROOT, devices)
         image = subprocess.run(["unsquashfs", "-cat", str(two), "rootfs.img"], capture_output=True, check=True).stdout
-        yield Recording(bench, before, calls, image)
+        yield Recording(bench, before, calls, {"B.img": image, "boot-b.img": KERNEL})
 
 
 def cuts(recording: Recording, draw: random.Random) -> Iterator[tuple[str, dict[str, bytes | None]]]:
@@ -100,11 +101,12 @@ def cuts(recording: Recording, draw: random.Random) -> Iterator[tuple[str, dict[
                 assert disk.as_seen()["/" + str(path.relative_to(recording.bench.here))] == path.read_bytes()
 
 
-def judged(left: Path, said: str, image: bytes) -> str:
+def judged(left: Path, said: str, images: dict[str, bytes]) -> str:
     """What the words tell after a cut; every promise that an update makes is held."""
     autoboot = (left / "chooser/autoboot.txt").read_bytes()
     assert {firmware.partition(autoboot), firmware.partition(autoboot, tried=True)} == {2, 3}
-    slot, whole = firmware.boots(autoboot), (left / "B.img").read_bytes().startswith(image)
+    slot = firmware.boots(autoboot)
+    whole = all((left / name).read_bytes().startswith(image) for name, image in images.items())
     assert slot == ("A" if "<installed>" not in said else "B" if "<committed>" in said else slot)
     assert whole or slot == "A"
     (left / "cmdline").write_text(f"rauc.slot={slot}\n")
@@ -132,7 +134,7 @@ def test_whatever_a_power_cut_leaves_of_an_update_boots_and_says_what_happened(r
             continue
         seen.add(one)
         with TemporaryDirectory(dir="/dev/shm") as place:
-            outcomes[judged(written(left, Path(place) / "left"), said, recording.image)] += 1
+            outcomes[judged(written(left, Path(place) / "left"), said, recording.images)] += 1
     print(f"{len(seen)} disks: {dict(outcomes)}")  # noqa: T201  # the figures that README quotes
     assert set(outcomes) == set(SHOWN)
 

@@ -127,8 +127,8 @@ Survives = Callable[[Thing, tuple[object, ...]], tuple[object, ...] | None]
 class Disk:
     """A folder on a disk that forgets; everything in it at the beginning is there for certain.
 
-    `fat` names the folders in it that are FAT, without `sync` among the words of their mount; `parts` what of the folder
-    is on the disk, if not all of it.
+    `fat` names the folders in it that are FAT, without `sync` among the words of their mount; `parts` what of the
+    folder is on the disk, if not all of it.
     """
 
     def __init__(self, folder: Path, before: Path, fat: tuple[str, ...] = (), parts: tuple[str, ...] = ("",)) -> None:
