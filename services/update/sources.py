@@ -175,19 +175,27 @@ def _pieces(source: IO[bytes]) -> Iterator[bytes]:
 
 
 def _append(part: Path, pieces: Iterator[bytes], size: int, progress: Progress) -> None:
-    """Write what comes; errors of reading pass as they are, those of writing for want of room are UpdateNoRoom."""
+    """Write what comes, and wait for the disk; errors of reading pass as they are, want of room is UpdateNoRoom."""
     with part.open("ab", buffering=0) as file:
         for piece in pieces:
-            try:
+            with _room(part, size):
                 file.write(piece)
-            except OSError as error:
-                if not disk.is_full(error):
-                    raise
-                raise UpdateNoRoom(f"the disk is full after {part.stat().st_size} of {size} bytes") from error
             arrived = part.stat().st_size
             progress(min(1.0, arrived / size), "fetching")
             if arrived > size:  # nobody promised that: its SHA-256 will say so
                 return
+        with _room(part, size):
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def _room(part: Path, size: int) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if not disk.is_full(error):
+            raise
+        raise UpdateNoRoom(f"the disk is full after {part.stat().st_size} of {size} bytes") from error
 
 
 @contextmanager

@@ -21,6 +21,8 @@ from services.update.settings import UpdateSettings
 log = logging.getLogger(__name__)
 
 ASK_AGAIN_S = 2.0
+READS = (2, 3)  # a copy, the signature, the slot: how many times a bundle is read or written, at best and at most
+RESTART_S = (30.0, 180.0)  # from the restart to the commit; a guess, until this device has timed one
 GONE = "Put the USB stick back in, look for updates once more, and choose again."
 FORGIVEN = ("camera", "calibration")  # of the head: if they failed before, another version is not to blame
 
@@ -109,7 +111,7 @@ class Updater:
         settings = self._settings
         gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
-            ill = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)
+            ill, begin_s = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery), self._clock.now_s()
             sources.clear(settings.folder)
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
             bundle = fetch()
@@ -121,7 +123,8 @@ class Updater:
             for done in (bundle, settings.folder / sources.WHOLE):
                 done.unlink(missing_ok=True)
             (settings.tablet / update_notes.UPLOAD).unlink(missing_ok=True)
-            self._journal.write(state="installed", offered="", found=(), looked=False)
+            spent_s = self._clock.now_s() - begin_s
+            self._journal.write(state="installed", offered="", found=(), looked=False, spent_s=spent_s)
             self._tell(f"Version {release.version} is installed.")
             if restart:
                 self._restart()
@@ -145,7 +148,8 @@ class Updater:
         if not gate.is_trying(self._chooser):
             self._tell(f"Version {self.runs} is committed already.")
             return
-        forgiven = set(FORGIVEN) & set(self._journal.write(version=self.runs, state="trying", settling=True).ill)
+        entry = self._journal.write(version=self.runs, state="trying", settling=True)
+        forgiven = set(FORGIVEN) & set(entry.ill)
         deadline = Deadline.after(self._clock, self._settings.patience_s)
         while wrong := self._wrong(forgiven):
             if deadline.left_s() <= 0:
@@ -155,7 +159,7 @@ class Updater:
                 raise UpdateFailed(f"version {self.runs} is not well: {said}")
             self._clock.sleep(ASK_AGAIN_S)
         self._rauc.mark("good")
-        self._journal.write(state="committed")
+        self._journal.write(state="committed", took_s=entry.spent_s + self._clock.now_s())  # whose zero is the start
         self._tell(f"Version {self.runs} is well, and committed.")
 
     def status(self) -> tuple[Entry, str]:
@@ -196,8 +200,12 @@ class Updater:
         """RAUC reads only what belongs to root and cannot change: so a copy, which nobody else can reach."""
         folder = self._settings.folder
         try:
-            release = self._rauc.release(sources.copied(path, folder, self._quietly))
-            found = found.model_copy(update={"version": release.version})
+            begin_s = self._clock.now_s()
+            copy = sources.copied(path, folder, self._quietly)
+            copy_s = self._clock.now_s() - begin_s
+            takes_s = tuple(times * copy_s + more_s for times, more_s in zip(READS, RESTART_S, strict=True))
+            release = self._rauc.release(copy)
+            found = found.model_copy(update={"version": release.version, "takes_s": takes_s})
             gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
         except UpdateError as error:
             return found.model_copy(update={"trouble": Trouble.of(error)})

@@ -17,6 +17,8 @@ from services.instrument.updates_api import update_routes
 from services.instrument.updating import MOST_BYTES, PATIENCE_S, UpdateDesk, news
 from services.records.update_notes import TABLET, UPLOAD, WISH, Wish, leave
 from services.update import gate
+from services.update.updater import Updater
+from tests.appliance.instrument import served
 from tests.journey.conftest import Rig
 from tests.updates import Board
 
@@ -90,6 +92,26 @@ def test_from_a_stick_to_the_next_version(page: Page) -> None:
     after = UpdateDesk(page.board.state, page.board.wishes, page.clock, "2.0").told()
     assert (after["state"], after["runs"], after["trouble"]) == ("committed", "2.0", None)
     assert after["news"]
+
+
+def test_how_long_an_update_takes_is_what_the_last_one_took_or_an_estimate(page: Page) -> None:
+    """Timed from the copy to the restart, and from the start of the computer until it was found well."""
+    board = page.board
+    board.bundle("two.raucb")
+    (found,) = page.looked()["found"]
+    low_s, high_s = found["takes_s"]
+    assert (0 < low_s < high_s, page.told()["took_s"]) == (True, None)
+    page.installed(found["id"])
+    board.boot()
+    with served() as instrument:
+        settings = board.settings(instrument=instrument.at, answer_s=2.0)
+        Updater(settings, VirtualClock(elapsed_s=100.0), print, board.chooser, "2.0").settle()
+    told = UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()
+    assert told["state"] == "committed"
+    assert 100 < told["took_s"] < 160  # the install took a second or two
+    board.bundle("three.raucb", "3.0")
+    board.updater("2.0").look()
+    assert UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()["took_s"] == told["took_s"]
 
 
 def test_a_version_that_is_not_well_is_taken_back_and_says_why(page: Page) -> None:
