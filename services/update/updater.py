@@ -111,13 +111,13 @@ class Updater:
         settings = self._settings
         gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
-            ill, begin_s = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery), self._clock.now_s()
+            ill, begin_s = self._at_rest(), self._clock.now_s()
             sources.clear(settings.folder)
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
             bundle = fetch()
             release = self._rauc.release(bundle)
             gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
-            gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)  # fetching took a while
+            self._at_rest()  # fetching took a while
             self._journal.write(state="installing", version=release.version, share=0.0)
             self._rauc.install(bundle, self._progress)
             for done in (bundle, settings.folder / sources.WHOLE):
@@ -133,7 +133,7 @@ class Updater:
         """Try what is installed and waits; UpdateNowhere if nothing does."""
         with gate.alone(self._settings.folder):
             gate.refuse_while_trying(self._chooser)
-            gate.refuse_unless_at_rest(self._settings.instrument, self._settings.lowest_battery)
+            self._at_rest()
             waiting = self._journal.read().state in ("installed", "trying")
             if not waiting or not self._chooser.is_good(other(self._chooser.committed())):
                 raise UpdateNowhere("nothing that is installed waits to be tried")
@@ -173,6 +173,10 @@ class Updater:
         settings = self._settings
         checks = probe.examine(settings.instrument, look="camera" not in forgiven, patience_s=settings.answer_s)
         return [check for check in checks if check.of_release and not check.ok and check.name not in forgiven]
+
+    def _at_rest(self) -> tuple[str, ...]:
+        settings = self._settings
+        return gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery, self._clock.wall())
 
     def _fetched(self, place: Path | None) -> Path:
         folder = self._settings.folder

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import version
 from threading import Event, Thread
@@ -26,6 +27,7 @@ class Page:
     checks: list[Check] = field(default_factory=lambda: [check("camera"), check("captures")])
     sees: bool = True
     hangs: bool = False
+    visit_begun: timedelta | None = None  # how long ago the visit was begun that is open
     closing: Event = field(default_factory=Event)
 
     def answer(self, path: str) -> tuple[int, bytes]:
@@ -34,6 +36,10 @@ class Page:
                 return 200, json.dumps({"state": self.state, "version": version("diffuscope")}).encode()
             case "/api/health":
                 return 200, json.dumps({"battery": self.battery, "checks": as_json(self.checks)}).encode()
+            case "/api/visits?open=true&limit=1":
+                begun = [] if self.visit_begun is None else [datetime.now(UTC) - self.visit_begun]
+                visits = [{"number": "PN-0007-K", "begun_at": at.isoformat()} for at in begun]
+                return 200, json.dumps({"visits": visits}).encode()
         return (200, b"\xff\xd8a picture") if self.sees else (204, b"")
 
 

@@ -4,6 +4,7 @@ What a real instrument answers is in `test_versions.py`; here it hangs, is ill, 
 """
 
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -121,6 +122,7 @@ def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) 
     [
         (not_now(exam="busy"), UpdateDuringExam),
         (not_now(exam="making"), UpdateDuringExam),
+        (Page(visit_begun=timedelta(minutes=3)), UpdateDuringExam),
         (not_now(battery=0.49), UpdatePowerLow),
         (not_now(well=False), UpdateAtRisk),
     ],
@@ -128,11 +130,12 @@ def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) 
 def test_an_update_waits_for_examination_charger_and_captures(
     bench: Bench, page: Page, two: tuple[object, Path], now: Page, kind: type[UpdateError]
 ) -> None:
-    page.state, page.battery, page.checks = now.state, now.battery, now.checks
+    page.state, page.battery, page.checks, page.visit_begun = now.state, now.battery, now.checks, now.visit_begun
     with pytest.raises(kind):
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "A"
     page.state, page.battery, page.checks = "aim", 0.51, [check("captures")]
+    page.visit_begun = timedelta(hours=1)  # somebody left it so, and will finish it another time
     with bench.service():
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "B"

@@ -130,7 +130,7 @@ def test_from_a_stick_to_the_next_version(device: Device, open_page: Open, compl
         page.locator("#look").tap()
         offered = page.locator("li", has_text="Version 3.0")
         expect(offered).to_contain_text(
-            re.compile(r"The last update took \d+ minutes?\. The camera restarts by itself")
+            re.compile(r"The last update took \d+ minutes?\. The camera restarts by itself"), timeout=90_000
         )
     (board.stick / "three.raucb").unlink()
 

@@ -5,13 +5,17 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import httpx
 import pytest
 
 from device.clock import VirtualClock
+from device.errors import UpdateDuringExam
 from services.instrument.api import create_app
 from services.instrument.updates_api import update_routes
 from services.instrument.updating import MOST_BYTES, PATIENCE_S, UpdateDesk, news
@@ -278,3 +282,27 @@ def test_what_is_new_is_the_versions_own_list_without_marks(tmp_path: Path) -> N
     assert news("1.0", file) == ["old"]
     assert news("3.0", file) == ["New: a, and b.", "c"]
     assert news("1.0", tmp_path / "none") == []
+
+
+def test_an_open_visit_is_an_examination_which_an_update_does_not_end(rig: Rig, page: Page) -> None:
+    """Asked over HTTP of the page's own answers, as the updater asks."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            answer = rig.request("GET", self.path)
+            self.send_response(answer.status_code)
+            self.end_headers()
+            self.wfile.write(answer.content)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    visit = rig.request("POST", "/api/visits", json={"key": "00000000000000aa"}).json()
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        begun = datetime.fromisoformat(visit["begun_at"])
+        at = f"http://127.0.0.1:{server.server_port}"
+        with pytest.raises(UpdateDuringExam, match=visit["number"]):
+            gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=29))
+        gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=31))
+        server.shutdown()
