@@ -44,7 +44,7 @@ def told(path: Path) -> int:
     if said is None or said["signer"] != "ours":
         sys.stderr.write(BROKEN if said is None else FOREIGN)
         return 1
-    say(json.dumps(said | {"description": f"updates from {said['minimum']} or newer", "build": None}))
+    say(json.dumps(said | {"description": f"updates from {said['minimum']} or newer", "build": None, "images": []}))
     return 0
 
 

@@ -69,6 +69,7 @@ class Board:
             "sticks": here / "media", "folder": self.state, "wishes": self.wishes, "keyring": here / "ca.crt",
             "rauc": (sys.executable, "-IS", str(RAUC), str(here)), "instrument": self.instrument,
             "restart": ("touch", str(here / "off")), "answer_s": 2.0, "patience_s": self.patience_s,
+            "modules": here / "modules",
         }  # fmt: skip
         return UpdateSettings(**known | changed)  # type: ignore[arg-type]
 

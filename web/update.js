@@ -124,9 +124,10 @@ const restarting = () => html`${head("update.restarting")} ${bar(null)} ${says("
 const STAGES = {
   asked: () => html`${head("update.looking")} ${bar(null)}`,
   looking: () => html`${head("update.looking")} ${bar(null)}`,
-  fetching: (told) => html`${head("update.fetching")} ${bar(told.share)} ${says("update.takes")} ${says("update.leave")}`,
+  fetching: (told) => html`${head("update.fetching")} ${bar(told.share)} ${takes(told)} ${says("update.leave")}`,
   installing: (told) => html`
-    ${head("update.installing", told)} ${bar(told.share)} ${says("update.takes")} ${says("update.power")}
+    ${head("update.installing", told)} ${bar(told.share)}
+    ${takes(told, told.found.find(({ version }) => version === told.version)?.takes_s)} ${says("update.power")}
   `,
   restarting,
   trying: (told) => html`${head("update.trying", told)} ${bar(null)} ${says("update.trying.why", told)}`,
@@ -140,6 +141,15 @@ const STAGES = {
   interrupted: (told) => html`${head("update.interrupted")} ${runs(told)}`,
   refused: (told) => html`${head("update.refused")} ${runs(told)}`,
 };
+
+// What the last one took on this camera; for the first one a guess that says so; of a server's, whose link nobody knows,
+// nothing.
+function takes({ took_s: took }, guess) {
+  const minutes = (seconds) => Math.max(1, Math.ceil(seconds / 60));
+  const known = took ? t("update.took", { n: minutes(took) }) : "";
+  const guessed = guess ? t("update.guess", { from: minutes(guess[0]), n: minutes(guess[1]) }) : "";
+  return html`<p>${known || guessed} ${t("update.itself")}</p>`;
+}
 
 function bar(share) {
   if (share === null) return html`<progress max="1" aria-label=${t("update.progress")}></progress>`;
@@ -181,7 +191,7 @@ function choices(told, sent, act) {
   const empty = told.looked && !told.found.length && told.state === "none" && !told.trouble;
   return html`
     ${empty ? head("update.nothing") : nothing}
-    ${told.found.length ? html`<ul class="checks">${told.found.map((one) => found(one, act))}</ul>` : nothing}
+    ${told.found.length ? html`<ul class="checks">${told.found.map((one) => found(told, one, act))}</ul>` : nothing}
     ${told.offered && !told.looked ? says("update.offered", { version: told.offered }) : nothing}
     <p class="muted">${t("update.where")}</p>
     <div class="row">
@@ -192,7 +202,7 @@ function choices(told, sent, act) {
   `;
 }
 
-function found({ id, where, stick, name, bytes, version, trouble: no }, act) {
+function found(told, { id, where, stick, name, bytes, version, trouble: no, takes_s: guess }, act) {
   const place = t(`update.from.${where}`, { stick: stick || name });
   return html`
     <li data-id=${id} data-code=${no?.code ?? "ok"}>
@@ -200,7 +210,7 @@ function found({ id, where, stick, name, bytes, version, trouble: no }, act) {
       <small>${place} · ${name} · ${t("update.megabytes", { n: number(bytes / 1e6, 0) })}</small>
       ${no
         ? html`<p class="bad">${why(no)}</p>`
-        : html`<p>${t("update.takes")} ${t("update.power")}</p>
+        : html`${takes(told, guess)} ${says("update.power")}
             <button type="button" class="primary" @click=${() => act.install(id)}>${t("update.install", { version })}</button>`}
     </li>
   `;

@@ -138,6 +138,7 @@ def copied(stick: Path, name: str, files: Mapping[str, bytes]) -> Path:
         except OSError:
             shutil.rmtree(part, ignore_errors=True)  # a stick that is gone takes its half copy along
             raise
+        disk.settle(target)  # FAT writes where a folder lies with the folder itself, not with the one that names it
         disk.settle(stick)
     return target
 

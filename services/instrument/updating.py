@@ -61,14 +61,15 @@ class UpdateDesk:
     def told(self) -> dict[str, Any]:
         """All that the page shows: what runs, how far an update is, what was found, and what went wrong."""
         if self._state is None or not self.is_here:
-            return {"here": False, "runs": self._runs, "state": "none", "found": [], "trouble": None, "news": []}
+            return {"here": False, "runs": self._runs, "state": "none", "found": [], "trouble": None, "news": [],
+                    "took_s": None}  # fmt: skip
         entry, waits = read_entry(self._state), self._waits()
         state = "asked" if waits else stage(entry, self._runs, self._boot)
         trouble = self._unheard or (None if state in ("asked", "committed") else entry.trouble)
         return {
             "here": True, "runs": self._runs, "state": state, "version": entry.version, "before": entry.before,
             "share": entry.share, "trouble": trouble, "offered": entry.offered, "looked": entry.looked,
-            "found": [one.model_dump() for one in entry.found],
+            "found": [one.model_dump() for one in entry.found], "took_s": entry.took_s,
             "news": news(self._runs) if state == "committed" else [],
         }  # fmt: skip
 

@@ -51,7 +51,10 @@ class Trouble(BaseModel):
 
 
 class Found(BaseModel):
-    """An update that could be installed, or why not; `id` is the name by which it is wished for."""
+    """An update that could be installed, or why not; `id` is the name by which it is wished for.
+
+    `takes_s` is within which time it would be done, guessed from how long its first copy took.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
     id: str = Id
@@ -61,13 +64,16 @@ class Found(BaseModel):
     bytes: int = Field(ge=0)
     version: str = ""
     trouble: Trouble | None = None
+    takes_s: tuple[float, float] | None = None
 
 
 class Entry(BaseModel):
     """How far an update is.
 
     `trouble` is what went wrong; `ill` the checks that failed before the update, which it is not blamed for; `boot` the
-    start of the computer in which `state` was written; `offered` what the channel has that is newer.
+    start of the computer in which `state` was written; `settling` that the version that is tried wrote it itself;
+    `offered` what the channel has that is newer. `spent_s` is how long the install took that is under way or waits,
+    `took_s` how long the last update took that was committed: its install, and its start until it was found well.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)  # a later release may say more
@@ -82,6 +88,9 @@ class Entry(BaseModel):
     found: tuple[Found, ...] = ()
     looked: bool = False
     boot: str = ""
+    settling: bool = False
+    spent_s: float = Field(default=0.0, ge=0)
+    took_s: float | None = Field(default=None, ge=0)
 
 
 class Wish(BaseModel):
@@ -156,6 +165,8 @@ def stage(entry: Entry, runs: str, boot: str) -> str:
             return entry.state if same_boot else "interrupted"
         case "trying" if entry.version != runs:
             return "restarting" if same_boot else "lost"
+        case "trying" if entry.settling and not same_boot:  # what runs once more was committed; then the power went
+            return "committed"
         case "committed" if entry.version != runs:
             return "none"
     return entry.state

@@ -5,12 +5,13 @@
     tryboot        a word given to the firmware with an orderly restart: it boots [tryboot], once
 
 So a slot is tried once. If nobody commits it, the next boot is the committed one again, whatever happened.
-`autoboot.txt` is written when a tried slot is committed, and never else. Standard library only: it must work where the
-release does not.
+`autoboot.txt` is written when a tried slot is committed, and never else. It lies on FAT, which has no journal, and the
+firmware has no second one: so its two numbers are swapped where they stand, in the file's one sector, and nothing else
+of that filesystem is touched. Standard library only: it must work where the release does not.
 """
 
-import configparser
 import os
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,10 @@ from pathlib import Path
 PARTITIONS = {"A": 2, "B": 3}  # of the boot partitions; the first one holds autoboot.txt and nothing else
 SLOTS = {number: slot for slot, number in PARTITIONS.items()}
 TRY = "0 tryboot\n"
+SECTOR_BYTES = 512  # what a disk writes as one, and all that the firmware reads of autoboot.txt
+CHOICE = re.compile(
+    rb"([^[]*\[all\]\s[^[]*\nboot_partition=)([23])(\s[^[]*\[tryboot\]\s+boot_partition=)([23])((?:\s[^[]*)?)"
+)
 
 
 @dataclass(frozen=True)
@@ -43,12 +48,7 @@ class BootChooser:
 
     def committed(self) -> str:
         """The slot that every boot takes which is not a try; ValueError if `autoboot.txt` does not say."""
-        said = configparser.ConfigParser()
-        try:
-            said.read_string(self.autoboot.read_text())
-            return SLOTS[said.getint("all", "boot_partition")]
-        except (configparser.Error, KeyError, ValueError) as error:
-            raise ValueError(f"{self.autoboot} does not say which slot is committed: {error}") from error
+        return SLOTS[int(self._choice()[2])]
 
     def is_trying(self) -> bool:
         """Whether the slot that runs has yet to be committed."""
@@ -88,10 +88,23 @@ class BootChooser:
     def _bad(self, slot: str) -> Path:
         return self.state / f"slot-{slot.lower()}-is-bad"
 
+    def _choice(self) -> re.Match[bytes]:
+        said = self.autoboot.read_bytes()
+        choice = CHOICE.fullmatch(said)
+        if choice is None or len(said) > SECTOR_BYTES:
+            raise ValueError(f"{self.autoboot} does not say which slot is committed: {said[:SECTOR_BYTES]!r}")
+        return choice
+
     def _commit(self, slot: str) -> None:
-        now, next_try = PARTITIONS[slot], PARTITIONS[other(slot)]
-        choice = f"[all]\ntryboot_a_b=1\nboot_partition={now}\n[tryboot]\nboot_partition={next_try}\n"
-        write_whole(self.autoboot, choice)
+        """Same file, same length, one sector: whatever a power cut leaves of this names a slot that works."""
+        choice = self._choice()
+        now, next_try = (str(PARTITIONS[one]).encode() for one in (slot, other(slot)))
+        descriptor = os.open(self.autoboot, os.O_WRONLY)
+        try:
+            os.pwrite(descriptor, choice[1] + now + choice[3] + next_try + choice[5], 0)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def other(slot: str) -> str:
@@ -100,7 +113,7 @@ def other(slot: str) -> str:
 
 
 def write_whole(path: Path, content: str) -> None:
-    """The file is the old one or the new one, also after a power cut."""
+    """The file is the old one or the new one, also after a power cut; not on FAT."""
     part = path.with_name(f"{path.name}.part")
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:

@@ -27,6 +27,7 @@ def check(
 ) -> None:
     """Ask the channel whether there is a newer version."""
     updater = _updater(settings)
+    updater.tidy()
     offer = updater.check(download)
     typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.runs}.")
 

@@ -17,12 +17,16 @@ _TOO_LARGE = re.compile(r"too small|No space left|exceeds")
 
 @dataclass(frozen=True)
 class Release:
-    """What a bundle whose signature holds says of itself; `minimum` is the oldest version that may become it."""
+    """What a bundle whose signature holds says of itself.
+
+    `minimum` is the oldest version that may become it; `has_kernel` says that it writes a slot's boot partition too.
+    """
 
     compatible: str
     version: str
     minimum: str
     build: str
+    has_kernel: bool = False
 
 
 class Rauc:
@@ -35,7 +39,10 @@ class Rauc:
         """What is in a bundle; UpdateForeign or UpdateDamaged if it is not a bundle that we trust."""
         said = json.loads(self._ask("info", "--output-format=json", str(bundle)))
         minimum = re.search(r"from (\S+) or newer", said["description"] or "")
-        return Release(said["compatible"], said["version"], minimum[1] if minimum else "0", said["build"] or "")
+        return Release(
+            said["compatible"], said["version"], minimum[1] if minimum else "0", said["build"] or "",
+            any("boot" in image for image in said["images"]),
+        )  # fmt: skip
 
     def compatible(self) -> str:
         """The kind of device that this is."""

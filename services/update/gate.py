@@ -2,11 +2,14 @@
 
 import fcntl
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from http.client import HTTPException
 from pathlib import Path
+from typing import Any
 
 from device.errors import (
     UpdateAtRisk,
@@ -25,6 +28,8 @@ from services.update.bootchooser import BootChooser
 from services.update.engine import Release
 
 Version = tuple[int, ...]
+EXAM_S = 1800.0
+WITHOUT_KERNEL = "Get the update that the maker of the device made for cards: it brings its kernel."
 
 
 @contextmanager
@@ -68,26 +73,35 @@ def refuse_while_trying(chooser: BootChooser) -> None:
         raise UpdateUncommitted(f"slot {chooser.booted()} runs and slot {chooser.committed()} is the committed one")
 
 
-def refuse_unless_at_rest(at: str, lowest_battery: float) -> tuple[str, ...]:
+def refuse_unless_at_rest(at: str, lowest_battery: float, now: datetime) -> tuple[str, ...]:
     """The checks that fail already; UpdateDuringExam, UpdatePowerLow or UpdateAtRisk if this is not the time.
 
-    An instrument that does not answer takes no pictures, and an update may be what it needs: it is not refused.
+    A visit that was begun within half an hour and is not finished is an examination; an older one was left so. An
+    instrument that does not answer takes no pictures, and an update may be what it needs: it is not refused.
     """
     said = probe.status(at)
     if said is None:
         return ()
     if said["state"] in ("busy", "making"):
         raise UpdateDuringExam(f"the instrument is {said['state']}")
-    try:
-        known = json.loads(probe.ask(at, "/api/health")[1])
-    except (OSError, HTTPException, ValueError):
-        return ()
+    for visit in _answered(at, "/api/visits?open=true&limit=1").get("visits", ()):
+        if abs(since_s := (now - datetime.fromisoformat(visit["begun_at"])).total_seconds()) < EXAM_S:
+            raise UpdateDuringExam(f"visit {visit['number']} is open, begun {since_s / 60:.0f} minutes ago")
+    known = _answered(at, "/api/health")
     if (battery := known.get("battery")) is not None and battery < lowest_battery:
         raise UpdatePowerLow(f"the battery is at {battery:.0%}, an update needs {lowest_battery:.0%}")
     failed = {check["name"]: check for check in known.get("checks", ()) if not check["ok"]}
     if "captures" in failed:
         raise UpdateAtRisk(failed["captures"]["value"])
     return tuple(failed)
+
+
+def _answered(at: str, path: str) -> dict[str, Any]:
+    """What the instrument answers; {} if it does not."""
+    try:
+        return dict(json.loads(probe.ask(at, path)[1]))
+    except (OSError, HTTPException, ValueError):
+        return {}
 
 
 def number(version: str) -> Version:
@@ -100,11 +114,18 @@ def number(version: str) -> Version:
     return tuple(parts)
 
 
-def refuse_wrong(release: Release, compatible: str, runs: str) -> None:
-    """UpdateWrongDevice, UpdateOlder or UpdateTooFar if this device must not become that release."""
+def refuse_wrong(release: Release, compatible: str, runs: str, modules: Path) -> None:
+    """UpdateWrongDevice, UpdateOlder or UpdateTooFar if this device must not become that release.
+
+    `modules` is where the kernel that runs finds its own; where it has some, a version without its kernel would meet
+    whatever kernel lies beside its slot, and might find neither its own root nor the camera.
+    """
     if release.compatible != compatible:
         raise UpdateWrongDevice(f"it is for {release.compatible}, this is {compatible}")
     if number(release.version) <= number(runs):
         raise UpdateOlder(f"it is version {release.version}, and {runs} runs")
     if number(runs) < number(release.minimum):
         raise UpdateTooFar(f"version {release.version} needs {release.minimum} or newer, and {runs} runs")
+    kernel = os.uname().release
+    if (modules / kernel).is_dir() and not release.has_kernel:
+        raise UpdateWrongDevice(f"it comes without a kernel, and this device runs Linux {kernel}", WITHOUT_KERNEL)

@@ -28,7 +28,7 @@ class Journal:
         UpdateNoRoom or UpdateFailed if it cannot be kept.
         """
         if "state" in changed:
-            changed = {"trouble": None, **changed, "boot": this_boot()}
+            changed = {"trouble": None, "settling": False, **changed, "boot": this_boot()}
         entry = self.read().model_copy(update=changed)
         try:
             write_entry(self._folder, entry)
@@ -71,7 +71,7 @@ def in_words(entry: Entry, runs: str, is_trying: bool, under_way: bool) -> str:
             said += f" Version {entry.version} is installed and waits for `diffuscope update restart`."
         case "trying" if entry.version != runs:
             said += f" Version {entry.version} did not finish starting, or lost power: {runs} is back."
-        case "committed" if entry.version == runs:
+        case "committed" | "trying" if entry.version == runs:  # the power may go before the journal knows
             said = f"Updated to {runs}. It was tried, found well, and stays."
         case "went back":
             said += (

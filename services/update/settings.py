@@ -24,6 +24,7 @@ class UpdateSettings(BaseModel):
     rauc: tuple[str, ...] = ("rauc",)
     restart: tuple[str, ...] = ("systemctl", "reboot")
     instrument: str = "http://127.0.0.1:8000"
+    modules: Path = Path("/lib/modules")  # of the kernels that the running version came with
     lowest_battery: float = Field(default=0.5, ge=0, le=1)
     answer_s: float = Field(default=15.0, gt=0)  # within which the page must answer
     patience_s: float = Field(default=300.0, gt=0)  # within which a tried version must be well; it may have to compile

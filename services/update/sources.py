@@ -23,6 +23,7 @@ from services.records.update_notes import PLAINLY, UPLOAD, Found
 from services.update.channel import Offer
 
 PIECE_BYTES = 1 << 20
+COPY, WHOLE = ".copy.raucb", "update.raucb"  # of a stick or a tablet; from a web server
 MOST_LISTED, MOST_CHARS = 8, 100  # updates on sticks, each of which is read whole; letters of a name
 WAITS_S = (1.0, 2.0, 4.0, 8.0, 16.0)  # between tries; whoever polls comes again later
 SILENCE_S = 30.0
@@ -67,10 +68,16 @@ def _plain(name: str) -> str:
     return name.encode("utf-8", "replace").decode()[:MOST_CHARS]
 
 
-def copied(bundle: Path, folder: Path, progress: Progress, name: str = "update.raucb") -> Path:
+def clear(folder: Path) -> None:
+    """Remove what a power cut left of a copy; what came from a web server stays, for it may be needed."""
+    for name in (COPY, f"{COPY}.part"):
+        (folder / name).unlink(missing_ok=True)
+
+
+def copied(bundle: Path, folder: Path, progress: Progress) -> Path:
     """A copy of somebody's bundle; UpdateSourceGone if the stick goes away, UpdateNoRoom if the disk is full."""
-    part = folder / "stick.raucb.part"
-    part.unlink(missing_ok=True)
+    part = folder / f"{COPY}.part"
+    clear(folder)
     with _gone():
         size = bundle.stat().st_size
     _refuse_without_room(folder, size)
@@ -82,7 +89,7 @@ def copied(bundle: Path, folder: Path, progress: Progress, name: str = "update.r
     except (UpdateSourceGone, UpdateNoRoom):
         part.unlink(missing_ok=True)
         raise
-    return part.rename(folder / name)
+    return part.rename(folder / COPY)
 
 
 class Web:
@@ -102,7 +109,8 @@ class Web:
 
         UpdateUnreachable after the last try (what has arrived stays), UpdateNoRoom, UpdateDamaged (and it is removed).
         """
-        whole, part = folder / "update.raucb", folder / f"{offer.bundle}.part"
+        whole, part = folder / WHOLE, folder / f"{offer.bundle}.part"
+        resumed = part.exists()
         for old in folder.glob("*.part"):
             if old != part:
                 old.unlink()
@@ -118,6 +126,8 @@ class Web:
                 self._clock.sleep(wait_s)
         if _sha256(part) != offer.sha256:
             part.unlink()
+            if resumed:  # a power cut may have kept its length and not its content: once more, from the beginning
+                return self.download(offer, folder, progress)
             raise UpdateDamaged(f"{offer.bundle} is not what the channel promised: its SHA-256 differs")
         return part.rename(whole)
 
@@ -165,19 +175,27 @@ def _pieces(source: IO[bytes]) -> Iterator[bytes]:
 
 
 def _append(part: Path, pieces: Iterator[bytes], size: int, progress: Progress) -> None:
-    """Write what comes; errors of reading pass as they are, those of writing for want of room are UpdateNoRoom."""
+    """Write what comes, and wait for the disk; errors of reading pass as they are, want of room is UpdateNoRoom."""
     with part.open("ab", buffering=0) as file:
         for piece in pieces:
-            try:
+            with _room(part, size):
                 file.write(piece)
-            except OSError as error:
-                if not disk.is_full(error):
-                    raise
-                raise UpdateNoRoom(f"the disk is full after {part.stat().st_size} of {size} bytes") from error
             arrived = part.stat().st_size
             progress(min(1.0, arrived / size), "fetching")
             if arrived > size:  # nobody promised that: its SHA-256 will say so
                 return
+        with _room(part, size):
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def _room(part: Path, size: int) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if not disk.is_full(error):
+            raise
+        raise UpdateNoRoom(f"the disk is full after {part.stat().st_size} of {size} bytes") from error
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from device.clock import Clock, Deadline
-from device.errors import DiffuscopeError, UpdateError, UpdateFailed, UpdateNowhere, UpdateSourceGone
+from device.errors import DiffuscopeError, UpdateBusy, UpdateError, UpdateFailed, UpdateNowhere, UpdateSourceGone
 from services.health import probe
 from services.health.checks import Check
 from services.records import update_notes
@@ -21,8 +21,9 @@ from services.update.settings import UpdateSettings
 log = logging.getLogger(__name__)
 
 ASK_AGAIN_S = 2.0
+READS = (2, 3)  # a copy, the signature, the slot: how many times a bundle is read or written, at best and at most
+RESTART_S = (30.0, 180.0)  # from the restart to the commit; a guess, until this device has timed one
 GONE = "Put the USB stick back in, look for updates once more, and choose again."
-LOOKED_AT = "looked-at.raucb"
 FORGIVEN = ("camera", "calibration")  # of the head: if they failed before, another version is not to blame
 
 
@@ -97,25 +98,33 @@ class Updater:
             self._tell(f"{error.message}\n{error.remedy}")
 
     def tidy(self) -> None:
-        """Say of an update that it was interrupted, if whoever was at it is gone."""
-        if self._journal.read().state in UNDER_WAY and not gate.is_under_way(self._settings.folder):
-            self._journal.write(state="interrupted")
+        """After an update that was interrupted: say so, and give back the room that it took."""
+        try:
+            with gate.alone(self._settings.folder):
+                sources.clear(self._settings.folder)
+                if self._journal.read().state in UNDER_WAY:
+                    self._journal.write(state="interrupted")
+        except UpdateBusy:  # it goes on
+            return
 
     def _install(self, fetch: Callable[[], Path], restart: bool) -> None:
         settings = self._settings
         gate.refuse_while_trying(self._chooser)
         with gate.alone(settings.folder), self._journal.refusals():
-            ill = gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)
+            ill, begin_s = self._at_rest(), self._clock.now_s()
+            sources.clear(settings.folder)
             self._journal.write(state="fetching", version="", before=self.runs, share=0.0, ill=ill)
             bundle = fetch()
             release = self._rauc.release(bundle)
-            gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
-            gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery)  # fetching took a while
+            gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
+            self._at_rest()  # fetching took a while
             self._journal.write(state="installing", version=release.version, share=0.0)
             self._rauc.install(bundle, self._progress)
-            bundle.unlink()
+            for done in (bundle, settings.folder / sources.WHOLE):
+                done.unlink(missing_ok=True)
             (settings.tablet / update_notes.UPLOAD).unlink(missing_ok=True)
-            self._journal.write(state="installed", offered="", found=(), looked=False)
+            spent_s = self._clock.now_s() - begin_s
+            self._journal.write(state="installed", offered="", found=(), looked=False, spent_s=spent_s)
             self._tell(f"Version {release.version} is installed.")
             if restart:
                 self._restart()
@@ -124,7 +133,7 @@ class Updater:
         """Try what is installed and waits; UpdateNowhere if nothing does."""
         with gate.alone(self._settings.folder):
             gate.refuse_while_trying(self._chooser)
-            gate.refuse_unless_at_rest(self._settings.instrument, self._settings.lowest_battery)
+            self._at_rest()
             waiting = self._journal.read().state in ("installed", "trying")
             if not waiting or not self._chooser.is_good(other(self._chooser.committed())):
                 raise UpdateNowhere("nothing that is installed waits to be tried")
@@ -139,7 +148,8 @@ class Updater:
         if not gate.is_trying(self._chooser):
             self._tell(f"Version {self.runs} is committed already.")
             return
-        forgiven = set(FORGIVEN) & set(self._journal.write(version=self.runs, state="trying").ill)
+        entry = self._journal.write(version=self.runs, state="trying", settling=True)
+        forgiven = set(FORGIVEN) & set(entry.ill)
         deadline = Deadline.after(self._clock, self._settings.patience_s)
         while wrong := self._wrong(forgiven):
             if deadline.left_s() <= 0:
@@ -149,7 +159,7 @@ class Updater:
                 raise UpdateFailed(f"version {self.runs} is not well: {said}")
             self._clock.sleep(ASK_AGAIN_S)
         self._rauc.mark("good")
-        self._journal.write(state="committed")
+        self._journal.write(state="committed", took_s=entry.spent_s + self._clock.now_s())  # whose zero is the start
         self._tell(f"Version {self.runs} is well, and committed.")
 
     def status(self) -> tuple[Entry, str]:
@@ -163,6 +173,10 @@ class Updater:
         settings = self._settings
         checks = probe.examine(settings.instrument, look="camera" not in forgiven, patience_s=settings.answer_s)
         return [check for check in checks if check.of_release and not check.ok and check.name not in forgiven]
+
+    def _at_rest(self) -> tuple[str, ...]:
+        settings = self._settings
+        return gate.refuse_unless_at_rest(settings.instrument, settings.lowest_battery, self._clock.wall())
 
     def _fetched(self, place: Path | None) -> Path:
         folder = self._settings.folder
@@ -190,13 +204,17 @@ class Updater:
         """RAUC reads only what belongs to root and cannot change: so a copy, which nobody else can reach."""
         folder = self._settings.folder
         try:
-            release = self._rauc.release(sources.copied(path, folder, self._quietly, LOOKED_AT))
-            found = found.model_copy(update={"version": release.version})
-            gate.refuse_wrong(release, self._rauc.compatible(), self.runs)
+            begin_s = self._clock.now_s()
+            copy = sources.copied(path, folder, self._quietly)
+            copy_s = self._clock.now_s() - begin_s
+            takes_s = tuple(times * copy_s + more_s for times, more_s in zip(READS, RESTART_S, strict=True))
+            release = self._rauc.release(copy)
+            found = found.model_copy(update={"version": release.version, "takes_s": takes_s})
+            gate.refuse_wrong(release, self._rauc.compatible(), self.runs, self._settings.modules)
         except UpdateError as error:
             return found.model_copy(update={"trouble": Trouble.of(error)})
         finally:
-            (folder / LOOKED_AT).unlink(missing_ok=True)
+            sources.clear(folder)
         return found
 
     def _offer(self) -> tuple[sources.Web, channel.Offer]:

@@ -18,7 +18,7 @@ from tests.appliance.releases import Workshop
 from tests.house import ROOT
 
 NOWHERE = "http://127.0.0.1:9"  # no instrument: a device whose page does not answer may be updated
-SLOT_MB = 32
+SLOT_KB, BOOT_KB = 32_768, 64
 BACKEND = """\
 #!{python} -I
 import sys
@@ -56,7 +56,7 @@ class Bench:
     def settings(self, **changed: object) -> UpdateSettings:
         here = self.here
         known = {"sticks": here / "media", "folder": here / "state", "keyring": self.workshop.keys / "ca.crt"}
-        rest = {"rauc": self.rauc(), "restart": ("true",), "instrument": NOWHERE}
+        rest = {"rauc": self.rauc(), "restart": ("true",), "instrument": NOWHERE, "modules": here / "modules"}
         return UpdateSettings(**known | rest | changed)  # type: ignore[arg-type]
 
     def updater(self, runs: str = "1.0", **changed: object) -> Updater:
@@ -103,7 +103,7 @@ class Bench:
 
 
 @contextmanager
-def opened(here: Path, workshop: Workshop) -> Iterator[Bench]:
+def opened(here: Path, workshop: Workshop, slot_kb: int = SLOT_KB) -> Iterator[Bench]:
     """A bench with the committed slot A running, both slots empty."""
     bench = Bench(here, workshop)
     for name in ("chooser", "state", "media", "root"):
@@ -117,8 +117,8 @@ def opened(here: Path, workshop: Workshop) -> Iterator[Bench]:
     try:
         assert daemon.stdout is not None
         bench.bus = daemon.stdout.readline().strip()
-        for slot in ("A", "B"):
-            run("truncate", "-s", f"{SLOT_MB}M", here / f"{slot}.img")
+        for slot, size_kb in (("A", slot_kb), ("B", slot_kb), ("boot-a", BOOT_KB), ("boot-b", BOOT_KB)):
+            run("truncate", "-s", f"{size_kb}K", here / f"{slot}.img")
             bench.loops[slot] = run("losetup", "-f", "--show", here / f"{slot}.img").strip()
         (here / "system.conf").write_text(_conf(bench))
         yield bench
@@ -148,6 +148,8 @@ def _conf(bench: Bench) -> str:
         "/opt/diffuscope/services/update/bootchooser.py": str(bench.here / "backend"),
         "/dev/disk/by-partlabel/root-a": bench.loops["A"],
         "/dev/disk/by-partlabel/root-b": bench.loops["B"],
+        "/dev/disk/by-partlabel/boot-a": bench.loops["boot-a"],
+        "/dev/disk/by-partlabel/boot-b": bench.loops["boot-b"],
     }.items():
         assert theirs in text, f"system.conf no longer says {theirs}"
         text = text.replace(theirs, ours)

@@ -17,8 +17,8 @@ from signal import SIGKILL
 from tests.systemd.machine import CACHE, Machine, leader
 
 PARTITIONS = {"2": "A", "3": "B"}
-NAMES = {"A": "root-a", "B": "root-b"}
-SLOT_MB, DATA_MB = 500, 1600
+NAMES = {"A": "root-a", "B": "root-b", "boot-a": "boot-a", "boot-b": "boot-b"}
+SLOT_MB, BOOT_MB, DATA_MB = 500, 4, 1600
 FOLDERS = ("captures", "compiled", "update", "journal")
 
 # The kernel's words are the host's: ours are laid over them, and once more in the units that have a /proc of their own.
@@ -158,7 +158,8 @@ def made(folder: Path, image: Path) -> Iterator[Device]:
     text = "[all]\ntryboot_a_b=1\nboot_partition=2\n[tryboot]\nboot_partition=3\n"
     (device.chooser / "autoboot.txt").write_text(text)
     try:
-        for name, size_mb in (("A", SLOT_MB), ("B", SLOT_MB), ("data", DATA_MB)):
+        sizes_mb = {"A": SLOT_MB, "B": SLOT_MB, "boot-a": BOOT_MB, "boot-b": BOOT_MB, "data": DATA_MB}
+        for name, size_mb in sizes_mb.items():
             file = folder / f"{name}.img"
             run("truncate", "-s", f"{size_mb}M", file)
             device.loops[name] = run("losetup", "-f", "--show", file).strip()

@@ -46,18 +46,23 @@ class Workshop:
         compatible: str = "diffuscope-pi5",
         keys: Path | None = None,
         minimum: str = "0.9",
+        noise_bytes: int = 12_000_000,
+        boot: bytes | None = None,
     ) -> Path:
         """A bundle whose slot is a small filesystem with a number and noise: quick to write, and to check."""
         keys, folder, out = keys or self.keys, self.folder / f"{name}-parts", self.folder / f"{name}.raucb"
         (folder / "tree").mkdir(parents=True)
         (folder / "tree" / "version").write_text(version)
-        (folder / "tree" / "noise").write_bytes(random.randbytes(12_000_000))
+        (folder / "tree" / "noise").write_bytes(random.randbytes(noise_bytes))
         run("mksquashfs", folder / "tree", folder / "rootfs.img", "-quiet", "-no-progress", "-comp", "lz4")
         subprocess.run(["rm", "-r", str(folder / "tree")], check=True)
         (folder / "manifest.raucm").write_text(
             f"[update]\ncompatible={compatible}\nversion={version}\ndescription=updates from {minimum} or newer\n\n"
             "[bundle]\nformat=plain\n\n[image.rootfs]\nfilename=rootfs.img\n"
+            + ("" if boot is None else "\n[image.boot]\nfilename=boot.img\n")
         )
+        if boot is not None:
+            (folder / "boot.img").write_bytes(boot)
         signer = ("--cert", keys / "signer.crt", "--key", keys / "signer.key", "--keyring", keys / "ca.crt")
         run("rauc", *signer, "bundle", folder, out)
         return out

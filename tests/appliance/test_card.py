@@ -5,6 +5,7 @@ firmware reads and what the first boot adds are those that ship.
 """
 
 import configparser
+import gzip
 import json
 import re
 import subprocess
@@ -25,6 +26,7 @@ IMAGE = ROOT / "systemd" / "image"
 CARD = IMAGE / "card"
 NAMES = ["chooser", "boot-a", "boot-b", "root-a", "root-b"]
 GROWN_MB = 7000
+KERNEL = "6.6.31+rpt-rpi-2712"
 SHIPPED = {
     "fstab": "etc/fstab",
     "repart.conf": "etc/repart.d/50-data.conf",
@@ -39,7 +41,8 @@ def tree_of(folder: Path, encrypt: str = "n") -> Path:
         (tree / name).mkdir(parents=True)
     for ours, theirs in SHIPPED.items():
         run("install", "-D", "--mode=644", IMAGE / ours, tree / theirs)
-    (tree / "boot/firmware/kernel_2712.img").write_bytes(b"a kernel" * 1000)
+    kernel = gzip.compress(b"a kernel" * 1000 + f"\0Linux version {KERNEL} (somebody) \0".encode())
+    (tree / "boot/firmware/kernel_2712.img").write_bytes(kernel)
     run(CARD / "board", tree, encrypt)
     return tree
 
@@ -116,8 +119,9 @@ def test_the_partitions_are_those_that_firmware_rauc_and_updates_expect(card: Pa
     assert found["root-a"]["bytes"] == found["root-b"]["bytes"] > 1_500_000_000
     conf = configparser.ConfigParser()
     conf.read(IMAGE / "system.conf")
-    devices = [Path(conf[f"slot.rootfs.{number}"]["device"]).name for number in (0, 1)]
-    assert devices == ["root-a", "root-b"]
+    for kind, names in {"rootfs": ["root-a", "root-b"], "boot": ["boot-a", "boot-b"]}.items():
+        assert [Path(conf[f"slot.{kind}.{number}"]["device"]).name for number in (0, 1)] == names
+    assert [conf[f"slot.boot.{number}"]["parent"] for number in (0, 1)] == ["rootfs.0", "rootfs.1"]
     (tmp_path / "autoboot.txt").write_text(read(card, "chooser", "autoboot.txt"))
     assert BootChooser(autoboot=tmp_path / "autoboot.txt").committed() == "A"
 
@@ -130,6 +134,36 @@ def test_each_slot_tells_the_kernel_which_root_is_its_own(card: Path, tmp_path: 
     assert f"root=PARTLABEL=root-{slot.lower()}" in words.split()
     assert {"rootfstype=squashfs", "ro", "rootwait", "systemd.volatile=overlay", "panic=10"} <= set(words.split())
     assert BootChooser(command_line=tmp_path / "cmdline").booted() == slot
+
+
+def bundle(card: Path, root: Path, *more: object) -> subprocess.CompletedProcess[str]:
+    """What a technician calls to make an update of a card."""
+    out = root.with_suffix(".raucb")
+    words = [IMAGE / "bundle", "--keys", card.parents[1] / "keys", "--format", "plain", "-o", out, "--image", root]
+    return subprocess.run([str(word) for word in (*words, *more)], capture_output=True, text=True, check=False)
+
+
+def test_an_update_of_a_card_has_the_kernel_of_its_root_or_is_not_made(card: Path, tmp_path: Path) -> None:
+    """The two are one slot: RAUC finds both in the bundle, and a kernel without its modules is refused at once."""
+    run(IMAGE / "keys", card.parents[1] / "keys")
+    boot = card.parent / "boot.vfat"
+    for kernel in (KERNEL, "6.1.0"):
+        tree = tmp_path / kernel
+        (tree / "usr/lib/modules" / kernel).mkdir(parents=True)
+        (tree / "usr/share/diffuscope").mkdir(parents=True)
+        (tree / "usr/share/diffuscope/sbom.cdx.json").write_text("{}")
+        (tree / "usr/share/diffuscope/release.json").write_text('{"version": "2.0", "git": "0", "minimum": "1.0"}')
+        run("mksquashfs", tree, tmp_path / f"{kernel}.squashfs", "-quiet", "-no-progress")
+    ours, other = (tmp_path / f"{kernel}.squashfs" for kernel in (KERNEL, "6.1.0"))
+    assert "needs that kernel" in bundle(card, ours).stderr
+    assert f"is {KERNEL}, and the root has modules of 6.1.0" in bundle(card, other, "--boot", boot).stderr
+    made = bundle(card, ours, "--boot", boot)
+    assert made.returncode == 0, made.stderr
+    keyring = f"--keyring={card.parents[1] / 'keys/ca.crt'}"
+    said = json.loads(run("rauc", keyring, "info", "--output-format=json", ours.with_suffix(".raucb")))
+    assert {name: image["filename"] for one in said["images"] for name, image in one.items()} == {
+        "rootfs": "rootfs.img", "boot": "boot.img",
+    }  # fmt: skip
 
 
 def test_a_root_has_no_kernel_and_no_choice_in_it(card: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import random
 import shutil
 import sys
 from collections.abc import Iterator
@@ -30,7 +32,7 @@ from services.update import gate
 from services.update.engine import Rauc
 from tests.appliance import bench as benches
 from tests.appliance import releases
-from tests.appliance.bench import Bench
+from tests.appliance.bench import BOOT_KB, Bench
 from tests.appliance.device import run
 from tests.appliance.releases import Workshop
 from tests.house import ROOT
@@ -99,6 +101,24 @@ def test_another_device_an_older_version_and_one_step_too_many(bench: Bench, she
     assert "2.5" in refused(bench, far, UpdateTooFar)
     assert "1.0" in refused(bench, shelf.good, UpdateOlder)
     assert "2.0" in refused(bench, shelf.newer, UpdateOlder, runs="2.0.1")
+
+
+def test_a_version_without_its_kernel_is_refused_and_one_with_it_becomes_root_and_kernel(
+    bench: Bench, shelf: Shelf, tmp_path: Path
+) -> None:
+    """Where the kernel that runs has modules: they and it are written into the same slot, or not at all."""
+    modules, kernels = tmp_path / "modules", [random.randbytes(40_000) for _ in range(2)]
+    (modules / os.uname().release).mkdir(parents=True)
+    for slot in ("a", "b"):
+        (bench.here / f"boot-{slot}.img").write_bytes(kernels[0].ljust(BOOT_KB * 1024, b"\0"))
+    assert os.uname().release in refused(bench, shelf.newer, UpdateWrongDevice, modules=modules)
+    whole = shelf.workshop.small(f"{tmp_path.name}-whole", "2.0", boot=kernels[1])
+    with bench.service():
+        bench.updater(modules=modules).install(whole)
+    assert (bench.version("A"), bench.version("B")) == ("1.0", "2.0")
+    written = {slot: Path(bench.loops[slot]).read_bytes() for slot in ("boot-a", "boot-b")}
+    assert written["boot-a"].startswith(kernels[0])
+    assert written["boot-b"].startswith(kernels[1])
 
 
 @pytest.mark.parametrize("harm", ["bit flip", "truncated", "last byte", "empty", "text"])

@@ -3,77 +3,27 @@
 What a real instrument answers is in `test_versions.py`; here it hangs, is ill, examines, or has an empty battery.
 """
 
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.metadata import version
+from datetime import timedelta
 from pathlib import Path
-from threading import Event, Thread
 
 import pytest
 
 from device.clock import SystemClock
 from device.errors import UpdateAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow, UpdateWrongDevice
-from services.health.checks import Check
-from services.health.probe import as_json
 from services.update.updater import Updater
 from tests.appliance import bench as benches
 from tests.appliance import releases
 from tests.appliance.bench import Bench
+from tests.appliance.instrument import Page, check, served
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(60)]
 
 
-def check(name: str, ok: bool = True) -> Check:
-    return Check(name, ok, "as it should be" if ok else "broken", "well", "" if ok else "Mend it first.", True)
-
-
-@dataclass
-class Page:
-    """What an instrument says on its page."""
-
-    at: str = ""
-    state: str = "aim"
-    battery: float | None = None
-    checks: list[Check] = field(default_factory=lambda: [check("camera"), check("captures")])
-    sees: bool = True
-    hangs: bool = False
-    closing: Event = field(default_factory=Event)
-
-    def answer(self, path: str) -> tuple[int, bytes]:
-        match path:
-            case "/api/status":
-                return 200, json.dumps({"state": self.state, "version": version("diffuscope")}).encode()
-            case "/api/health":
-                return 200, json.dumps({"battery": self.battery, "checks": as_json(self.checks)}).encode()
-        return (200, b"\xff\xd8a picture") if self.sees else (204, b"")
-
-
 @pytest.fixture
 def page() -> Iterator[Page]:
-    page = Page()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if page.hangs:
-                page.closing.wait(20)
-            status, body = page.answer(self.path)
-            self.send_response(status)
-            self.end_headers()
-            self.wfile.write(body)
-
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.handle_error = lambda request, address: None  # type: ignore[method-assign]  # who asked did not wait
-    page.at = f"http://127.0.0.1:{server.server_port}"
-    Thread(target=server.serve_forever, daemon=True).start()
-    yield page
-    page.closing.set()
-    server.shutdown()
-    server.server_close()
+    with served() as page:
+        yield page
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +122,7 @@ def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) 
     [
         (not_now(exam="busy"), UpdateDuringExam),
         (not_now(exam="making"), UpdateDuringExam),
+        (Page(visit_begun=timedelta(minutes=3)), UpdateDuringExam),
         (not_now(battery=0.49), UpdatePowerLow),
         (not_now(well=False), UpdateAtRisk),
     ],
@@ -179,11 +130,12 @@ def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) 
 def test_an_update_waits_for_examination_charger_and_captures(
     bench: Bench, page: Page, two: tuple[object, Path], now: Page, kind: type[UpdateError]
 ) -> None:
-    page.state, page.battery, page.checks = now.state, now.battery, now.checks
+    page.state, page.battery, page.checks, page.visit_begun = now.state, now.battery, now.checks, now.visit_begun
     with pytest.raises(kind):
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "A"
     page.state, page.battery, page.checks = "aim", 0.51, [check("captures")]
+    page.visit_begun = timedelta(hours=1)  # somebody left it so, and will finish it another time
     with bench.service():
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "B"

@@ -1,5 +1,6 @@
 """The update screen on the real server, with the real updater beside it: from stick to "Updated to 2.0", and not."""
 
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -109,7 +110,7 @@ def test_from_a_stick_to_the_next_version(device: Device, open_page: Open, compl
         page.wait_for_timeout(700)
         install.tap()
         at(page, "installing")
-        expect(page.locator(".update")).to_contain_text("Takes about 4 minutes. The camera restarts by itself.")
+        expect(page.locator(".update")).to_contain_text("Estimate: 1 to 4 minutes. No update was timed on this camera")
         expect(page.locator("progress")).to_have_js_property("value", 0.8)
         board.release()
         at(page, "restarting")
@@ -123,6 +124,15 @@ def test_from_a_stick_to_the_next_version(device: Device, open_page: Open, compl
     at(page, "committed")
     expect(page.locator(".update")).to_contain_text("Updated to 2.0.")
     expect(page.locator(".update")).to_contain_text("What is new")
+    board.bundle("three.raucb", "3.0")
+    with board.path_unit("2.0"):
+        page.wait_for_timeout(700)
+        page.locator("#look").tap()
+        offered = page.locator("li", has_text="Version 3.0")
+        expect(offered).to_contain_text(
+            re.compile(r"The last update took \d+ minutes?\. The camera restarts by itself"), timeout=90_000
+        )
+    (board.stick / "three.raucb").unlink()
 
 
 def test_a_version_that_is_not_well_is_taken_back(device: Device, open_page: Open, complaints: Complaints) -> None:

@@ -21,15 +21,22 @@ from services.records.people import People
 from services.records.protocol import load_protocol
 from services.records.snapshots import Snapshots
 from services.records.store import Store
-from services.update.bootchooser import BootChooser
-from services.update.journal import Journal
 from tests.earlier import RAW, Release, shelf_of
+from tests.hard.power_fat import (
+    FILES,
+    commit,
+    commit_by_rename,
+    export,
+    judge_choice,
+    judge_export,
+    judge_rename,
+    with_choice,
+    with_stick,
+)  # fmt: skip
 from tests.unit.test_archive import WHO, calibration
 
-FILES = {"raw.tiff": bytes(range(256)) * 40, "picture.png": b"png" * 300, "report.json": b"{}"}
 OLD, NEW = (replace(calibration(black_dn), dark_dn=None, bad=None) for black_dn in (64.25, 65.0))
 ADOPTED = "adopted"
-CHOICE = "[all]\ntryboot_a_b=1\nboot_partition=2\n[tryboot]\nboot_partition=3\n"
 
 
 def capture(name: str, second: int = 0) -> Capture:
@@ -39,10 +46,6 @@ def capture(name: str, second: int = 0) -> Capture:
 
 def people(store: Store) -> People:
     return People(store.engine, load_protocol(), SystemClock())
-
-
-def chooser(folder: Path) -> BootChooser:
-    return BootChooser(folder / "autoboot.txt", folder, folder / "word", folder / "cmdline")
 
 
 # What is done, what it begins with, and what must be true of whatever is left; `said` is what was said to be done.
@@ -58,6 +61,7 @@ class Case:
     act: Act
     judge: Judge
     outcomes: frozenset[str]
+    fat: tuple[str, ...] = ()  # folders that are FAT
 
 
 def shelf_with_one(folder: Path) -> None:
@@ -166,30 +170,6 @@ def judge_calibration(folder: Path, said: list[str]) -> str:
     elif said and not (said == [NEW.id] and in_force == OLD.id and OLD.id in kept):
         assert in_force == said[-1]
     return "new" if NEW.id in kept else "old"
-
-
-def with_choice(folder: Path) -> None:
-    (folder / "autoboot.txt").write_text(CHOICE)
-    (folder / "cmdline").write_text("rauc.slot=B\n")
-    Journal(folder).write(state="installed", version="2.0")
-
-
-def commit(folder: Path, say: Callable[[str], None]) -> None:
-    Journal(folder).write(state="trying")
-    chooser(folder).set_good("B")
-    say("B")
-    Journal(folder).write(state="committed")
-    say("committed")
-
-
-def judge_choice(folder: Path, said: list[str]) -> str:
-    slot, entry = chooser(folder).committed(), Journal(folder).read()
-    assert (folder / "autoboot.txt").read_text().startswith("[all]\ntryboot_a_b=1\n")
-    assert slot == "B" or not said
-    assert entry.version == "2.0"
-    assert entry.state in {"installed", "trying", "committed"}
-    assert entry.state == "committed" or "committed" not in said
-    return slot
 
 
 def earlier_shelf(folder: Path) -> None:
@@ -336,13 +316,19 @@ CASES = {
     "a calibration is kept and taken back": Case(calibrated, recalibrate, judge_calibration, OLD_NEW),
     "a calibration is taken in": Case(to_take_in, take_in, judge_calibration, OLD_NEW),
     "the first calibration": Case(nothing, first_calibration, judge_calibration, frozenset({"none", "new"})),
-    "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB")),
+    "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB"), ("chooser",)),
     "tables are brought forward": Case(earlier_shelf, migrate, judge_migration, OLD_NEW),
     "a torn capture is moved aside": Case(half_kept, opened, judge_swept, OLD_NEW),
     "a snapshot is put back": Case(with_snapshot, put_back, judge_put_back, frozenset({"old", "refused", "new"})),
+    "a visit goes onto a FAT stick": Case(
+        with_stick, export, judge_export, frozenset({"old", "empty", "new"}), ("stick",)
+    ),
     "careless: no wait": Case(with_note, does_not_wait, judge_note, frozenset({"old", "new", "empty", "lost"})),
     "careless: the file alone": Case(
         with_note, waits_for_the_file_alone, judge_note, frozenset({"old", "new", "lost"})
+    ),
+    "careless: a rename on FAT": Case(
+        with_choice, commit_by_rename, judge_rename, frozenset({"A", "B", "no choice", "lost"}), ("chooser",)
     ),
     "careless: tables": Case(
         with_loose_tables, trusts_the_disk, judge_loose, frozenset({"old", "damaged", "new", "lost"})

@@ -41,7 +41,7 @@ def recording() -> Iterator[Recording]:
 @pytest.mark.parametrize("name", CASES)
 def test_a_power_cut_at_any_moment_leaves_the_old_or_the_new_one_whole(name: str, recording: Recording) -> None:
     case, draw, folder = CASES[name], random.Random(name), folder_of(name, recording.folder)
-    disk = Disk(folder, folder_of(name, recording.folder / "before"))
+    disk = Disk(folder, folder_of(name, recording.folder / "before"), case.fat)
     disks, contents, outcomes = set[int](), set[int](), set[str]()
     for call in ["", *recording.calls]:
         if call and not disk.follow(call):

@@ -5,18 +5,24 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import httpx
 import pytest
 
 from device.clock import VirtualClock
+from device.errors import UpdateDuringExam
 from services.instrument.api import create_app
 from services.instrument.updates_api import update_routes
 from services.instrument.updating import MOST_BYTES, PATIENCE_S, UpdateDesk, news
 from services.records.update_notes import TABLET, UPLOAD, WISH, Wish, leave
 from services.update import gate
+from services.update.updater import Updater
+from tests.appliance.instrument import served
 from tests.journey.conftest import Rig
 from tests.updates import Board
 
@@ -90,6 +96,26 @@ def test_from_a_stick_to_the_next_version(page: Page) -> None:
     after = UpdateDesk(page.board.state, page.board.wishes, page.clock, "2.0").told()
     assert (after["state"], after["runs"], after["trouble"]) == ("committed", "2.0", None)
     assert after["news"]
+
+
+def test_how_long_an_update_takes_is_what_the_last_one_took_or_an_estimate(page: Page) -> None:
+    """Timed from the copy to the restart, and from the start of the computer until it was found well."""
+    board = page.board
+    board.bundle("two.raucb")
+    (found,) = page.looked()["found"]
+    low_s, high_s = found["takes_s"]
+    assert (0 < low_s < high_s, page.told()["took_s"]) == (True, None)
+    page.installed(found["id"])
+    board.boot()
+    with served() as instrument:
+        settings = board.settings(instrument=instrument.at, answer_s=2.0)
+        Updater(settings, VirtualClock(elapsed_s=100.0), print, board.chooser, "2.0").settle()
+    told = UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()
+    assert told["state"] == "committed"
+    assert 100 < told["took_s"] < 160  # the install took a second or two
+    board.bundle("three.raucb", "3.0")
+    board.updater("2.0").look()
+    assert UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()["took_s"] == told["took_s"]
 
 
 def test_a_version_that_is_not_well_is_taken_back_and_says_why(page: Page) -> None:
@@ -256,3 +282,27 @@ def test_what_is_new_is_the_versions_own_list_without_marks(tmp_path: Path) -> N
     assert news("1.0", file) == ["old"]
     assert news("3.0", file) == ["New: a, and b.", "c"]
     assert news("1.0", tmp_path / "none") == []
+
+
+def test_an_open_visit_is_an_examination_which_an_update_does_not_end(rig: Rig, page: Page) -> None:
+    """Asked over HTTP of the page's own answers, as the updater asks."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            answer = rig.request("GET", self.path)
+            self.send_response(answer.status_code)
+            self.end_headers()
+            self.wfile.write(answer.content)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    visit = rig.request("POST", "/api/visits", json={"key": "00000000000000aa"}).json()
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        begun = datetime.fromisoformat(visit["begun_at"])
+        at = f"http://127.0.0.1:{server.server_port}"
+        with pytest.raises(UpdateDuringExam, match=visit["number"]):
+            gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=29))
+        gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=31))
+        server.shutdown()

@@ -60,7 +60,11 @@ class Machine:
         return [said[name] for name in names]
 
     def is_there(self, path: str) -> bool:
-        return subprocess.run([*self._enter, "test", "-e", path], check=False).returncode == 0
+        """Whether there is such a file; whoever enters a machine at the moment of its end may wait for ever."""
+        try:
+            return subprocess.run([*self._enter, "test", "-e", path], check=False, timeout=20).returncode == 0
+        except subprocess.TimeoutExpired:
+            return False
 
     def blanked(self) -> list[Blanked]:
         """Every run of the blanker so far."""

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from services.update.bootchooser import PARTITIONS, BootChooser, main
+from services.update.bootchooser import SECTOR_BYTES, BootChooser, main
+from tests import firmware
 from tests.house import ROOT
 
 
@@ -27,9 +28,7 @@ def restart(device: BootChooser, orderly: bool = True) -> str:
     """What the firmware does: the word counts once, and only after an orderly restart."""
     trying = orderly and device.reboot_word.exists() and "tryboot" in device.reboot_word.read_text()
     device.reboot_word.unlink(missing_ok=True)
-    section = device.autoboot.read_text().split("[tryboot]")[1 if trying else 0]
-    number = int(section.split("boot_partition=")[1].split()[0])
-    slot = next(slot for slot, partition in PARTITIONS.items() if partition == number)
+    slot = firmware.boots(device.autoboot.read_bytes(), trying)
     device.command_line.write_text(f"rauc.slot={slot}\n")
     return slot
 
@@ -85,7 +84,41 @@ def test_rauc_and_systemd_are_answered(device: BootChooser, capsys: pytest.Captu
     assert main(["set-primary", "C"], device) == 254
 
 
-@pytest.mark.parametrize("content", ["", "[all]\n", "[all]\nboot_partition=7\n", "[all]\nboot_partition=x\n"])
+def test_a_commit_changes_two_bytes_of_one_sector_and_nothing_else_on_that_disk(device: BootChooser) -> None:
+    """So that whatever a power cut leaves names a slot: even of a sector that is torn between its bytes."""
+    before, inode = device.autoboot.read_bytes(), device.autoboot.stat().st_ino
+    device.set_primary("B")
+    restart(device)
+    device.set_good("B")
+    after = device.autoboot.read_bytes()
+    assert (device.autoboot.stat().st_ino, len(after)) == (inode, len(before))
+    places = [at for at, (old, new) in enumerate(zip(before, after, strict=True)) if old != new]
+    assert len(places) == 2
+    for some in ((), places[:1], places[1:], places):
+        torn = bytearray(before)
+        for at in some:
+            torn[at] = after[at]
+        assert firmware.partition(bytes(torn)) == (3 if places[0] in some else 2)
+        assert firmware.partition(bytes(torn), tried=True) in (2, 3)
+        device.autoboot.write_bytes(torn)
+        assert device.committed() == firmware.boots(bytes(torn))
+
+
+def test_what_a_technician_wrote_into_the_choice_stays(device: BootChooser) -> None:
+    said = "# two slots\r\n[all]\r\ntryboot_a_b=1\r\nboot_partition=2\r\n# the other\r\n[tryboot]\r\nboot_partition=3"
+    device.autoboot.write_bytes(said.encode())
+    device.command_line.write_text("rauc.slot=B\n")
+    device.set_good("B")
+    assert device.autoboot.read_bytes().decode() == said.replace("=2", "=x").replace("=3", "=2").replace("=x", "=3")
+
+
+UNREADABLE = [
+    "", "[all]\n", "[all]\nboot_partition=7\n", "[all]\nboot_partition=x\n", "[all]\nboot_partition=2\n",
+    f"#{'x' * SECTOR_BYTES}\n[all]\nboot_partition=2\n[tryboot]\nboot_partition=3\n",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("content", UNREADABLE)
 def test_an_unreadable_choice_is_said_and_not_guessed(
     device: BootChooser, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -143,3 +143,11 @@ def test_what_an_entry_means_depends_on_what_runs_and_since_when(
 
 def test_every_start_of_the_computer_has_a_name() -> None:
     assert len(this_boot()) == 36
+
+
+def test_a_commit_that_the_journal_did_not_see_is_told_as_one() -> None:
+    """The power went between `autoboot.txt` and the journal: the version that was tried runs, in another start."""
+    tried = Entry(state="trying", version="2.0", boot="one", settling=True)
+    assert [stage(tried, "2.0", boot) for boot in ("one", "two")] == ["trying", "committed"]
+    assert stage(tried.model_copy(update={"settling": False}), "2.0", "two") == "trying"  # it has only just begun
+    assert stage(tried, "1.0", "two") == "lost"

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from device.errors import (
     UpdateNowhere,
     UpdateOlder,
     UpdateUnreachable,
+    UpdateWrongDevice,
 )  # fmt: skip
 from services.update.channel import Offer, opened
 from services.update.engine import Release
@@ -90,6 +92,14 @@ def test_what_is_not_what_the_channel_promised_is_removed(site: Site, keys: Path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_power_cut_kept_by_its_length_only_is_fetched_anew(site: Site, keys: Path, tmp_path: Path) -> None:
+    """Zeros where the content was not written yet; who waited for hours for it is not told that the file is damaged."""
+    (tmp_path / "two.raucb.part").write_bytes(bytes(4_000_000))
+    site.files = {"two.raucb": CONTENT}
+    assert Web(site.at, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
+    assert site.asked == ["bytes=4000000-", "all"]
+
+
 def test_what_is_there_already_is_not_asked_for_again(site: Site, keys: Path, tmp_path: Path) -> None:
     (tmp_path / "update.raucb").write_bytes(CONTENT)
     (tmp_path / "one.raucb.part").write_bytes(b"of an older version")
@@ -129,15 +139,27 @@ def test_a_channel_is_believed_if_our_signer_signed_it(keys: Path, tmp_path: Pat
         opened(signed(keys, json.dumps(said | {"bundle": "../../etc/x.raucb"}).encode()), keys / "ca.crt")
 
 
-def test_versions_are_numbers_and_not_words() -> None:
+def test_versions_are_numbers_and_not_words(tmp_path: Path) -> None:
     assert number("2.0") == number("2") < number("2.0.1") < number("2.10") < number("10")
     for word in ("", "2.0-rc1", "two", "1.2.3.4.5"):
         with pytest.raises(UpdateDamaged):
             number(word)
     release = Release("here", "2.9", "1.0", "")
-    refuse_wrong(release, "here", "2.8.9")
+    refuse_wrong(release, "here", "2.8.9", tmp_path)
     with pytest.raises(UpdateOlder):
-        refuse_wrong(release, "here", "2.10")
+        refuse_wrong(release, "here", "2.10", tmp_path)
+
+
+def test_a_root_never_meets_the_kernel_of_another(tmp_path: Path) -> None:
+    """A device whose kernel has modules takes no version without its kernel; one without modules takes both."""
+    with_kernel, without = (Release("here", "2.9", "1.0", "", has_kernel=one) for one in (True, False))
+    for release in (with_kernel, without):
+        refuse_wrong(release, "here", "2.8", tmp_path)
+    (tmp_path / os.uname().release).mkdir()
+    refuse_wrong(with_kernel, "here", "2.8", tmp_path)
+    with pytest.raises(UpdateWrongDevice, match="without a kernel") as caught:
+        refuse_wrong(without, "here", "2.8", tmp_path)
+    assert "it brings its kernel" in caught.value.remedy
 
 
 def test_settings_refuse_what_they_do_not_know(tmp_path: Path) -> None:

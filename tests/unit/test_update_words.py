@@ -28,6 +28,7 @@ from services.update.journal import in_words
             False,
             "Version 1.0 runs. Version 2.0 did not finish starting, or lost power: 1.0 is back.",
         ),
+        (Entry(state="trying", version="1.0"), False, "Updated to 1.0. It was tried, found well, and stays."),
         (Entry(state="committed", version="1.0"), False, "Updated to 1.0. It was tried, found well, and stays."),
         (
             Entry(

@@ -1,0 +1,72 @@
+"""An instrument that is made up: what it says on its page is whatever a test wants, over real HTTP."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.metadata import version
+from threading import Event, Thread
+
+from services.health.checks import Check
+from services.health.probe import as_json
+
+
+def check(name: str, ok: bool = True) -> Check:
+    return Check(name, ok, "as it should be" if ok else "broken", "well", "" if ok else "Mend it first.", True)
+
+
+@dataclass
+class Page:
+    """What an instrument says on its page."""
+
+    at: str = ""
+    state: str = "aim"
+    battery: float | None = None
+    checks: list[Check] = field(default_factory=lambda: [check("camera"), check("captures")])
+    sees: bool = True
+    hangs: bool = False
+    visit_begun: timedelta | None = None  # how long ago the visit was begun that is open
+    closing: Event = field(default_factory=Event)
+
+    def answer(self, path: str) -> tuple[int, bytes]:
+        match path:
+            case "/api/status":
+                return 200, json.dumps({"state": self.state, "version": version("diffuscope")}).encode()
+            case "/api/health":
+                return 200, json.dumps({"battery": self.battery, "checks": as_json(self.checks)}).encode()
+            case "/api/visits?open=true&limit=1":
+                begun = [] if self.visit_begun is None else [datetime.now(UTC) - self.visit_begun]
+                visits = [{"number": "PN-0007-K", "begun_at": at.isoformat()} for at in begun]
+                return 200, json.dumps({"visits": visits}).encode()
+        return (200, b"\xff\xd8a picture") if self.sees else (204, b"")
+
+
+@contextmanager
+def served() -> Iterator[Page]:
+    """A page that answers."""
+    page = Page()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if page.hangs:
+                page.closing.wait(20)
+            status, body = page.answer(self.path)
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server.handle_error = lambda request, address: None  # type: ignore[method-assign]  # who asked did not wait
+    page.at = f"http://127.0.0.1:{server.server_port}"
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield page
+    finally:
+        page.closing.set()
+        server.shutdown()
+        server.server_close()
