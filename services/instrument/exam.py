@@ -25,7 +25,7 @@ from device.recon.reconstructor import Reconstructor, Stage, ladder
 from device.sequence import lit
 from device.values import EYES, Calibration, Capture, Eye, Glow, Image, Reconstruction, Shot
 from services.instrument.bulletin import Bulletin
-from services.instrument.exposing import expose, eye_in
+from services.instrument.exposing import before, expose, eye_in
 from services.instrument.filing import QUICK_PX, as_json, capture_files, unmade
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
@@ -177,7 +177,7 @@ class Exam:
         if live.psfs[0] is not calibration.psfs[0]:  # aiming has a colour, and that colour a PSF, of its own
             self._live = Reconstructor(live, shape, planner, self.clock, recipes[:1], refract=False)
         self.fitness.begin(self._reconstructor.refractor)
-        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera.exposure_s, self.bulletin)
+        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera, self.bulletin)
 
     def _best_psf(self, calibration: Calibration, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
@@ -284,6 +284,7 @@ class Exam:
         verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
         report = asdict(made.report) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict)}
         report["budget_s"] = budget_s
+        report["laterality"] = self._eyes.side(eye_in(made.picture, self.head), verdict, shot.press.errand)
         report["seconds"] = {"expose": shot.expose_s, **made.report.seconds}
         plain = json.loads(as_json(report))  # as it will be read back: lists for tuples, floats for numpy's
         calibration_id = self.head.calibration.id
@@ -363,6 +364,7 @@ class Exam:
     def _live_picture(self) -> tuple[Preview, float] | None:
         """The next one, and when its light (for aiming, not the picture's) went off; None if somebody pressed."""
         spec = self.head.spec
+        before(self.head, self._aimed)
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
             with self.head.light.on(Glow(spec.light.preview_colour), self._aimed):

@@ -95,7 +95,7 @@ class People:
         if visit.finished_at is not None:
             raise VisitFinished(f"{visit.number} is finished")
         tries = len(visit.slots[slot].taken)
-        return Errand(id, slot, tries, self.protocol.retakes, self._beside(key))
+        return Errand(id, slot, tries, self.protocol.retakes, wanted.field, self._beside(key))
 
     def _beside(self, key: str | None) -> Beside:
         """What is kept with a capture: the key of the press that made it, and its place."""
