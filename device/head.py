@@ -1,6 +1,6 @@
 """The one place that chooses: a head file becomes a camera, a guarded light and a calibration. Never a fallback."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,9 +33,13 @@ from device.sim.light import Mirrored, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
 from device.sim.world import World
 from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
-from device.values import Calibration
+from device.values import Calibration, Eye
 
 LEASE_MARGIN_S = 0.05  # the guard's own timer comes first; the other process is for when it does not come
+
+
+def by_hand(eye: Eye) -> None:
+    """A real head is held before an eye by a person, whom nobody can move."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,8 @@ class Chips:
 class Head:
     """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it.
 
-    `provenance` is where that comes from; None where nobody measured it.
+    `provenance` is where that comes from; None where nobody measured it. `facing` is told which eye is asked for next,
+    while it is dark: whoever stands before a simulated head brings it.
     """
 
     spec: InstrumentSpec
@@ -62,6 +67,7 @@ class Head:
     button: Button | None = None
     held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
     provenance: Provenance | None = None
+    facing: Callable[[Eye], None] = by_hand
 
     @property
     def kind(self) -> str:
@@ -291,14 +297,15 @@ def _replayed(opening: Opening, ledger: Ledger) -> Head:
 
 def _opened(opening: Opening, ledger: Ledger) -> Head:
     spec, calibration = opening.spec, opening.calibration()
+    facing: Callable[[Eye], None] = by_hand
     if spec.camera.backend == "sim":
-        world = opening.world
-        for colour in {spec.light.colour, spec.light.preview_colour}:
-            world.electrons_per_s(colour)  # now, not while a lamp is lit
+        facing = opening.world.meet
+        facing("OD")  # its light is traced now, not while a lamp is lit
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
     known = opening.kept.provenance if opening.kept is not None else None
-    return Head(spec, camera, light, calibration, opening.chips(), opening.button(), provenance=known)
+    chips, button = opening.chips(), opening.button()
+    return Head(spec, camera, light, calibration, chips, button, provenance=known, facing=facing)
 
 
 def refuse_another_head(head: Head) -> None:

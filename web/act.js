@@ -167,7 +167,10 @@ const ofState = {
     lower("eye.side");
     visits.moveToOtherEye(slot ?? here().slot, id ?? shotOf(get()).id);
   },
-  keepEye: () => lower("eye.side"),
+  keepEye({ code, id, slot }) {
+    dismiss({ code }); // the instrument asks until it has the answer
+    visits.sayEyeIsRight(slot ?? here().slot, id ?? shotOf(get()).id);
+  },
   uncross: visits.uncross,
 };
 

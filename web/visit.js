@@ -1,7 +1,7 @@
 // A person's visit: begin, fill in, go on to the next missing picture, finish, take back. Every change is sent as it is made.
 
 import { freshKey, getVisit, getVisits, Refusal, send } from "./api.js";
-import { get, lostShots, moveShot, set, underway } from "./memory.js";
+import { eyeOf, get, lostShots, moveShot, set, underway } from "./memory.js";
 import { go } from "./routes.js";
 import { lower, raise } from "./states.js";
 
@@ -141,6 +141,10 @@ export async function moveToOtherEye(slot, capture) {
   moveShot(capture, to);
   go({ screen: "picture", visit: visit.id, slot: to.id, capture });
 }
+
+/** The picture is of the eye that it was taken for: nobody asks again. */
+export const sayEyeIsRight = (slot, capture) =>
+  politely(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: eyeOf(get(), slot) }));
 
 /** The next slot without a picture, after this one in the order of the programme; null when every one is answered. */
 export function nextSlot(after) {

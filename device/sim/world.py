@@ -20,21 +20,25 @@ from device.values import Charge, Colour, Eye, Geometry, Glow, Identity, Image
 REFERENCE_C = 25.0  # where a scene's dark current is that of its file
 FAULTS = frozenset({
     "camera.missing", "camera.stalled", "camera.mode", "light.fault", "light.silent", "bus.silent", "eye.closed",
+    "eye.other",
 })  # fmt: skip
 
+OTHER: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 Choice = Callable[[Scene], tuple[Decision, ...]]
 
 
 class World:
     """A retina behind an eye behind the diffuser, and the state of the lamp.
 
-    `eye` is that of the procedural retina; `choose` decides which effects each colour of light calls for;
+    `eye` is the one that looks in now: of the procedural retina, a left one is a right one's mirror image, and a
+    photograph stays what it is. `choose` decides which effects each colour of light calls for;
     `ambient_e_per_s` is light that comes without the lamp, beside what the scene says. `stage` is the light of what
     stands there instead of the eye (`stage.py`), electrons per second (rows, cols); no lamp of ours changes it, and it
     moves by `shake_px` columns and back from one frame to the next.
     `faults` holds what is broken now: "camera.missing", "camera.stalled", "camera.mode" (it gives every other pixel),
     "light.fault", "light.silent" (nothing reaches the LEDs, which keep what they show), "bus.silent", "eye.closed" (a
-    lid, or no eye at all: the lamp's light comes back from everywhere alike).
+    lid, or no eye at all: the lamp's light comes back from everywhere alike), "eye.other" (whoever holds the head goes
+    to the other eye than is asked for).
     """
 
     def __init__(
@@ -60,8 +64,9 @@ class World:
         self.identity: Identity | None = None
         self.pressed_since_s: float | None = None
         self._choose = choose
-        self._setups: dict[Colour, Setup] = {}
-        self._rates: dict[Colour, Image] = {}
+        self._setups: dict[tuple[Eye, Colour], Setup] = {}
+        self._rates: dict[tuple[Eye, Colour], Image] = {}
+        self._retinas: dict[Eye, Fundus] = {}
 
     def broken(self, part: str) -> bool:
         """Whether a part has its fault now; SettingError if `faults` names one that does not exist."""
@@ -70,6 +75,15 @@ class World:
                 f"no fault is called {sorted(strange)[0]!r}", f"Choose from {', '.join(sorted(FAULTS))}."
             )
         return part in self.faults
+
+    def meet(self, eye: Eye) -> None:
+        """The head is held before that eye from now on, or before the other one; its light is traced while it is dark.
+
+        Where something else stands there, it stays.
+        """
+        self.eye = OTHER[eye] if self.broken("eye.other") else eye
+        for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
+            self.electrons_per_s(colour)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -94,24 +108,27 @@ class World:
             return sensor
         return replace(sensor, full_well_e=camera.full_well_e, white_dn=camera.white_dn)
 
-    @cached_property
+    @property
     def retina(self) -> Fundus:
         """The whole object in the field, on a square as wide as the field: it may be larger than the sensor.
 
         Rows and columns are even or odd as the sensor's are, so that their middles fall together.
         """
-        px_per_deg = self.geometry.px_per_deg
-        wide = int(np.ceil(px_per_deg * self.optics.field_deg)) + 4
-        shape = (wide + (wide - self.shape[0]) % 2, wide + (wide - self.shape[1]) % 2)
-        return drawn(self.scene.sim, self.optics, self.eye, shape, px_per_deg)
+        if self.eye not in self._retinas:
+            px_per_deg = self.geometry.px_per_deg
+            wide = int(np.ceil(px_per_deg * self.optics.field_deg)) + 4
+            shape = (wide + (wide - self.shape[0]) % 2, wide + (wide - self.shape[1]) % 2)
+            self._retinas[self.eye] = drawn(self.scene.sim, self.optics, self.eye, shape, px_per_deg)
+        return self._retinas[self.eye]
 
     def setup(self, colour: Colour) -> Setup:
         """The light's way in one colour, with the effects that it calls for."""
-        if colour not in self._setups:
+        mine = self.eye, colour
+        if mine not in self._setups:
             scene = Scene(self.spec, colour, self.eye)
             chosen = self.plan if colour == self.spec.light.colour else self._choose(scene)
-            self._setups[colour] = prepared(scene, self.retina, chosen)
-        return self._setups[colour]
+            self._setups[mine] = prepared(scene, self.retina, chosen)
+        return self._setups[mine]
 
     def truth(self, colour: Colour) -> Image:
         """The object on the sensor grid: reflectance, float32 (rows, cols), zero outside the field."""
@@ -126,9 +143,10 @@ class World:
 
         The green peak reaches `sim.peak_e` in `camera.exposure_s`.
         """
-        if colour not in self._rates:
-            self._rates[colour] = electrons_per_s(self.setup(colour))
-        return self._rates[colour]
+        mine = self.eye, colour
+        if mine not in self._rates:
+            self._rates[mine] = electrons_per_s(self.setup(colour))
+        return self._rates[mine]
 
     def electrons(self, exposure_s: float) -> Image:
         """The electrons that are expected in an exposure under the lamp as it is now; float32 (rows, cols)."""

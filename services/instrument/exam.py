@@ -24,7 +24,7 @@ from device.sequence import lit
 from device.values import EYES, Calibration, Capture, Eye, Glow, Image, Reconstruction, Shot
 from services.instrument.aside import aside
 from services.instrument.bulletin import Bulletin
-from services.instrument.exposing import expose, eye_in
+from services.instrument.exposing import before, expose, eye_in
 from services.instrument.filing import QUICK_PX, capture_files, report_of, unmade
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
@@ -176,7 +176,7 @@ class Exam:
         if live.psfs[0] is not calibration.psfs[0]:  # aiming has a colour, and that colour a PSF, of its own
             self._live = Reconstructor(live, shape, planner, self.clock, recipes[:1], refract=False)
         self.fitness.begin(self._reconstructor.refractor)
-        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera.exposure_s, self.bulletin)
+        self._eyes = Watch(calibration, shape, planner, index, self.head.spec.camera, self.bulletin)
 
     def _best_psf(self, calibration: Calibration, planner: Planner) -> int:
         """A recording may bring PSFs of several depths: the first frame tells which one is its own."""
@@ -281,11 +281,13 @@ class Exam:
             log.warning("no picture could be made of it: %s", error, extra={"code": error.code, "about": shot.id})
             made = unmade(shot.frame, error)
         verdict = self._eyes.judge_again(shot.id, shot.verdict, made.report, shot.press.errand)
-        report = report_of(shot, made.report, verdict, budget_s)
+        shown = eye_in(made.picture, self.head)
+        side = self._eyes.side(shown, verdict, shot.press.errand)
+        report = report_of(shot, made.report, verdict, side, budget_s)
         calibration_id = self.head.calibration.id
         capture = Capture(shot.id, shot.press.eye, shot.taken_at, made.simulated, calibration_id, report, {})
         self._tell_stage(shot.press, shot.id, "keep")
-        shown, quick = eye_in(made.picture, self.head), self._quick.get(shot.id)
+        quick = self._quick.get(shot.id)
 
         def keep() -> Capture:
             files = capture_files(capture, self.head.spec.name, shot.frame, shot.dark, shown, quick)
@@ -363,6 +365,7 @@ class Exam:
     def _live_picture(self) -> tuple[Preview, float] | None:
         """The next one, and when its light (for aiming, not the picture's) went off; None if somebody pressed."""
         spec = self.head.spec
+        before(self.head, self._aimed)
         self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
         try:
             with self.head.light.on(Glow(spec.light.preview_colour), self._aimed):

@@ -10,6 +10,7 @@ def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
     """A lit frame and a dark one, if the head is well; the light counts for these eyes."""
     head.check()
     shot = Shot(head.spec.camera.exposure_s)
+    before(head, eyes)
     head.camera.prepare(shot)
     try:
         with head.light.on(Glow(head.spec.light.colour), eyes):
@@ -17,6 +18,12 @@ def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
         return frame, head.camera.expose(shot)
     finally:
         head.light.off()
+
+
+def before(head: Head, eyes: tuple[Eye, ...]) -> None:
+    """Ask for the eye of the next light, while it is dark, where one is named."""
+    if len(eyes) == 1:
+        head.facing(eyes[0])
 
 
 def eye_in(image: Image, head: Head) -> Image:

@@ -37,9 +37,12 @@ def capture_files(
     }
 
 
-def report_of(shot: Exposed, made: Report, verdict: Verdict, budget_s: float) -> dict[str, Any]:
+def report_of(
+    shot: Exposed, made: Report, verdict: Verdict, laterality: dict[str, Any] | None, budget_s: float
+) -> dict[str, Any]:
     """The report of a picture that was made within `budget_s`, as it will be read back: lists for tuples, no numpy."""
-    report = asdict(made) | shot.light | shot.press.errand.facts | {"verdict": asdict(verdict), "budget_s": budget_s}
+    judged = {"verdict": asdict(verdict), "laterality": laterality, "budget_s": budget_s}
+    report = asdict(made) | shot.light | shot.press.errand.facts | judged
     plain: dict[str, Any] = json.loads(as_json(report | {"seconds": {"expose": shot.expose_s, **made.seconds}}))
     return plain
 

@@ -1,17 +1,23 @@
 """What the page hears about a frame: how to aim before it, and whether it is good, at once and after its making."""
 
 from dataclasses import asdict
+from typing import Any
+
+import numpy as np
 
 from device.errors import FrameError
 from device.recon.aim import Aim, Aimer
 from device.recon.kernels import Pixels
+from device.recon.laterality import laterality
 from device.recon.plan import Planner
 from device.recon.verdict import Gate, Verdict, after, judge
-from device.values import Calibration, Report
+from device.spec import CameraSpec
+from device.values import Calibration, Image, Report
 from services.instrument.bulletin import Bulletin
 from services.instrument.filing import UNMADE
 from services.records.errand import Errand
 
+CENTRE = "centre"  # the part, in a programme, whose pictures have the macula in their middle
 NOWHERE = Aim("noeye", 0.0)
 FAILED = Verdict("again", "make.failed", {})
 
@@ -20,11 +26,12 @@ class Watch:
     """Reads frames for whoever owns the head, and tells pages what it saw; one thread at a time."""
 
     def __init__(
-        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, shot_s: float,
+        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, camera: CameraSpec,
         bulletin: Bulletin,
     ) -> None:  # fmt: skip
         self._gate = Gate(calibration, shape, planner, index)
-        self._aimer, self._bulletin = Aimer(shot_s, self._gate.deg_per_sample), bulletin
+        self._aimer, self._bulletin = Aimer(camera.exposure_s, self._gate.deg_per_sample), bulletin
+        self._geometry, self._field_deg, self._upright = calibration.geometry, calibration.field_deg, camera.upright
         self._told: Aim | None = None
 
     def aim(self, counts: Pixels, exposed_s: float) -> Aim:
@@ -49,6 +56,14 @@ class Watch:
             first = FAILED
         again = after(first, report.residual, report.quality.get("coverage"), errand.tries, errand.retakes)
         return again if (again.word, again.code) == (first.word, first.code) else self._say(id, again)
+
+    def side(self, picture: Image, verdict: Verdict, errand: Errand) -> dict[str, Any] | None:
+        """Which eye a good, macula-centred picture (the field's box of it) seems to be of; None where nobody looked."""
+        asked = self._upright and verdict.word == "good" and errand.field == CENTRE
+        if not asked or self._geometry is None or self._field_deg is None:
+            return None
+        plain = picture if picture.ndim == 2 else picture[..., int(np.argmax(picture.mean(axis=(0, 1))))]
+        return asdict(laterality(plain, self._geometry.px_per_deg, self._field_deg))
 
     def _say(self, id: str, verdict: Verdict) -> Verdict:
         self._bulletin.tell("verdict", id=id, **asdict(verdict))

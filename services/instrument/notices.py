@@ -7,7 +7,7 @@ of it in the status.
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from threading import Event, Lock, Thread
 from typing import Any
@@ -76,7 +76,7 @@ class Notices:
     def standing(self) -> Standing:
         """Everything that stands now, by code."""
         found: Standing = {}
-        for part in (self._store, self._head, self._calibration, self._date, self._making):
+        for part in (self._store, self._head, self._calibration, self._date, self._making, self._side):
             try:
                 found.update(part())
             except DiffuscopeError as error:  # who asks that part for work is told by it
@@ -153,6 +153,10 @@ class Notices:
     def _making(self) -> Standing:
         exam = self._owner.exam_now
         return {"make.slow": {}} if exam is not None and exam.progress.late_s > LATE_S else {}
+
+    def _side(self) -> Standing:
+        asked = self._people.asked_side()
+        return {} if asked is None else {"eye.side": asdict(asked)}
 
     def _is_over(self, one: Lost) -> bool:
         """Whether its slot has a picture, or its visit has ended."""

@@ -82,7 +82,10 @@ def visits_router(people: People, lease: Lease, promised: Promised) -> APIRouter
 
     @router.post("/api/captures/{id}/eye")
     def move(id: str, order: OfEye) -> dict[str, Any]:
-        """This picture was of the other eye: it goes to that eye's slot of the same part, and its report says so."""
+        """This picture is of that eye: it goes to that eye's slot of the same part, if it is not there already.
+
+        Its report says so, and nobody asks again which eye it shows.
+        """
         return shown_visit(people.move(order.key, id, order.eye, lease.holder), people)
 
     @router.post("/api/controller")

@@ -13,12 +13,13 @@ Beside = Callable[[Session, Capture], None]
 
 @dataclass(frozen=True)
 class Errand:
-    """A slot of a visit, how often it was tried before and may be tried again, and what `beside` writes with it."""
+    """A slot of a visit and the part it looks at, how often it was tried and may be, and what `beside` writes with it."""
 
     visit: str | None = None
     slot: str | None = None
     tries: int = 0
     retakes: int = 2
+    field: str | None = None
     beside: Beside | None = None
 
     @property

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 
 from device.clock import Clock
 from device.errors import LightLimit, StoreError
-from device.ledger import Page, Reserved
+from device.ledger import SLOT_S, Page, Reserved
 from device.values import Eye
 from services.records import schema
 from services.records.schema import LightRow, SeenRow
@@ -24,6 +24,18 @@ REMEDY = "The light stays off while what it gives cannot be written down. Free s
 def this_boot() -> str:
     """The name of the time since the computer started; where there is none, this call's own: then less time counts."""
     return BOOT_ID.read_text(encoding="ascii").strip() if BOOT_ID.is_file() else uuid4().hex
+
+
+def count_also(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
+    """Count light for an eye that got it under another's name; it is given already, so nothing is asked or refused.
+
+    It ages from the last light of the book, which is that light itself or a later one.
+    """
+    seen = session.get(SeenRow, 1)
+    slot = int(seen.observed_s // SLOT_S) if seen is not None else 0
+    row = session.get(LightRow, (eye, slot))
+    before = row.dose_j_per_cm2 if row is not None else 0.0
+    session.merge(LightRow(eye=eye, slot=slot, dose_j_per_cm2=before + dose_j_per_cm2))
 
 
 class LightBook:

@@ -95,7 +95,7 @@ class People:
         if visit.finished_at is not None:
             raise VisitFinished(f"{visit.number} is finished")
         tries = len(visit.slots[slot].taken)
-        return Errand(id, slot, tries, self.protocol.retakes, self._beside(key))
+        return Errand(id, slot, tries, self.protocol.retakes, wanted.field, self._beside(key))
 
     def _beside(self, key: str | None) -> Beside:
         """What is kept with a capture: the key of the press that made it, and its place."""
@@ -126,8 +126,9 @@ class People:
         return self.get(self._once(key, f"keep {capture}", act))
 
     def move(self, key: str, capture: str, eye: Eye, by: str | None) -> Visit:
-        """A picture was taken of the other eye: it goes to that eye's slot of the same part; `by` is who says so.
+        """A picture is of that eye: if it was taken as the other one's, it goes to that eye's slot of the same part.
 
+        `by` is who says so. Where that eye was named at the press already, that is written down.
         Errors: NotKept (it belongs to no visit), VisitFinished, InputError (the programme has no such slot).
         """
 
@@ -136,6 +137,7 @@ class People:
             before = self._read(session, self._open(session, shot.visit)).slots
             to, left = moving.same_field(self.protocol, shot.slot, eye), shot.slot
             if to.id == left:
+                moving.confirm(session, shot, self.clock.wall(), by)
                 return shot.visit
             stood = before[left].decided
             if stood is not None and stood.capture == capture:  # what is left of that eye speaks for itself
@@ -146,6 +148,11 @@ class People:
             return shot.visit
 
         return self.get(self._once(key, f"move {capture} {eye}", act))
+
+    def asked_side(self) -> moving.Question | None:
+        """The newest picture that seems to be of the other eye, while nobody said which eye it is of."""
+        with told(), Session(self.engine) as session:
+            return moving.question(session)
 
     def choose(self, key: str, id: str, slot: str, capture: str | None) -> Visit:
         """Make a capture of that very slot stand for it, or empty the slot (None); either ends a "could not"."""

@@ -202,7 +202,7 @@ def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., R
         if tinted:
             own = tuple(Psf(fitted(scene.psf(colour), scene.shape), colour, colour) for colour in tinted)
             stack = replace(calibration, psfs=own)
-        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack))
+        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack, facing=scene.meet))
         bulletin = bulletin or Bulletin()
         exam = Exam(opened, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)

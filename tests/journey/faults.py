@@ -5,6 +5,7 @@ code, the numbers that the page's words need, and what to do where it is a refus
 """
 
 import re
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -308,6 +309,13 @@ def wrong_date(rig: Rig, shelf: Shelf) -> Said:
     return stands(rig, "clock.wrong")
 
 
+def other_eye(rig: Rig, shelf: Shelf) -> Said:
+    rig.world.faults.add("eye.other")
+    visit = rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
+    assert pressed(rig, visit=visit, slot="R-centre").code == "good"
+    return stands(rig, "eye.side")
+
+
 def old(rig: Rig, shelf: Shelf) -> Said:
     rig.clock.sleep((WEEKS - MAKE_WEEKS) * 7 * 86400.0)
     said = stands(rig, "cal.old")
@@ -368,6 +376,7 @@ SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
     "link.other": other_screen,
     "lock.idle": locked,
     "clock.wrong": wrong_date,
+    "eye.side": other_eye,
 }
 # These need an instrument of their own: see test_fault_states.py.
 APART = frozenset({"cal.missing", "cal.mismatch", "power.lost"})
@@ -383,7 +392,6 @@ OF_THE_PAGE = {
 NOT_YET = {
     "send.waiting": "nothing is sent: there is no outbox",
     "send.stuck": "nothing is sent: there is no outbox",
-    "eye.side": "which eye a picture shows is not looked at",
 }
 
 
@@ -409,3 +417,6 @@ def mended(rig: Rig) -> None:
     until(lambda: not rig.exam.fitness.due, 120)
     for heap in (rig.exam.fitness._sights, rig.exam.fitness._spheres_dpt):
         heap.clear()  # what was broken here says nothing about the next scenario
+    for one in rig.request("GET", "/api/status").json()["standing"]:
+        if one["code"] == "eye.side":  # or the next scenario is asked it
+            rig.request("POST", f"/api/captures/{one['id']}/eye", json={"key": secrets.token_hex(8), "eye": "OD"})

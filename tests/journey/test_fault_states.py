@@ -1,6 +1,7 @@
 """Every state of the page is reached by a fault of the simulated head, over the real server, whole with its numbers."""
 
 import re
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -168,3 +169,53 @@ def test_the_lamp_shines_for_no_stranger(old_rig: Rig, headers: dict[str, str], 
     if status == 403:
         assert answer.json()["code"] == "link.forged"
         assert old_rig.world.frames == frames
+
+
+def asked(rig: Rig) -> dict[str, Any] | None:
+    """What a page that was loaded anew is asked about the side of an eye."""
+    standing = rig.request("GET", "/api/status").json()["standing"]
+    return next((one for one in standing if one["code"] == "eye.side"), None)
+
+
+def say(rig: Rig, capture: str, eye: str) -> dict[str, Any]:
+    answer = rig.request("POST", f"/api/captures/{capture}/eye", json={"key": secrets.token_hex(8), "eye": eye})
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json()["slots"])
+
+
+def test_who_took_the_other_eye_is_asked_until_somebody_says_which_it_is(
+    rig: Rig, equipped: tuple[Rig, Shelf]
+) -> None:
+    ledger = rig.exam.head.light.ledger
+    kept = faults.other_eye(rig, equipped[1]).facts["id"]
+    assert rig.store.get(kept).report["laterality"]["eye"] == "OS"
+    assert asked(rig) == {"code": "eye.side", "id": kept, "slot": "R-centre", "other": "OS"}
+    say(rig, kept, "OD")
+    assert asked(rig) is None
+    rig.app.state.notices.look()
+    assert rig.told()[-1] == ("notice", {"code": "eye.side", "over": True})
+    report = rig.store.get(kept).report
+    assert (report["confirmed"]["eye"], report["slot"], "moved" in report) == ("OD", "R-centre", False)
+
+    moved = faults.other_eye(rig, equipped[1]).facts["id"]
+    rest = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
+    slots = say(rig, moved, "OS")
+    assert (slots["R-centre"]["state"], slots["L-centre"]["capture"]) == ("empty", moved)
+    assert asked(rig) is None
+    dose = rig.store.get(moved).report["dose_j_per_cm2"]
+    assert dose > 0
+    both = ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")
+    assert both == (rest[0], pytest.approx(rest[1] + dose)), "the light went into the other eye, or into this one"
+    say(rig, moved, "OD")
+    say(rig, moved, "OS")
+    assert (ledger.spent_j_per_cm2("OD"), ledger.spent_j_per_cm2("OS")) == both, "each eye has it once"
+
+
+@pytest.mark.parametrize(("slot", "said"), [("R-centre", "OD"), ("L-centre", "OS"), ("R-nerve", None)])
+def test_the_eye_that_was_asked_for_comes_and_nobody_is_asked(rig: Rig, slot: str, said: str | None) -> None:
+    visit = rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
+    eye = "OD" if slot[0] == "R" else "OS"
+    assert faults.pressed(rig, eye, visit=visit, slot=slot).code == "good"
+    report = rig.store.captures(1)[0].report
+    assert (report["laterality"] or {}).get("eye") == said
+    assert asked(rig) is None
