@@ -42,7 +42,7 @@ def receiver(papers: tuple[Path, Path]) -> Iterator[Receiver]:
 
 def carrier(receiver: Receiver, papers: tuple[Path, Path], folder: Path, **more: object) -> Https:
     said = receiver.settings(folder, authority=papers[0], **more)
-    return Https(SendSettings(**said))  # type: ignore[arg-type]
+    return Https(SendSettings.model_validate(said))
 
 
 def deliver(way: Https) -> Receipt:
@@ -193,7 +193,7 @@ def test_a_stranger_and_an_expired_certificate_are_not_trusted_and_hear_no_key(
     receiver: Receiver, papers: tuple[Path, Path], tmp_path: Path
 ) -> None:
     with pytest.raises(SendUntrusted, match="self-signed"):
-        deliver(Https(SendSettings(**receiver.settings(tmp_path))))  # type: ignore[arg-type]
+        deliver(Https(SendSettings.model_validate(receiver.settings(tmp_path))))
     old = aged(tmp_path)
     with receiving(*old) as expired, pytest.raises(SendUntrusted, match="expired") as told:
         deliver(carrier(expired, old, tmp_path))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -31,6 +32,7 @@ from services.records.protocol import load_protocol
 from services.records.store import Store
 
 keys = (f"{number:016x}" for number in count(1))
+MEMORY = Path("/dev/shm")
 LINK = SendUnreachable("no answer")
 
 
@@ -75,8 +77,11 @@ class Shelf:
 
 
 @pytest.fixture
-def shelf(tmp_path: Path) -> Iterator[Shelf]:
-    with Store(tmp_path, reserve_bytes=0) as store:
+def shelf() -> Iterator[Shelf]:
+    with (
+        TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder,
+        Store(Path(folder), reserve_bytes=0) as store,
+    ):
         yield Shelf(store, VirtualClock(datetime(2026, 3, 1, tzinfo=UTC)))
 
 
@@ -223,8 +228,8 @@ def test_a_parcel_under_way_waits_for_an_exam_and_gives_up_when_it_is_long(shelf
     assert shelf.outbox.waiting()[0].tries == 0
 
 
-@given(st.integers(1, 14), st.floats(0, 1))
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(1, 9), st.floats(0, 1))
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_tries_are_put_off_twice_as_long_each_time_up_to_an_hour(shelf: Shelf, fails: int, luck: float) -> None:
     if not shelf.waits():
         shelf.finished()
@@ -364,12 +369,13 @@ moves = st.lists(
 
 
 @given(moves)
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_whatever_happens_each_finish_arrives_as_it_is(
-    tmp_path_factory: pytest.TempPathFactory, story: list[str]
-) -> None:
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_whatever_happens_each_finish_arrives_as_it_is(story: list[str]) -> None:
     """The receiver ends up with every finished visit as it was finished last, and nothing is there twice."""
-    with Store(tmp_path_factory.mktemp("story"), reserve_bytes=0) as store:
+    with (
+        TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder,
+        Store(Path(folder), reserve_bytes=0) as store,
+    ):
         shelf, van = Shelf(store, VirtualClock(datetime(2026, 3, 1, tzinfo=UTC))), Van()
         mine = sender(shelf, van)
         for move in story:
