@@ -19,7 +19,7 @@ class Receiver:
 
     `answers` are statuses instead of an answer, by method; `mood` is what happens to a PUT: "half" keeps the first half
     and says 201, "mute" keeps all and hangs up without a word, "cut" hangs up in the middle, "dribble" answers a letter
-    a second. `gate` is passed by each request.
+    a second. `gate` is passed by each request, `after_put` by those after a parcel was kept.
     """
 
     at: str = ""
@@ -29,6 +29,7 @@ class Receiver:
     mood: str = "well"
     tells_digest: bool = True
     gate: Event = field(default_factory=Event)
+    after_put: Event = field(default_factory=Event)
     over: Event = field(default_factory=Event)
 
     def settings(self, folder: Path, **more: object) -> dict[str, object]:
@@ -75,6 +76,8 @@ class Handler(BaseHTTPRequestHandler):
         known = self.server.known
         known.asked.append(self.command)
         known.gate.wait(30)
+        if "PUT" in known.asked[:-1]:
+            known.after_put.wait(30)
         status = known.answers.get(self.command)
         if status is None and self.headers["Authorization"] != f"Bearer {KEY}":
             status = 401
@@ -111,6 +114,7 @@ def receiving(certificate: Path, key: Path, port: int = 0) -> Iterator[Receiver]
     """A receiver at localhost, for as long as the context lasts."""
     known = Receiver()
     known.gate.set()
+    known.after_put.set()
     server = Quiet(known, port)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
@@ -123,6 +127,7 @@ def receiving(certificate: Path, key: Path, port: int = 0) -> Iterator[Receiver]
     finally:
         known.over.set()
         known.gate.set()
+        known.after_put.set()
         server.shutdown()
         server.server_close()
         thread.join(10)

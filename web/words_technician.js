@@ -175,6 +175,8 @@ export const TECHNICIAN = {
   "update.megabytes": "{n} MB",
   "update.install": "Install {version}",
   "update.takes": "Takes about 4 minutes. The camera restarts by itself.",
+  "update.unsent": { one: "{n} person waits to be sent.", other: "{n} people wait to be sent." },
+  "update.unsent.safe": "They stay on this camera, and are sent after the update.",
   "update.power": "Leave it on its charger.",
   "update.leave": "Leave the stick where it is.",
   "update.progress": "Progress of the update",
@@ -236,4 +238,5 @@ export const TECHNICIAN = {
   "health.heat": "Heat",
   "health.clock": "Clock",
   "health.speed": "Speed",
+  "health.sending": "Sending",
 };

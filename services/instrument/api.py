@@ -370,7 +370,7 @@ def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None
     @app.get("/api/health")
     def health() -> dict[str, Any]:
         """Whether it can take pictures now: every check with its limit and what to do; and how the calibration fits."""
-        known = facts(owner, len(people.protocol.slots))
+        known = facts(owner, len(people.protocol.slots), notices.sender)
         checks = judged(known)
         return {
             "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,

@@ -72,6 +72,11 @@ class Sender:
         today = self._clock.wall().astimezone().date().isoformat()
         return {"sent": self.outbox.sent(today), "waiting": self.outbox.count()}
 
+    def in_need(self) -> tuple[int, int]:
+        """How many wait, and how many of them need somebody."""
+        now, waiting = self._clock.wall(), self.outbox.waiting()
+        return len(waiting), sum(one.is_stuck(now) for one in waiting)
+
     def standing(self) -> dict[str, dict[str, Any]]:
         """What pages are told: who could not be sent for a reason that does not pass, and who waits for the link."""
         now, waiting = self._clock.wall(), self.outbox.waiting()

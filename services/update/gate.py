@@ -90,6 +90,12 @@ def refuse_unless_at_rest(at: str, lowest_battery: float) -> tuple[str, ...]:
     return tuple(failed)
 
 
+def unsent(at: str) -> int:
+    """How many people wait to be sent: no reason to refuse, for an update leaves the data partition alone."""
+    said = probe.status(at) or {}
+    return int((said.get("sending") or {}).get("waiting", 0))
+
+
 def number(version: str) -> Version:
     """A version as numbers that compare, 2.0 being 2; UpdateDamaged if it is none."""
     if not re.fullmatch(r"\d+(\.\d+){0,3}", version):

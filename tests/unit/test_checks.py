@@ -31,6 +31,7 @@ DRIVEN: list[tuple[str, dict[str, Any]]] = [
     ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
     ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
     ("speed", {"presses": [(1.0, -4.0)] * 50 + [(9.0, 4.0)] * 50}),
+    ("sending", {"unsent": (4, 1)}),
     ("speed", {"presses": [(2.5, 1.5)] * 100}),
 ]
 
