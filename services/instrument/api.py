@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -177,24 +177,13 @@ def create_app(
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
     lease, promised = Lease(clock), Promised()
-    outbox = Outbox(store.engine, clock)
-    sender = Sender(outbox, packer(store, people), carrier, lambda: owner.is_idle, clock) if carrier else None
+    outbox, pack = Outbox(store.engine, clock), packer(store, people)
+    sender = Sender(outbox, pack, carrier, lambda: owner.is_idle, clock) if carrier is not None else None
     notices = Notices(owner, people, lease, sender)
-
-    @asynccontextmanager
-    async def life(_: FastAPI) -> AsyncIterator[None]:
-        notices.begin()
-        if sender is not None:
-            sender.begin()
-        yield
-        if sender is not None:
-            sender.close()
-        notices.close()
-        owner.house.bulletin.close()
-
     app = FastAPI(
-        title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
-        docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
+        title="Diffuscope", version=version("diffuscope"), lifespan=_life(owner, notices),
+        openapi_url="/api/openapi.json", docs_url=None, redoc_url=None,
+        responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
     app.state.notices = notices
     _words_for_errors(app)
@@ -210,6 +199,23 @@ def create_app(
     technician_routes(app, owner, door, rooms)
     page(app)
     return app
+
+
+def _life(owner: Owner, notices: Notices) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    """What runs beside the server for as long as it runs."""
+
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        notices.begin()
+        if notices.sender is not None:
+            notices.sender.begin()
+        yield
+        if notices.sender is not None:
+            notices.sender.close()
+        notices.close()
+        owner.house.bulletin.close()
+
+    return life
 
 
 def one_screen(lease: Lease) -> Callable[..., None]:

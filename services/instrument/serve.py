@@ -85,8 +85,7 @@ def serve(
     """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
     The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
-    `names`, beside the computer's own, its addresses, and local ones. `updater`: its folder, and where it takes wishes;
-    `carrier`: the way to who receives finished visits.
+    `names`, beside its own and local ones. `updater`: its folder, and where it takes wishes; `carrier`: to a receiver.
     """
     clock = SystemClock()
     with address, Store(data, clock=clock) as store, ExitStack() as undo:
