@@ -32,7 +32,7 @@ from receiver import receiving
 with receiving(Path("/run/receiver/web.crt"), Path("/run/receiver/web.key"), 8443) as known:
     while True:
         time.sleep(0.2)
-        Path("/run/receiver/kept").write_text("".join(f"{path} {len(content)}\\n" for path, content in known.kept.items()))
+        Path("/run/receiver/kept").write_text("\\n".join(known.kept))
 """
 
 
