@@ -5,13 +5,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import Field
 
-from device.errors import DiffuscopeError, SendError, SendOff, StoreDamaged, StoreError
+from device.errors import DiffuscopeError, NotKept, SendError, SendOff, StoreDamaged
 from services.instrument.sending import Sender
 from services.instrument.visits_api import NAME, Order
 from services.records.outbox import Waiting
 
 LISTED = 200
-KINDS: tuple[type[DiffuscopeError], ...] = (*SendError.__subclasses__(), StoreDamaged, StoreError)
+KINDS: tuple[type[DiffuscopeError], ...] = (*SendError.__subclasses__(), StoreDamaged, NotKept)
 REMEDIES = {kind.code: kind.default_remedy for kind in KINDS}
 
 
@@ -45,8 +45,7 @@ def shown_outbox(sender: Sender | None) -> dict[str, Any]:
     """The outbox as JSON."""
     if sender is None:
         return {"configured": False, "sent": 0, "waiting": 0, "next_try_s": 0.0, "visits": []}
-    now, waiting = sender.outbox.clock.wall(), sender.outbox.waiting(LISTED, sizes=True)
-    visits = [_shown(one) | {"stuck": one.is_stuck(now)} for one in waiting]
+    visits = [_shown(one) for one in sender.outbox.waiting(LISTED, sizes=True)]
     return {"configured": True, **sender.counts(), "next_try_s": round(sender.wait_s, 1), "visits": visits}
 
 
@@ -55,5 +54,5 @@ def _shown(one: Waiting) -> dict[str, Any]:
     return {
         "visit": one.visit, "number": one.number, "since": one.finished_at.isoformat(), "size_bytes": one.size_bytes,
         "tries": one.tries, "failing_since": one.failing_since.isoformat() if one.failing_since else None,
-        "error": error,
+        "error": error, "stuck": one.stuck,
     }  # fmt: skip

@@ -11,7 +11,18 @@ from threading import Event, Thread
 from typing import Any
 
 from device.clock import Clock
-from device.errors import Busy, SendLocked, SendRejected, SendUnlike, SendUnreachable, SendUntrusted, StoreError
+from device.errors import (
+    Busy,
+    DiffuscopeError,
+    NotKept,
+    SendLocked,
+    SendRejected,
+    SendUnlike,
+    SendUnreachable,
+    SendUntrusted,
+    StoreDamaged,
+    StoreError,
+)
 from services.instrument.carrier import Carrier, Parcel
 from services.instrument.exporting import exported, folder_name, zipped
 from services.instrument.visits_api import shown_visit
@@ -26,7 +37,8 @@ FIRST_S, LAST_S = 60.0, 3600.0  # between tries: doubled from one to the other
 SPREAD = 0.2  # of a wait, by chance: after a power cut not every device of a district asks at once
 GLANCE_S = 0.1
 HUNG_UP_S = 20.0  # no receiver waits longer for the next piece
-OF_ITSELF = frozenset(kind.code for kind in (SendRejected, SendUnlike))  # what no other visit suffers from
+OWN = (SendRejected, SendUnlike, StoreDamaged, NotKept)  # what no other visit suffers from, and no time mends
+PARKED = frozenset(kind.code for kind in OWN)
 
 
 class Sender:
@@ -70,49 +82,49 @@ class Sender:
     def counts(self) -> dict[str, int]:
         """How many of today were sent, and how many wait."""
         today = self._clock.wall().astimezone().date().isoformat()
-        return {"sent": self.outbox.sent(today), "waiting": self.outbox.count()}
+        return {"sent": self.outbox.sent(today), "waiting": self.outbox.trouble().waiting}
 
     def in_need(self) -> tuple[int, int]:
-        """How many wait, and how many of them need somebody."""
-        now, waiting = self._clock.wall(), self.outbox.waiting()
-        return len(waiting), sum(one.is_stuck(now) for one in waiting)
+        """How many wait, and how many of them need somebody: all, if the thread that sends has ended by itself."""
+        trouble, thread = self.outbox.trouble(), self._thread
+        ended = thread is not None and not thread.is_alive() and not self._closing.is_set()
+        return trouble.waiting, trouble.waiting if ended else trouble.stuck
 
     def standing(self) -> dict[str, dict[str, Any]]:
         """What pages are told: who could not be sent for a reason that does not pass, and who waits for the link."""
-        now, waiting = self._clock.wall(), self.outbox.waiting()
-        stuck = [one for one in waiting if one.is_stuck(now)]
+        trouble = self.outbox.trouble()
         found: dict[str, dict[str, Any]] = {}
-        if stuck:
-            since = min(one.failing_since for one in stuck if one.failing_since is not None)
-            found["send.stuck"] = {"n": len(stuck), "date": since.astimezone().date().isoformat()}
-        if any(one.error is not None for one in waiting if one not in stuck):
-            found["send.waiting"] = {"n": len(waiting) - len(stuck)}
+        if trouble.stuck_since is not None:
+            since = trouble.stuck_since.astimezone().date().isoformat()
+            found["send.stuck"] = {"n": trouble.stuck, "date": since}
+        if trouble.failing:
+            found["send.waiting"] = {"n": trouble.waiting - trouble.stuck}
         return found
 
     def step(self) -> bool:
         """Send the one that was finished first, if now is the time for it; whether it was tried."""
         if self.wait_s > 0 or not self._is_idle():
             return False
-        due = [one for one in self.outbox.waiting() if one.error not in OF_ITSELF and not _is_broken(one)]
-        if not due:
+        first = self.outbox.waiting(1, parked=PARKED)
+        if not first:
             return False
         try:
-            receipt = self._carrier.deliver(self._pack(due[0].visit), self._pause)
+            receipt = self._carrier.deliver(self._pack(first[0].visit), self._pause)
         except Busy:  # nothing went wrong: somebody is examined, or it was opened again
             return False
         except (SendUnreachable, SendUntrusted, SendLocked) as error:
             if not self._closing.is_set():
-                self._fail(due, error)
+                self._fail(self.outbox.waiting(parked=PARKED), error)
                 self._put_off()
-        except (SendRejected, SendUnlike, StoreError) as error:
-            self._fail(due[:1], error)
+        except OWN as error:
+            self._fail(first, error)
         else:
             self._fails = 0
-            self.outbox.arrived(due[0], receipt)
-            log.info("sent, and seen at the receiver by its %s", receipt.confirmed, extra={"about": due[0].visit})
+            self.outbox.arrived(first[0], receipt)
+            log.info("sent, and seen at the receiver by its %s", receipt.confirmed, extra={"about": first[0].visit})
         return True
 
-    def _fail(self, which: list[Waiting], error: Any) -> None:
+    def _fail(self, which: list[Waiting], error: DiffuscopeError) -> None:
         log.warning("not sent: %s", error, extra={"code": error.code, "about": which[0].visit})
         self.outbox.failed(which, error)
 
@@ -136,17 +148,12 @@ class Sender:
         while not self._closing.is_set():
             try:
                 tried = self.step()
-            except StoreError as error:  # it will be well again, or the store says so elsewhere
+            except StoreError as error:  # busy, or out of room: it passes, or the shelf says so elsewhere
                 log.warning("the outbox cannot be asked: %s", error, extra={"code": error.code})
                 tried = False
             if not tried:
                 self._wake.wait(LOOK_S)
                 self._wake.clear()
-
-
-def _is_broken(one: Waiting) -> bool:
-    """Whether its own files cannot be read: that does not mend itself."""
-    return one.error is not None and one.error.startswith("store.")
 
 
 def packer(store: Store, people: People) -> Callable[[str], Parcel]:

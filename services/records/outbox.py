@@ -4,11 +4,11 @@ It is asked of the visits, and not a list beside them: a finish puts a visit in,
 is finished again waits again. Written down is only what sending itself learns. Nothing is ever removed by it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
-from sqlalchemy import Engine, Select, and_, func, or_, select, update
+from sqlalchemy import ColumnElement, Engine, and_, case, func, not_, or_, select, update
 from sqlalchemy.orm import Session
 
 from device.clock import Clock
@@ -21,12 +21,15 @@ PATIENCE = timedelta(days=3)  # in which nobody has to do anything about a link 
 OWN = ("picture.png", "report.json")  # of each capture, what is sent
 # In the very words of the index `visits_to_send`.
 UNSENT = and_(VisitRow.finished_at.is_not(None), or_(VisitRow.sent.is_(None), VisitRow.sent != VisitRow.finished_at))
-OF_THIS_FINISH = SendingRow.finished_at == VisitRow.finished_at
+OF_ITS_FINISH = and_(SendingRow.visit == VisitRow.id, SendingRow.finished_at == VisitRow.finished_at)
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A visit that waits: since its finish; how often it was tried, since when in vain, and why (`error`, a code)."""
+    """A visit that waits: since its finish; how often it was tried, since when in vain, and why (`error`, a code).
+
+    `stuck`: somebody has to do something, for what keeps it does not pass, or has not passed for days.
+    """
 
     visit: str
     number: str
@@ -35,13 +38,18 @@ class Waiting:
     failing_since: datetime | None = None
     error: str | None = None
     said: str | None = None
+    stuck: bool = False
     size_bytes: int = 0
 
-    def is_stuck(self, now: datetime) -> bool:
-        """Whether somebody has to do something: what does not pass, or has not passed for days."""
-        if self.error is None or self.failing_since is None:
-            return False
-        return self.error != SendUnreachable.code or now - self.failing_since >= PATIENCE
+
+@dataclass(frozen=True)
+class Trouble:
+    """How many wait; how many of them are stuck, since when; and how many were tried in vain, and are not stuck."""
+
+    waiting: int
+    stuck: int
+    stuck_since: datetime | None
+    failing: int
 
 
 @dataclass(frozen=True)
@@ -58,16 +66,37 @@ class Outbox:
     def __init__(self, engine: Engine, clock: Clock) -> None:
         self.engine, self.clock = engine, clock
 
-    def waiting(self, limit: int | None = None, sizes: bool = False) -> list[Waiting]:
-        """Those that wait, the one that was finished first before the others; with `sizes`, how large each is."""
+    def waiting(
+        self, limit: int | None = None, *, parked: Collection[str] | None = None, sizes: bool = False
+    ) -> list[Waiting]:
+        """Those that wait, the one that was finished first before the others.
+
+        With `parked`, without those that such errors keep; with `sizes`, how large each is.
+        """
+        query = select(VisitRow, SendingRow, self._stuck()).outerjoin(SendingRow, OF_ITS_FINISH).where(UNSENT)
+        if parked is not None:
+            query = query.where(or_(SendingRow.error.is_(None), SendingRow.error.not_in(parked)))
+        query = query.order_by(VisitRow.finished_at, VisitRow.id).limit(limit)
         with told(), Session(self.engine) as session:
-            found = [_waiting(row, sending) for row, sending in session.execute(_asked().limit(limit))]
+            found = [_waiting(*row) for row in session.execute(query)]
             return _with_sizes(session, found) if sizes else found
 
-    def count(self) -> int:
-        """How many wait."""
+    def trouble(self) -> Trouble:
+        """How many wait, and how it stands with them."""
+        stuck, failing = self._stuck(), SendingRow.error.is_not(None)
+        query = select(
+            func.count(), func.count(case((stuck, 1))), func.min(case((stuck, SendingRow.failing_since))),
+            func.count(case((and_(failing, not_(stuck)), 1))),
+        ).select_from(VisitRow).outerjoin(SendingRow, OF_ITS_FINISH).where(UNSENT)  # fmt: skip
         with told(), Session(self.engine) as session:
-            return session.scalar(select(func.count()).select_from(VisitRow).where(UNSENT)) or 0
+            waiting, many, since, tried = session.execute(query).one()
+        return Trouble(waiting, many, None if since is None else datetime.fromisoformat(since), tried)
+
+    def _stuck(self) -> ColumnElement[bool]:
+        """Kept by what does not pass, or by a link that has failed for days."""
+        long_ago = schema.utc_text(self.clock.wall() - PATIENCE)
+        passes = and_(SendingRow.error == SendUnreachable.code, SendingRow.failing_since > long_ago)
+        return and_(SendingRow.error.is_not(None), not_(passes))
 
     def sent(self, day: str) -> int:
         """How many visits of a day are at the receiver."""
@@ -95,7 +124,7 @@ class Outbox:
 
     def forget(self, visit: str | None) -> None:
         """What kept one of those that wait (None: all) is said to be mended."""
-        query = select(SendingRow).join(VisitRow, VisitRow.id == SendingRow.visit).where(UNSENT, OF_THIS_FINISH)
+        query = select(SendingRow).join(VisitRow, OF_ITS_FINISH).where(UNSENT)
         if visit is not None:
             query = query.where(SendingRow.visit == visit)
         with told(), Session(schema.for_writing(self.engine)) as session, session.begin():
@@ -103,19 +132,15 @@ class Outbox:
                 row.error = row.said = None
 
 
-def _asked() -> Select[VisitRow, SendingRow]:
-    """Those that wait and what became of them; the index of what is unsent makes it as short as the list."""
-    query = select(VisitRow, SendingRow).outerjoin(SendingRow, and_(SendingRow.visit == VisitRow.id, OF_THIS_FINISH))
-    return query.where(UNSENT).order_by(VisitRow.finished_at, VisitRow.id)
-
-
-def _waiting(visit: VisitRow, sending: SendingRow | None) -> Waiting:
+def _waiting(visit: VisitRow, sending: SendingRow | None, stuck: bool | None) -> Waiting:
     assert visit.finished_at is not None  # asked for
     finished_at = datetime.fromisoformat(visit.finished_at)
     if sending is None:
         return Waiting(visit.id, visit.person, finished_at)
     since = None if sending.failing_since is None else datetime.fromisoformat(sending.failing_since)
-    return Waiting(visit.id, visit.person, finished_at, sending.tries, since, sending.error, sending.said)
+    return Waiting(
+        visit.id, visit.person, finished_at, sending.tries, since, sending.error, sending.said, stuck=bool(stuck)
+    )
 
 
 def _row(session: Session, one: Waiting) -> SendingRow:

@@ -340,7 +340,7 @@ def cut_off(rig: Rig, again: Callable[[], Rig], folder: Path) -> Said:
 
 def unsent(rig: Rig, shelf: Shelf, answers: dict[str, int]) -> dict[str, Any]:
     """One more visit is finished, and the receiver says no: what the Send screen lists of it."""
-    number = rig.app.state.notices.sender.outbox.count() + len(shelf.receiver.kept)
+    number = rig.app.state.notices.sender.outbox.trouble().waiting + len(shelf.receiver.kept)
     key = f"{number + 256:016x}"
     visit = rig.request("POST", "/api/visits", json={"key": key}).json()["id"]
     assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"

@@ -121,7 +121,7 @@ def test_a_finish_waits_an_undo_does_not_and_a_new_finish_waits_again(shelf: She
     shelf.finish(visit)
     assert shelf.waits() == [visit]
     shelf.reopen(visit)
-    assert (shelf.waits(), shelf.outbox.count()) == ([], 0)
+    assert (shelf.waits(), shelf.outbox.trouble().waiting) == ([], 0)
     shelf.finish(visit)
     shelf.outbox.arrived(shelf.outbox.waiting()[0], Receipt("0" * 64, "sha256"))
     assert shelf.waits() == []
@@ -357,7 +357,7 @@ def test_the_thread_sends_and_ends(shelf: Shelf) -> None:
     assert van.aborted
     mine.begin()
     end = datetime.now(UTC) + timedelta(seconds=20)
-    while shelf.outbox.count():
+    while shelf.outbox.trouble().waiting:
         assert datetime.now(UTC) < end
     mine.close()
     assert len(van.brought) >= 3
