@@ -46,6 +46,13 @@ DiffuscopeError
 │   ├── StickFull                the USB stick has no room
 │   ├── StickGone                the USB stick is not there, or cannot be written
 │   └── NotKept (LookupError)    no such capture
+├── SendError                    a visit was not sent, and is kept
+│   ├── SendOff                  nothing is sent from here
+│   ├── SendUnreachable          the receiver does not answer, or cannot now
+│   ├── SendUntrusted            the receiver's certificate is not one that we trust
+│   ├── SendLocked               the receiver does not know this device
+│   ├── SendRejected             the receiver does not take this visit
+│   └── SendUnlike               the receiver has something else than what was sent
 └── UpdateError                  another version is not installed
     ├── UpdateBusy               one is under way
     ├── UpdateNotUnderstood      what was asked for is nothing that can be asked for
@@ -402,6 +409,57 @@ class NotKept(StoreError, LookupError):
 
     code = "store.unknown"
     default_remedy = "Choose a picture from the list."
+
+
+class SendError(DiffuscopeError):
+    """A visit was not sent; it stays on this device, whole."""
+
+    code = "send"
+    default_remedy = "Nothing is lost. Copy the visit to a USB stick, and call the technician."
+
+
+class SendOff(SendError):
+    """No receiver is set up."""
+
+    code = "send.off"
+    default_remedy = "Nothing is sent from this device. Copy visits to a USB stick, or save them as files."
+
+
+class SendUnreachable(SendError):
+    """The receiver does not answer, or answers that it cannot take anything now: that passes."""
+
+    code = "send.link"
+    default_remedy = "It is tried again by itself. Look whether this device is connected to the internet."
+
+
+class SendUntrusted(SendError):
+    """Whoever answers cannot prove to be the receiver; a wrong clock looks the same."""
+
+    code = "send.certificate"
+    default_remedy = "Look whether the date of this device is right. If it is, call the technician."
+
+
+class SendLocked(SendError):
+    """The receiver does not let this device in."""
+
+    code = "send.key"
+    default_remedy = "The receiver does not know this device. Call the technician: its key must be renewed."
+
+
+class SendRejected(SendError):
+    """The receiver refuses this visit, and would again."""
+
+    code = "send.refused"
+    default_remedy = "The receiver does not take this visit. Copy it to a USB stick, and call the technician."
+
+
+class SendUnlike(SendError):
+    """What the receiver has under the name of this visit is not what was sent."""
+
+    code = "send.unlike"
+    default_remedy = (
+        "The receiver has only a part of it, or something else. Copy it to a USB stick, and call the technician."
+    )
 
 
 class UpdateError(DiffuscopeError):

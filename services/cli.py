@@ -55,19 +55,22 @@ def run(
     wishes: Annotated[
         Path | None, typer.Option(help="Where the updater takes what the page asks for.", readable=False)
     ] = None,
+    send: Annotated[Path | None, typer.Option(help="Where finished visits are sent, as TOML; else nowhere.")] = None,
 ) -> None:
     """Serve the page: one button, one true picture."""
+    from services.instrument.carrier import Https, load_settings
     from services.instrument.serve import bound, handed_over, serve  # opens the web stack; others do not need it
     from services.instrument.watchdog import Watchdog
     from services.records.protocol import STANDARD, load_protocol
 
     spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or STANDARD)
+    carrier = Https(load_settings(send)) if send is not None else None
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
     address = handed_over(os.environ) or bound(host, port)
     served, at = address.getsockname()[:2]
     serve(
         spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
-        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()), (updates, wishes),
+        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()), (updates, wishes), carrier,
     )  # fmt: skip
 
 

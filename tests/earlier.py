@@ -19,6 +19,10 @@ OUTCOME = '{"code": "refer_picture", "sentence": "Refer: picture of both eyes no
 Row = tuple[object, ...]
 _CAPTURE = "captures.id, captures.eye, captures.taken_at, captures.simulated, captures.calibration_id, captures.report"
 _VISIT = "visits.id, visits.person, visits.day, visits.begun_at, visits.finished_at, visits.outcome"
+_SENDING = (
+    "sendings.visit, sendings.finished_at, sendings.tries, sendings.failing_since, sendings.error, sendings.said,"
+    " sendings.sent_at, sendings.sha256, sendings.confirmed"
+)
 _FIELD = "fields.visit, fields.name, fields.value, fields.set_at"
 
 
@@ -171,13 +175,43 @@ def _read_people(n: int) -> list[tuple[str, Row]]:
     ]
 
 
+def _write_outbox(say: sqlite3.Connection, n: int) -> None:
+    now, visit = "2026-03-01T12:00:00.000000+00:00", f"v{n}"
+    say.execute(
+        "INSERT INTO sendings (visit, finished_at, tries, failing_since, error, said, sent_at, sha256, confirmed)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (visit, now, 1, now, "send.link", "no answer", None, None, None),
+    )
+    say.execute(
+        "UPDATE sendings SET tries=?, failing_since=?, error=?, said=?, sent_at=?, sha256=?, confirmed=?"
+        " WHERE sendings.visit = ? AND sendings.finished_at = ?",
+        (2, None, None, None, now, hashlib.sha256(RAW).hexdigest(), "sha256", visit, now),
+    )
+    say.execute("UPDATE visits SET sent=? WHERE visits.id = ?", (now, visit))
+
+
+def _read_outbox(n: int) -> list[tuple[str, Row]]:
+    visit = f"v{n}"
+    return [
+        (f"SELECT {_VISIT}, visits.sent FROM visits WHERE visits.id = ?", (visit,)),
+        (f"SELECT {_SENDING} FROM sendings WHERE sendings.visit = ?", (visit,)),
+        (
+            "SELECT visits.id FROM visits WHERE visits.id = ? AND visits.finished_at IS NOT NULL"
+            " AND (visits.sent IS NULL OR visits.sent != visits.finished_at)",
+            (visit,),
+        ),
+    ]
+
+
 WRITES: dict[str, Callable[[sqlite3.Connection, int], None]] = {
     "r0001": _write_captures,
     "r0002": _write_light,
     "r0003": _write_people,
+    "r0004": _write_outbox,
 }
 READS: dict[str, Callable[[int], list[tuple[str, Row]]]] = {
     "r0001": _read_captures,
     "r0002": _read_light,
     "r0003": _read_people,
+    "r0004": _read_outbox,
 }

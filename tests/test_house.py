@@ -207,6 +207,7 @@ def test_the_clock_is_the_only_door_to_time() -> None:
         "device/clock.py: time": "the door itself: SystemClock",
         "device/clock.py: datetime.now": "the door itself: SystemClock.wall",
         "device/guard.py: Timer": "darkens the lamp when everything that asks a Clock hangs",
+        "services/instrument/carrier.py: Timer": "ends a delivery that hangs in a socket, where nobody asks a Clock",
     }
     judge(doors_to_time, python("device", "services"), allowed, "Clock and Deadline are arguments")
 

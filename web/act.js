@@ -22,6 +22,7 @@ const moves = {
   go,
   begin: (number) => unlocked() && visits.begin(number),
   resume: visits.resume,
+  trySending: visits.trySending,
   shoot: () => unlocked() && go({ screen: "aim", visit: get().visit.id, slot: get().visit.next_slot ?? visits.nextSlot() }),
   setField: visits.setField,
   typeNumber(key) {
@@ -156,9 +157,12 @@ const ofState = {
     lower("power.lost");
     if (visit && slot) go({ screen: "aim", visit, slot });
   },
-  see: () => go({ screen: "history" }),
-  why: () => go({ screen: "history" }),
-  tryNow: ({ code }) => lower(code),
+  see: () => go({ screen: "send" }),
+  why: () => go({ screen: "send" }),
+  tryNow({ code }) {
+    lower(code);
+    visits.trySending();
+  },
   next: () => exam.next(),
   again: () => exam.again(),
   couldNot: () => exam.ask(),

@@ -31,6 +31,7 @@ export const getProtocol = () => json("/api/protocol");
 export const getVisit = (id) => json(`/api/visits/${encodeURIComponent(id)}`);
 export const getVisits = (query) => json(`/api/visits?${new URLSearchParams(query)}`);
 export const getCapture = (id) => json(`/api/captures/${encodeURIComponent(id)}`);
+export const getOutbox = () => json("/api/outbox");
 export const getFolders = async () => (await json("/api/exports")).folders;
 export const fileOf = (capture, name) => `/api/captures/${encodeURIComponent(capture)}/${name}`;
 export const zipOf = (visit) => `/api/visits/${encodeURIComponent(visit)}/export.zip`;

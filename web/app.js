@@ -10,7 +10,7 @@ import { cue, freshPicture, heardOfShots, lock, openPicture, settleShots, take }
 import { follow, go } from "./routes.js";
 import { lower, over, raise, stands } from "./states.js";
 import { render } from "./vendor/lit-html.js";
-import { finishWhenMade, politely, refreshList, refreshVisit, saveRest } from "./visit.js";
+import { finishWhenMade, politely, refreshList, refreshOutbox, refreshVisit, saveRest } from "./visit.js";
 import { learn, t, today } from "./words.js";
 
 const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
@@ -43,6 +43,7 @@ async function arrive(route) {
 // What Home does not need, by the screens that do. A file that a lost link kept back is asked for again when the link is back.
 const FILES = {
   history: () => import("./screens/history.js"),
+  send: () => import("./screens/send.js"),
   aloud: () => import("./screens/aloud.js"),
   viewer: () => import("./viewer.js"),
 };
@@ -52,6 +53,7 @@ const LATER = {
   aim: ["viewer", "aloud"],
   picture: ["viewer"],
   history: ["viewer", "history"],
+  send: ["send"],
   film: ["viewer", "history"],
   compare: ["viewer", "history"],
 };
@@ -70,6 +72,7 @@ async function load(route) {
   for (const name of LATER[route.screen] ?? []) bring(name);
   if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
+  if (route.screen === "send") refreshOutbox();
   if (route.screen === "history") refreshList({ day: route.day ?? today(), limit: "500" });
   if (!route.visit) return;
   if (get().visit?.id !== route.visit) set({ visit: null });
@@ -113,6 +116,7 @@ const heard = {
     beats += 1;
     // A problem that is over must go at once.
     if (beats % STATUS_BEATS === 0 || get().states.some(({ from }) => from === "status")) refreshStatus();
+    else if (get().route.screen === "send" && beats % HOLD_BEATS === 1) refreshOutbox();
     else if (beats % HOLD_BEATS === 0 && get().mine) holdControls();
   },
 

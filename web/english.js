@@ -1,7 +1,10 @@
 // The master of every text that the page itself says. Short, at most twelve words a line, for a reader of ten years; three
 // words for a picture: Good, Take again, Could not. No word for a disease, and no "normal": those are a reader's.
 
+import { SENDING } from "./english_send.js";
+
 export const ENGLISH = {
+  ...SENDING,
   "app.name": "Diffuscope",
   "chip.simulated": "SIMULATED",
   "chip.simulated.why": "No real eye: these pictures are simulated.",

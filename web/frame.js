@@ -19,7 +19,7 @@ const SCREENS = { home, find, person, aim, picture, outcome };
 
 export function page(state, act) {
   const { later, route } = state;
-  const screen = (SCREENS[route.screen] ?? later.history?.[route.screen])?.(state, act) ?? nothing;
+  const screen = (SCREENS[route.screen] ?? later.history?.[route.screen] ?? later.send?.[route.screen])?.(state, act) ?? nothing;
   const exam = isExam(state);
   return html`
     <div class="page" data-screen=${route.screen} data-phase=${phase(state)} data-link=${state.link}>

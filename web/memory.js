@@ -49,6 +49,7 @@ export const store = createStore({
   picked: Object.freeze([]), // two pictures to compare
   folders: null, // where a visit can be copied to
   copied: null,
+  outbox: null, // who waits to be sent: the Send screen
   finishing: null, // the visit that is finished as soon as its last picture is there
   now: 0, // set every second while something counts down
   later: Object.freeze({}), // modules that Home does not need, by name

@@ -98,7 +98,8 @@ export function stateBar(one, act) {
 }
 
 export function chips(state, act) {
-  const shown = shownStates(state).chips;
+  // The Send screen says itself what its two states say.
+  const shown = shownStates(state).chips.filter(({ code }) => state.route.screen !== "send" || !code.startsWith("send."));
   if (!shown.length) return nothing;
   return html`
     <ul class="notices" aria-label=${t("part.notices")}>

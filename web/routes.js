@@ -2,7 +2,7 @@
 
 /**
  * @typedef {{screen: string, visit?: string, slot?: string, capture?: string, other?: string, day?: string}} Route
- * #/ · #/find · #/history[/DAY] · #/visit/ID/{person|outcome|film} · …/aim/SLOT · …/picture/SLOT[/CAPTURE]
+ * #/ · #/find · #/send · #/history[/DAY] · #/visit/ID/{person|outcome|film} · …/aim/SLOT · …/picture/SLOT[/CAPTURE]
  * · …/compare/CAPTURE/OTHER
  */
 const VISIT_SCREENS = {
@@ -18,7 +18,7 @@ const OPTIONAL = new Set(["capture picture"]);
 /** @returns {Route} the place an address names; an address that names none is Home. */
 export function routeFrom(hash) {
   const [head, ...rest] = hash.replace(/^#?\/?/, "").split("/").map(unescaped);
-  if (head === "find") return { screen: "find" };
+  if (head === "find" || head === "send") return { screen: head };
   if (head === "history") return rest[0] ? { screen: "history", day: rest[0] } : { screen: "history" };
   const [visit, screen = "person", ...parts] = rest;
   const names = VISIT_SCREENS[screen];

@@ -12,7 +12,7 @@ const AWAY = ["installing", "restarting", "trying"]; // when the camera restarts
 const NEWS_SHOWN = 5;
 
 class SoftwareUpdate extends HTMLElement {
-  #state = { told: null, lost: false, alert: null, sent: null };
+  #state = { told: null, waiting: 0, lost: false, alert: null, sent: null };
   #timer = 0;
   #sending = null;
   #lockedUntil = 0;
@@ -38,7 +38,8 @@ class SoftwareUpdate extends HTMLElement {
     clearTimeout(this.#timer);
     try {
       const answer = await fetch("/api/update", { cache: "no-store" });
-      if (answer.ok) this.#set({ told: await answer.json(), lost: false }); // otherwise the door is shut: the place says so
+      const waiting = this.#state.told?.found.length ? await unsent() : 0;
+      if (answer.ok) this.#set({ told: await answer.json(), waiting, lost: false }); // otherwise the door is shut: the place says so
     } catch {
       this.#set({ lost: true });
     }
@@ -99,8 +100,10 @@ class SoftwareUpdate extends HTMLElement {
 
 customElements.define("software-update", SoftwareUpdate);
 
+const unsent = async () => (await (await fetch("/api/outbox", { cache: "no-store" })).json()).waiting;
+
 function view(state, act) {
-  const { told, lost, alert, sent } = state;
+  const { told, waiting, lost, alert, sent } = state;
   if (!told) return html`<p role="status">${t("tech.opening")}</p>`;
   const away = lost && AWAY.includes(told.state);
   return html`
@@ -108,7 +111,7 @@ function view(state, act) {
     <section class="update" data-state=${away ? "restarting" : told.state}>
       ${away ? restarting() : (STAGES[told.state] ?? nothing_)(told, act)}
       ${trouble(alert ?? told.trouble)}
-      ${UNDER_WAY.includes(told.state) || !told.here ? nothing : choices(told, sent, act)}
+      ${UNDER_WAY.includes(told.state) || !told.here ? nothing : choices(told, waiting, sent, act)}
     </section>
   `;
 }
@@ -181,7 +184,7 @@ function news(items) {
 
 // ---- what there is to install, and where to look
 
-function choices(told, sent, act) {
+function choices(told, waiting, sent, act) {
   if (sent !== null) {
     return html`
       ${head("update.sending")} ${bar(sent)} ${says("update.stay")}
@@ -191,6 +194,7 @@ function choices(told, sent, act) {
   const empty = told.looked && !told.found.length && told.state === "none" && !told.trouble;
   return html`
     ${empty ? head("update.nothing") : nothing}
+    ${waiting ? html`<p id="unsent">${t("update.unsent", { n: waiting })} ${t("update.unsent.safe")}</p>` : nothing}
     ${told.found.length ? html`<ul class="checks">${told.found.map((one) => found(told, one, act))}</ul>` : nothing}
     ${told.offered && !told.looked ? says("update.offered", { version: told.offered }) : nothing}
     <p class="muted">${t("update.where")}</p>

@@ -1,6 +1,6 @@
 // A person's visit: begin, fill in, go on to the next missing picture, finish, take back. Every change is sent as it is made.
 
-import { freshKey, getVisit, getVisits, Refusal, send } from "./api.js";
+import { freshKey, getOutbox, getVisit, getVisits, Refusal, send } from "./api.js";
 import { eyeOf, get, lostShots, moveShot, set, underway } from "./memory.js";
 import { go } from "./routes.js";
 import { lower, raise } from "./states.js";
@@ -162,6 +162,19 @@ export function goOn(after) {
   const slot = nextSlot(after);
   if (slot) go({ screen: "aim", visit: get().route.visit, slot });
   else finish();
+}
+
+// ---- sending
+
+export async function refreshOutbox() {
+  const outbox = await politely(getOutbox);
+  if (outbox) set({ outbox });
+}
+
+/** What kept one visit (none: any of them) from being sent is mended, somebody says. */
+export async function trySending(visit) {
+  const outbox = await politely(() => send("POST", "/api/outbox/try", visit ? { visit } : {}));
+  if (outbox) set({ outbox });
 }
 
 // ---- the end

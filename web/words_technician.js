@@ -177,6 +177,8 @@ export const TECHNICIAN = {
   "update.took": { one: "The last update took {n} minute.", other: "The last update took {n} minutes." },
   "update.guess": "Estimate: {from} to {n} minutes. No update was timed on this camera yet.",
   "update.itself": "The camera restarts by itself.",
+  "update.unsent": { one: "{n} person waits to be sent.", other: "{n} people wait to be sent." },
+  "update.unsent.safe": "They stay on this camera, and are sent after the update.",
   "update.power": "Leave it on its charger.",
   "update.leave": "Leave the stick where it is.",
   "update.progress": "Progress of the update",
@@ -238,4 +240,5 @@ export const TECHNICIAN = {
   "health.heat": "Heat",
   "health.clock": "Clock",
   "health.speed": "Speed",
+  "health.sending": "Sending",
 };

@@ -38,7 +38,8 @@ class Facts:
     """What an instrument knows of itself at one moment; None where it has no such part.
 
     `battery` is a share; `newest` when the last capture was; `presses` how long the last presses took, and by how much
-    each was later than it was allowed to be; `torn_bytes` what half-kept captures hold, one by one.
+    each was later than it was allowed to be; `torn_bytes` what half-kept captures hold, one by one; `unsent` how many
+    visits wait to be sent, and how many of them need somebody (None: nothing is sent from here).
     """
 
     state: str
@@ -58,6 +59,7 @@ class Facts:
     newest: datetime | None
     presses: Sequence[tuple[float, float]]
     torn_bytes: Sequence[int] = ()
+    unsent: tuple[int, int] | None = None
 
 
 def camera(facts: Facts) -> Check:
@@ -154,6 +156,16 @@ def _of(ordered_s: Sequence[float], share: float) -> float:
     return ordered_s[math.ceil(share * len(ordered_s)) - 1]
 
 
+def sending(facts: Facts) -> Check:
+    """Whoever was finished gets to the receiver by himself."""
+    limit = "nobody needs help to be sent"
+    if facts.unsent is None:
+        return Check("sending", True, "not set up", limit, "", known=False)
+    waiting, stuck = facts.unsent
+    remedy = "Open Send on the page: it says why. Nothing is lost."
+    return Check("sending", stuck == 0, f"{waiting} wait, {stuck} of them need help", limit, remedy)
+
+
 def _unless(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
@@ -161,7 +173,7 @@ def _unless(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 
 CHECKS: tuple[Callable[[Facts], Check], ...] = (
-    camera, lamp, calibration, captures, space, battery, heat, clock, speed,
+    camera, lamp, calibration, captures, space, battery, heat, clock, speed, sending,
 )  # fmt: skip
 
 

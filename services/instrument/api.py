@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -45,6 +45,7 @@ from device.errors import (
     PinWrong,
     PowerLow,
     Refused,
+    SendError,
     StickFull,
     StickGone,
     StoreDamaged,
@@ -61,20 +62,24 @@ from device.recon.model import field_radius_px
 from device.values import Capture, Eye
 from services.health.checks import judged
 from services.health.probe import as_json
+from services.instrument.carrier import Carrier
 from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
 from services.instrument.lease import Lease
 from services.instrument.live_api import live_routes
 from services.instrument.notices import Notices, is_old
+from services.instrument.outbox_api import outbox_router
 from services.instrument.owner import Owner
 from services.instrument.page import page
 from services.instrument.promised import Promised
+from services.instrument.sending import Sender, packer
 from services.instrument.technician import Door
 from services.instrument.technician_api import technician_routes
 from services.instrument.updates_api import UPLOAD_PATH
 from services.instrument.visits_api import NAME, exports_router, visits_router
 from services.instrument.wellbeing import facts
+from services.records.outbox import Outbox
 from services.records.people import People
 from services.records.protocol import Protocol, load_protocol
 
@@ -114,6 +119,7 @@ STATUS: dict[type[DiffuscopeError], int] = {
     UpdateNoRoom: 507,
     UpdateError: 409,
     StickGone: 503,
+    SendError: 409,
     StoreDamaged: 500,
     DiffuscopeError: 500,
 }
@@ -162,27 +168,22 @@ class Press(BaseModel):
 
 def create_app(
     owner: Owner, door: Door, protocol: Protocol | None = None, names: tuple[str, ...] | None = None,
-    sticks: Sticks | None = None, rooms: Sequence[APIRouter] = (),
+    sticks: Sticks | None = None, rooms: Sequence[APIRouter] = (), carrier: Carrier | None = None,
 ) -> FastAPI:  # fmt: skip
     """The application around whoever has the head; it answers to these `names`, and to addresses and local ones.
 
-    `rooms` are for the technician only.
+    `rooms` are for the technician only; `carrier` is the way to a receiver, where there is one.
     """
     store, clock = owner.house.store, owner.house.clock
     people = People(store.engine, protocol or load_protocol(), clock)
     lease, promised = Lease(clock), Promised()
-    notices = Notices(owner, people, lease)
-
-    @asynccontextmanager
-    async def life(_: FastAPI) -> AsyncIterator[None]:
-        notices.begin()
-        yield
-        notices.close()
-        owner.house.bulletin.close()
-
+    outbox, pack = Outbox(store.engine, clock), packer(store, people)
+    sender = Sender(outbox, pack, carrier, lambda: owner.is_idle, clock) if carrier is not None else None
+    notices = Notices(owner, people, lease, sender)
     app = FastAPI(
-        title="Diffuscope", version=version("diffuscope"), lifespan=life, openapi_url="/api/openapi.json",
-        docs_url=None, redoc_url=None, responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
+        title="Diffuscope", version=version("diffuscope"), lifespan=_life(owner, notices),
+        openapi_url="/api/openapi.json", docs_url=None, redoc_url=None,
+        responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
     app.state.notices = notices
     _words_for_errors(app)
@@ -192,11 +193,29 @@ def create_app(
     _captures(app, owner, people, promised, only_one)
     app.include_router(visits_router(people, lease, promised), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
+    app.include_router(outbox_router(sender), dependencies=[only_one])
     _state(app, owner, people, notices)
     live_routes(app, owner, shown)
     technician_routes(app, owner, door, rooms)
     page(app)
     return app
+
+
+def _life(owner: Owner, notices: Notices) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    """What runs beside the server for as long as it runs."""
+
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        notices.begin()
+        if notices.sender is not None:
+            notices.sender.begin()
+        yield
+        if notices.sender is not None:
+            notices.sender.close()
+        notices.close()
+        owner.house.bulletin.close()
+
+    return life
 
 
 def one_screen(lease: Lease) -> Callable[..., None]:
@@ -350,13 +369,14 @@ def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None
             "people_left": store.people_left(len(people.protocol.slots)), "controller": notices.lease.holder,
             "problem": words(problem) if problem else None,
             "standing": [{"code": code, **facts} for code, facts in notices.standing().items()],
+            "sending": notices.sender.counts() if notices.sender is not None else None,
             "notices": [one.remedy for one in owner.findings if not one.ok and not is_old(one)],
         }  # fmt: skip
 
     @app.get("/api/health")
     def health() -> dict[str, Any]:
         """Whether it can take pictures now: every check with its limit and what to do; and how the calibration fits."""
-        known = facts(owner, len(people.protocol.slots))
+        known = facts(owner, len(people.protocol.slots), notices.sender)
         checks = judged(known)
         return {
             "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,

@@ -20,6 +20,7 @@ from device.spec import BusSpec
 from services.health.checks import EARLIEST, LATE_S, PEOPLE_LEFT
 from services.instrument.lease import Lease
 from services.instrument.owner import Owner
+from services.instrument.sending import Sender
 from services.instrument.wellbeing import CLOCK_WAS_SET
 from services.records.people import People
 from services.records.underway import Lost
@@ -49,8 +50,8 @@ class Hot:
 class Notices:
     """Looks at what stands, and tells the bulletin what has changed since it looked last."""
 
-    def __init__(self, owner: Owner, people: People, lease: Lease) -> None:
-        self._owner, self._people, self.lease = owner, people, lease
+    def __init__(self, owner: Owner, people: People, lease: Lease, sender: Sender | None = None) -> None:
+        self._owner, self._people, self.lease, self.sender = owner, people, lease, sender
         self._clock: Clock = owner.house.clock
         self._began = (self._clock.wall(), self._clock.now_s())
         self._hot, self._told, self._held = Hot(), Standing(), lease.holder
@@ -76,7 +77,9 @@ class Notices:
     def standing(self) -> Standing:
         """Everything that stands now, by code."""
         found: Standing = {}
-        for part in (self._store, self._head, self._calibration, self._date, self._making, self._side):
+        for part in (
+            self._store, self._head, self._calibration, self._date, self._making, self._side, self._sending,
+        ):  # fmt: skip
             try:
                 found.update(part())
             except DiffuscopeError as error:  # who asks that part for work is told by it
@@ -157,6 +160,9 @@ class Notices:
     def _side(self) -> Standing:
         asked = self._people.asked_side()
         return {} if asked is None else {"eye.side": asdict(asked)}
+
+    def _sending(self) -> Standing:
+        return self.sender.standing() if self.sender is not None else {}
 
     def _is_over(self, one: Lost) -> bool:
         """Whether its slot has a picture, or its visit has ended."""

@@ -25,6 +25,7 @@ from services.records.store import Store
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 30.0
+AIMS_S = 5.0  # since the last live picture was asked for: it may have taken 2 s, and who aims comes again
 NO_PREVIEW_S = 1.0  # a page that asks at once again must not keep the computer busy
 
 
@@ -59,6 +60,7 @@ class Owner:
         self._open_exam, self._open_bench = exam, bench
         self._lock = Lock()
         self._closing = False
+        self._aimed_s = -AIMS_S
         self._begin()
 
     @property
@@ -88,6 +90,14 @@ class Owner:
         return self._exam.state if self._exam is not None else "busy"
 
     @property
+    def is_idle(self) -> bool:
+        """Whether nobody takes a picture, waits for one or aims: then other work may be done."""
+        exam = self._exam
+        if exam is None:
+            return True
+        return exam.state == "aim" and self.house.clock.now_s() - self._aimed_s >= AIMS_S
+
+    @property
     def idle_state(self) -> str:
         """`starting` while the exam cannot hand over the head yet, else `idle`: there is no wizard."""
         return "idle" if self._exam is not None and self._exam.ready.is_set() else "starting"
@@ -104,7 +114,7 @@ class Owner:
 
     def preview(self, after: int, eyes: tuple[Eye, ...] = EYES) -> Preview | None:
         """The exam's next live picture; while it does not have the head, none ever comes."""
-        exam = self._exam
+        exam, self._aimed_s = self._exam, self.house.clock.now_s()
         if exam is None:
             self.house.clock.sleep(NO_PREVIEW_S)
             return None

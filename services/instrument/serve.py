@@ -20,6 +20,7 @@ from device.head import open_bench, open_head
 from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
+from services.instrument.carrier import Carrier
 from services.instrument.diary import Diary
 from services.instrument.exam import Exam
 from services.instrument.explorer import Explorer
@@ -79,11 +80,12 @@ def _remedy(error: OSError, port: int) -> str:
 def serve(
     spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
     protocol: Protocol, names: tuple[str, ...] = (), updater: tuple[Path | None, Path | None] = (None, None),
+    carrier: Carrier | None = None,
 ) -> None:  # fmt: skip
     """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
 
     The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
-    `names`, beside the computer's own, its addresses, and local ones. `updater`: its folder, and where it takes wishes.
+    `names`, beside its own and local ones. `updater`: its folder, and where it takes wishes; `carrier`: to a receiver.
     """
     clock = SystemClock()
     with address, Store(data, clock=clock) as store, ExitStack() as undo:
@@ -103,7 +105,7 @@ def serve(
         door = Door(data / "technician.json", clock)
         desk = UpdateDesk(*updater, clock, version("diffuscope"))
         rooms = explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration), update_routes(desk, door)
-        app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
+        app = create_app(owner, door, protocol, own_names() + names, rooms=rooms, carrier=carrier)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)
         if store.swept:

@@ -15,6 +15,7 @@ from device.values import Capture
 from services.health.checks import Facts
 from services.instrument.owner import Owner
 from services.instrument.pace import BUDGET_S
+from services.instrument.sending import Sender
 from services.records.store import Store
 
 COMPUTER_HEAT = Path("/sys/class/thermal/thermal_zone0/temp")
@@ -23,7 +24,7 @@ GLANCE_S = 0.02
 PRESSES = 100
 
 
-def facts(owner: Owner, pictures: int) -> Facts:
+def facts(owner: Owner, pictures: int, sender: Sender | None = None) -> Facts:
     """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts.
 
     `pictures` is how many the protocol takes of a person.
@@ -42,6 +43,7 @@ def facts(owner: Owner, pictures: int) -> Facts:
         now=house.clock.wall(), clock_was_set=CLOCK_WAS_SET.exists(),
         newest=newest[0].taken_at if newest else None,
         presses=[(spent_s, spent_s - _budget_s(one)) for one in newest if (spent_s := _press_s(one)) > 0],
+        unsent=None if sender is None else sender.in_need(),
         torn_bytes=list(house.store.torn().values()),
     )  # fmt: skip
 

@@ -275,7 +275,7 @@ class People:
     def _put(self, session: Session, capture: Capture) -> None:
         """Put a new capture into its slot; also of a visit that was finished meanwhile: no picture is lost.
 
-        Such a visit ends anew, by what is known of it now.
+        Such a visit ends anew, now and by what is known of it: so it is sent again too.
         """
         id, slot = capture.report["visit"], capture.report["slot"]
         row = visits.row(session, id)
@@ -285,6 +285,7 @@ class People:
         if row.finished_at is not None:
             session.flush()
             self._tell_outcome(session, row)
+            row.finished_at = schema.utc_text(self.clock.wall())
 
     @contextmanager
     def _writing(self) -> Iterator[Session]:

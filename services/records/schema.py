@@ -25,6 +25,7 @@ from sqlalchemy import (
     create_engine,
     event,
     literal_column,
+    text,
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
@@ -148,6 +149,9 @@ class IdentifierRow(Shelf):
     )
 
 
+UNSENT = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
+
+
 class VisitRow(Shelf):
     """One visit; `day` is the calendar's where the instrument stands, moments are UTC; `outcome` is JSON."""
 
@@ -159,12 +163,14 @@ class VisitRow(Shelf):
     begun_at: Mapped[str] = mapped_column(Text)
     finished_at: Mapped[str | None] = mapped_column(Text)
     outcome: Mapped[str | None] = mapped_column(Text)
+    sent: Mapped[str | None] = mapped_column(Text)  # the `finished_at` of what was sent last
 
     __table_args__ = (
         CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="what_is_finished_has_an_outcome"),
         CheckConstraint("outcome IS NULL OR json_valid(outcome)", name="outcome_is_json"),
         Index("visits_by_time", "begun_at", "id"),
         Index("visits_by_day", "day"),
+        Index("visits_to_send", "finished_at", sqlite_where=text(UNSENT)),  # as small as what waits
         {"sqlite_strict": True},
     )
 
@@ -210,6 +216,33 @@ class SlotRow(Shelf):
 
     __table_args__ = (
         CheckConstraint("capture IS NULL OR reason IS NULL", name="taken_or_could_not"),
+        {"sqlite_strict": True},
+    )
+
+
+class SendingRow(Shelf):
+    """What became of sending a visit as it was finished at that moment; before the first try there is none.
+
+    `failing_since`, `error` and `said`: since when and why not. `confirmed` is by what the receiver proved that it has
+    it: the SHA-256 of the parcel, or its length alone.
+    """
+
+    __tablename__ = "sendings"
+
+    visit: Mapped[str] = mapped_column(Text, ForeignKey("visits.id"), primary_key=True)
+    finished_at: Mapped[str] = mapped_column(Text, primary_key=True)
+    tries: Mapped[int]
+    failing_since: Mapped[str | None] = mapped_column(Text)
+    error: Mapped[str | None] = mapped_column(Text)
+    said: Mapped[str | None] = mapped_column(Text)
+    sent_at: Mapped[str | None] = mapped_column(Text)
+    sha256: Mapped[str | None] = mapped_column(Text)
+    confirmed: Mapped[str | None] = mapped_column(Text)
+
+    __table_args__ = (
+        CheckConstraint("tries >= 0", name="tries_are_counted"),
+        CheckConstraint("(sent_at IS NULL) = (sha256 IS NULL)", name="what_was_sent_is_known"),
+        CheckConstraint("(sent_at IS NULL) = (confirmed IS NULL)", name="what_was_sent_was_confirmed"),
         {"sqlite_strict": True},
     )
 

@@ -9,6 +9,7 @@ import typer
 
 from device.clock import SystemClock
 from device.errors import DiffuscopeError
+from services.update.gate import unsent
 from services.update.settings import PLACE, load
 from services.update.updater import Updater
 
@@ -30,6 +31,8 @@ def check(
     updater.tidy()
     offer = updater.check(download)
     typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.runs}.")
+    if offer and (waiting := unsent(load(settings).instrument)):
+        typer.echo(f"{waiting} people wait to be sent: they stay on the device, and are sent after the update.")
 
 
 @app.command()

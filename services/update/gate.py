@@ -96,6 +96,12 @@ def refuse_unless_at_rest(at: str, lowest_battery: float, now: datetime) -> tupl
     return tuple(failed)
 
 
+def unsent(at: str) -> int:
+    """How many people wait to be sent: no reason to refuse, for an update leaves the data partition alone."""
+    said = probe.status(at) or {}
+    return int((said.get("sending") or {}).get("waiting", 0))
+
+
 def _answered(at: str, path: str) -> dict[str, Any]:
     """What the instrument answers; {} if it does not."""
     try:

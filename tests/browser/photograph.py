@@ -12,6 +12,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.browser.conftest import CHROMIUM, free_port
 from tests.browser.looks import SIZES
 from tests.browser.stub import Stub, Stubbed
+from tests.browser.stub_visits import unsent
 from tests.browser.test_states import CAUSES, NUMBERS, STOPS, TELLS
 
 LANGUAGES = ["en", "en-XA", "ta", "hi", "te"]
@@ -60,6 +61,10 @@ def photograph(page: Page, stubbed: Stubbed, folder: Path) -> None:
     page.emulate_media(media="print")
     take("slip")
     page.emulate_media(media="screen")
+    stub.sending = True
+    stub.unsent = [unsent(visit, code, 3) for code in ("send.refused", "send.link")] + [unsent(visit)]
+    for place, mark in (("", "#send"), ("send", ".send .people li"), (f"visit/{visit['id']}/outcome", "#by-itself")):
+        at(place, mark)
     at("history", ".history [data-visit]")
     at(f"visit/{visit['id']}/film", ".film li")
     ids = visit["slots"]["R-centre"]["captures"][:2]

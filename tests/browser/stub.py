@@ -78,6 +78,9 @@ class Stub:
     problem: dict[str, str] | None = None
     notices: list[str] = field(default_factory=list)
     standing: dict[str, dict[str, Any]] = field(default_factory=dict)  # what `notice` told, and is not over
+    sending: bool = False  # whether a receiver is set up
+    unsent: list[dict[str, Any]] = field(default_factory=list)  # who waits for it
+    tried: list[str | None] = field(default_factory=list)
     swept: list[dict[str, Any]] = field(default_factory=list)
     refuse: tuple[int, dict[str, str]] | None = None
     warnings: list[str] = field(default_factory=list)
@@ -202,8 +205,19 @@ def _status(app: FastAPI, stub: Stub) -> None:
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
                 "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
+                "sending": {"sent": 20, "waiting": len(stub.unsent)} if stub.sending else None,
                 "controller": stub.controller and "a public name", "notices": stub.notices,
                 "standing": list(stub.standing.values())}  # fmt: skip
+
+    @app.get("/api/outbox")
+    def outbox() -> dict[str, Any]:
+        known = {"configured": stub.sending, "sent": 20 * stub.sending, "waiting": len(stub.unsent)}
+        return known | {"next_try_s": 0 if stub.tried else 700, "visits": stub.unsent}
+
+    @app.post("/api/outbox/try")
+    def try_now(wish: dict[str, Any]) -> dict[str, Any]:
+        stub.tried.append(wish.get("visit"))
+        return outbox()
 
     @app.post("/api/controller")
     def controller(wish: dict[str, Any]) -> dict[str, Any]:

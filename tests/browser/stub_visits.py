@@ -30,6 +30,16 @@ def empty_slot() -> dict[str, Any]:
     return {"state": "empty", "capture": None, "captures": [], "verdict": None, "reason": None, "tries": 0}
 
 
+def unsent(visit: dict[str, Any], code: str | None = None, tries: int = 0) -> dict[str, Any]:
+    """A visit as the outbox lists it; `code` says why it was not sent."""
+    error = {"code": code, "message": "The receiver says no.", "remedy": "Call the technician."} if code else None
+    return {
+        "visit": visit["id"], "number": visit["number"], "since": now().isoformat(), "size_bytes": 8_200_000,
+        "tries": tries, "failing_since": now().isoformat() if code else None, "error": error,
+        "stuck": code not in (None, "send.link"),
+    }  # fmt: skip
+
+
 class Visits:
     """All the visits of the pretended shelf."""
 

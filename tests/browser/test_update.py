@@ -182,6 +182,7 @@ def test_every_stage_and_every_refusal_has_words_that_fit(
     """The journal as the updater writes it; the page is the real one."""
     complaints.expect("422")
     page = entered(open_page, device)
+    page.route("**/api/outbox", lambda route: route.fulfill(json={"waiting": 3}))
     boot = this_boot()
     stages = {
         "looking": {}, "fetching": {"share": 0.4}, "installing": {"share": 0.8}, "installed": {}, "trying": {},
@@ -202,4 +203,5 @@ def test_every_stage_and_every_refusal_has_words_that_fit(
         alert = page.locator(f".alert[data-code='{kind.code}']")
         expect(alert).to_contain_text(kind.default_remedy)
         assert kind is UpdateError or alert.locator("strong").inner_text() not in trouble.message
+    expect(page.locator("#unsent")).to_contain_text("3 people wait to be sent. They stay on this camera")
     assert faults(page) == []

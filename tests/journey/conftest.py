@@ -33,6 +33,7 @@ from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Colour, Psf
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
+from services.instrument.carrier import Carrier
 from services.instrument.exam import Exam
 from services.instrument.owner import House, Owner
 from services.instrument.technician import Door
@@ -190,6 +191,7 @@ def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., R
         watchdog: str | None = None,
         head: Callable[[Head], Head] = lambda head: head,
         clock: GateClock | None = None,
+        carrier: Carrier | None = None,
     ) -> Rig:
         clock, died = clock or GateClock(), Event()
         scene = copy(dark_world)
@@ -211,7 +213,7 @@ def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., R
         house = House(scene.spec, Archive(folder / "archive"), shelf, bulletin, clock, Watchdog(watchdog), died.set)
         owner = Owner(house, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = Door(folder / "technician.json", clock)
-        return Rig(scene, clock, shelf, bulletin, exam, owner, door, create_app(owner, door), died)
+        return Rig(scene, clock, shelf, bulletin, exam, owner, door, create_app(owner, door, carrier=carrier), died)
 
     return built
 

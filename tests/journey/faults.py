@@ -23,6 +23,7 @@ from device.spec import BusSpec
 from device.values import Charge
 from services.instrument.bulletin import Bulletin
 from tests.journey.conftest import Rig, until
+from tests.receiver import Receiver
 from tests.simulated import having
 
 BUS = BusSpec(backend="sim", thermometer=0x48, battery=0x36)
@@ -34,10 +35,11 @@ MOST_BYTES = 10**12
 
 @dataclass
 class Shelf:
-    """How much room the shelf believes it has, and what it costs to ask."""
+    """How much room the shelf believes it has, what it costs to ask, and who receives what is finished."""
 
     free_bytes: int = MOST_BYTES
     asked: Callable[[], None] = lambda: None
+    receiver: Receiver = field(default_factory=Receiver)
 
     def __call__(self, folder: Path) -> int:
         self.asked()
@@ -344,6 +346,67 @@ def cut_off(rig: Rig, again: Callable[[], Rig], folder: Path) -> Said:
     return Said("status", "power.lost", {"eye": lost[0]["eye"], "slot": lost[0]["slot"]})
 
 
+def unsent(rig: Rig, shelf: Shelf, answers: dict[str, int]) -> dict[str, Any]:
+    """One more visit is finished, and the receiver says no: what the Send screen lists of it."""
+    number = rig.app.state.notices.sender.outbox.trouble().waiting + len(shelf.receiver.kept)
+    key = f"{number + 256:016x}"
+    visit = rig.request("POST", "/api/visits", json={"key": key}).json()["id"]
+    assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"
+    rig.request("POST", f"/api/visits/{visit}/finish", json={"key": key[::-1]})
+    shelf.receiver.answers = answers
+    sent(rig)
+    listed = rig.request("GET", "/api/outbox").json()
+    assert (listed["configured"], listed["waiting"]) == (True, len(listed["visits"]))
+    assert rig.request("GET", "/api/status").json()["sending"]["waiting"] == listed["waiting"]
+    one: dict[str, Any] = next(one for one in listed["visits"] if one["visit"] == visit)
+    assert one["size_bytes"] > 1000
+    return one
+
+
+def sent(rig: Rig) -> None:
+    """As its thread does it, once nobody aims."""
+    rest(rig)
+    rig.clock.sleep(6)
+    until(lambda: rig.owner.is_idle, 120)
+    while rig.app.state.notices.sender.step():
+        pass
+
+
+def is_over(rig: Rig, code: str) -> None:
+    """It stands no longer, and that was the last news of it."""
+    rig.app.state.notices.look()
+    assert code not in {one["code"] for one in rig.request("GET", "/api/status").json()["standing"]}
+    assert [data for _, data in rig.told() if data.get("code") == code][-1] == {"code": code, "over": True}
+
+
+def waits_for_the_link(rig: Rig, shelf: Shelf) -> Said:
+    one = unsent(rig, shelf, {"HEAD": 503})
+    assert (one["tries"], one["stuck"], one["error"]["code"]) == (1, False, "send.link")
+    assert "503" in one["error"]["message"]
+    said = stands(rig, "send.waiting")
+    assert pressed(rig).way == "verdict", "nobody who is examined waits for the link"
+    shelf.receiver.answers = {}
+    rig.clock.sleep(60)
+    sent(rig)
+    is_over(rig, "send.waiting")
+    return said
+
+
+def is_stuck(rig: Rig, shelf: Shelf) -> Said:
+    before = len(shelf.receiver.kept)
+    one = unsent(rig, shelf, {"PUT": 403})
+    assert (one["stuck"], one["error"]["code"]) == (True, "send.key")
+    assert len(one["error"]["remedy"]) > 20
+    said = stands(rig, "send.stuck")
+    assert pressed(rig).way == "verdict"
+    shelf.receiver.answers = {}
+    assert rig.request("POST", "/api/outbox/try", json={"key": "f" * 16}).json()["next_try_s"] == 0
+    sent(rig)
+    is_over(rig, "send.stuck")
+    assert len(shelf.receiver.kept) == before + 1
+    return said
+
+
 def people(rig: Rig) -> Any:
     return rig.app.state.notices._people
 
@@ -375,6 +438,8 @@ SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
     "heat.hot": warm(61.0, "heat.hot"),
     "link.other": other_screen,
     "lock.idle": locked,
+    "send.waiting": waits_for_the_link,
+    "send.stuck": is_stuck,
     "clock.wrong": wrong_date,
     "eye.side": other_eye,
 }
@@ -387,11 +452,6 @@ OF_THE_PAGE = {
     "light.cut": ("test_sides.py", "test_a_light_that_went_out_too_early_leaves_one_on_that_tile"),
     "shot.lost": ("test_sides.py", "test_a_good_picture_that_is_lost_after_next_is_told_until_it_is_taken"),
     "shot.crossed": ("test_sides.py", "test_a_tile_can_be_crossed_while_aiming_and_uncrossed"),
-}
-# No fault can bring these about, because the server does not do yet what could go wrong.
-NOT_YET = {
-    "send.waiting": "nothing is sent: there is no outbox",
-    "send.stuck": "nothing is sent: there is no outbox",
 }
 
 

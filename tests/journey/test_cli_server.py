@@ -22,11 +22,12 @@ from tests.journey.conftest import COMMAND, ROOT, Diffuscope
 class Server:
     """`diffuscope run` on the small head, and ways to talk to it."""
 
-    def __init__(self, head: Path, data: Path, environment: dict[str, str]) -> None:
+    def __init__(self, head: Path, data: Path, environment: dict[str, str], *more: str) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         self._command = [COMMAND, "run", "--head", str(head), "--port", str(self.port), "--data", str(data)]
+        self._command += more
         self._log = data.with_suffix(".log")
         self._environment = environment
 

@@ -18,12 +18,15 @@ from device.sim.chips import SimHeadMemory
 from device.spec import CalibrationTable, load_head
 from device.values import Identity
 from services.instrument.api import create_app
+from services.instrument.carrier import Https, SendSettings
 from services.instrument.exam import Exam
 from services.instrument.owner import Owner
 from tests.journey import faults
 from tests.journey.conftest import GateClock, MakeRig, Rig, builder, traced, until
 from tests.journey.faults import Attentive, Said, Shelf
+from tests.receiver import receiving
 from tests.simulated import SCENES, coarse
+from tests.site import identity
 
 K = 4  # pixels of the paper's sensor that are one here, k x k
 WEB = Path(__file__).parents[2] / "web"
@@ -39,14 +42,14 @@ REFUSALS = {
 @pytest.fixture(scope="module")
 def equipped(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Rig, Shelf]]:
     """One instrument with thermometer, battery and a calibration with a date, for all scenarios in turn."""
-    shelf, clock = Shelf(), GateClock()
-    build = builder(traced(coarse(load_head(SCENES / "calm.toml"), K)), plans)
+    clock, build = GateClock(), builder(traced(coarse(load_head(SCENES / "calm.toml"), K)), plans)
     with ExitStack() as undo:
         folder = tmp_path_factory.mktemp("faults")
-        yield (
-            build(folder, undo, head=faults.equipped, store={"free_bytes": shelf}, clock=clock, bulletin=Attentive()),
-            shelf,
-        )
+        papers = identity(folder)
+        shelf = Shelf(receiver=undo.enter_context(receiving(*papers)))
+        way = Https(SendSettings.model_validate(shelf.receiver.settings(folder, authority=papers[0])))
+        made = {"head": faults.equipped, "store": {"free_bytes": shelf}, "clock": clock, "bulletin": Attentive()}
+        yield build(folder, undo, **made, carrier=way), shelf
 
 
 @pytest.fixture
@@ -74,11 +77,11 @@ def test_a_fault_brings_its_state_about(code: str, rig: Rig, equipped: tuple[Rig
     says_what_its_words_need(code, faults.SCENARIOS[code](rig, equipped[1]))
 
 
-def test_every_state_of_the_page_has_its_scenario_or_says_why_not() -> None:
+def test_every_state_of_the_page_has_its_scenario() -> None:
     assert len(STATES) == len(set(STATES)) >= 34
     reached = faults.SCENARIOS.keys() | faults.APART
-    assert reached | faults.OF_THE_PAGE.keys() | faults.NOT_YET.keys() == set(STATES)
-    assert len(reached) + len(faults.OF_THE_PAGE) + len(faults.NOT_YET) == len(STATES)
+    assert reached | faults.OF_THE_PAGE.keys() == set(STATES)
+    assert len(reached) + len(faults.OF_THE_PAGE) == len(STATES)
     for file, test in faults.OF_THE_PAGE.values():
         assert f"def {test}(" in (WEB.parent / "tests" / "browser" / file).read_text()
 

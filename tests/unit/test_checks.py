@@ -10,11 +10,12 @@ from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
 from services.health.checks import CHECKS, Facts, judged
 from services.health.probe import table
 
+SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
 WELL = Facts(
     state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
     battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
-    newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100,
+    newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0),
 )  # fmt: skip
 DRIVEN: list[tuple[str, dict[str, Any]]] = [
     ("camera", {"problem": CameraMissing("the camera is gone")}),
@@ -31,6 +32,7 @@ DRIVEN: list[tuple[str, dict[str, Any]]] = [
     ("clock", {"now": datetime(2020, 1, 1, tzinfo=UTC)}),
     ("clock", {"newest": datetime(2026, 11, 22, tzinfo=UTC)}),
     ("speed", {"presses": [(1.0, -4.0)] * 50 + [(9.0, 4.0)] * 50}),
+    ("sending", {"unsent": (4, 1)}),
     ("speed", {"presses": [(2.5, 1.5)] * 100}),
 ]
 
@@ -54,13 +56,13 @@ def test_one_slow_press_in_a_hundred_is_forgiven() -> None:
 
 
 def test_of_two_presses_the_slower_one_counts() -> None:
-    speed = judged(replace(WELL, presses=[(7.0, 2.0), (2.0, -3.0)]))[-1]
+    speed = judged(replace(WELL, presses=[(7.0, 2.0), (2.0, -3.0)]))[SPEED]
     assert (speed.ok, speed.value) == (False, "half of 2 pictures within 2.0 s, 99 of 100 within 7.0 s, 2.0 s over")
 
 
 def test_a_picture_is_as_slow_as_somebody_wished() -> None:
     """At the best pace a picture may take half a minute; it is late only beyond that."""
-    assert judged(replace(WELL, presses=[(30.8, 0.8)] * 100))[-1].ok
+    assert judged(replace(WELL, presses=[(30.8, 0.8)] * 100))[SPEED].ok
 
 
 def test_what_is_half_kept_is_told_with_the_room_that_is_left() -> None:
@@ -69,10 +71,10 @@ def test_what_is_half_kept_is_told_with_the_room_that_is_left() -> None:
 
 
 def test_parts_that_a_head_does_not_have_are_no_failure() -> None:
-    bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, presses=[])
+    bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, presses=[], unsent=None)
     checks = judged(bare)
     assert all(check.ok for check in checks)
-    assert [check.name for check in checks if not check.known] == ["battery", "heat", "speed"]
+    assert [check.name for check in checks if not check.known] == ["battery", "heat", "speed", "sending"]
 
 
 def test_an_update_is_judged_by_what_a_release_can_break_and_not_by_a_battery() -> None:

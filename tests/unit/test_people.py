@@ -213,12 +213,15 @@ def test_a_protocol_with_a_mistake_names_it(tmp_path: Path, change: str, said: s
 @pytest.mark.parametrize(
     "statement",
     [
-        "INSERT INTO visits VALUES ('v', 'nobody', '2026-01-01', 'x', NULL, NULL)",
+        "INSERT INTO visits VALUES ('v', 'nobody', '2026-01-01', 'x', NULL, NULL, NULL)",
         "INSERT INTO persons VALUES ('', 'x')", "INSERT INTO persons VALUES ('123456789012345678901', 'x')",
         "UPDATE visits SET finished_at = 'x'", "UPDATE visits SET outcome = '{}'", "DELETE FROM persons",
         "INSERT INTO fields SELECT id, 'age', 'fifty', 'x' FROM visits",
         "INSERT INTO slots SELECT id, 'R-centre', 'no capture', NULL FROM visits",
         "INSERT INTO keys VALUES ('short', 'a', 'b', 'c')", "UPDATE counters SET last = 'many'",
+        "INSERT INTO sendings SELECT id, 'x', -1, NULL, NULL, NULL, NULL, NULL, NULL FROM visits",
+        "INSERT INTO sendings SELECT id, 'x', 1, NULL, NULL, NULL, 'today', NULL, NULL FROM visits",
+        "INSERT INTO sendings VALUES ('no visit', 'x', 1, NULL, NULL, NULL, NULL, NULL, NULL)",
     ],
 )  # fmt: skip
 def test_the_tables_themselves_refuse_nonsense(store: Store, people: People, statement: str) -> None:

@@ -1,8 +1,13 @@
 """What an operator reads about the last update, in each state that it can be in."""
 
+import json
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
+
 import pytest
 
 from services.records.update_notes import Entry, Trouble
+from services.update.gate import unsent
 from services.update.journal import in_words
 
 
@@ -52,3 +57,26 @@ def test_each_state_has_its_words(entry: Entry, under_way: bool, words: str) -> 
 def test_a_try_says_what_comes_back() -> None:
     said = in_words(Entry(state="trying", version="2.0", before="1.0"), "2.0", is_trying=True, under_way=False)
     assert said == "Version 2.0 is being tried; 1.0 is back if it does not do."
+
+
+@pytest.mark.parametrize(
+    ("said", "waiting"),
+    [({"sending": {"sent": 2, "waiting": 3}}, 3), ({"sending": None}, 0), ({}, 0), (None, 0)],
+)
+def test_who_waits_to_be_sent_is_told_and_refuses_nothing(said: dict[str, object] | None, waiting: int) -> None:
+    """The status of this release, of one without a receiver, of one that sends nothing; and nobody who answers."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200 if said is not None else 500)
+            self.end_headers()
+            self.wfile.write(json.dumps(said).encode())
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = Thread(target=server.handle_request)
+        thread.start()
+        assert unsent(f"http://127.0.0.1:{server.server_port}") == waiting
+        thread.join(10)

@@ -15,7 +15,8 @@ const KEEP = {
 };
 
 export function history(state, act) {
-  const { visits, onlyShow, route } = state;
+  const { visits, onlyShow, route, status } = state;
+  const filters = status?.sending ? [...Object.keys(KEEP), "waiting"] : Object.keys(KEEP);
   const day = route.day ?? today();
   const listed = (visits ?? []).filter(KEEP[onlyShow]);
   const step = (days) => () => act.go({ screen: "history", day: shifted(day, days) });
@@ -32,8 +33,8 @@ export function history(state, act) {
       ${choice({
         label: t("history.title"),
         value: onlyShow,
-        options: Object.keys(KEEP).map((name) => [name, t(`show.${name}`)]),
-        choose: act.only,
+        options: filters.map((name) => [name, t(`show.${name}`)]),
+        choose: (name) => (name === "waiting" ? act.go({ screen: "send" }) : act.only(name)), // of all days
       })}
       ${listed.length ? people(listed, act.openFilm) : html`<p class="muted">${t("history.none")}</p>`}
     </section>

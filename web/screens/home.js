@@ -6,7 +6,7 @@ import { html, nothing } from "../vendor/lit-html.js";
 import { clockTime, LANGUAGES, t } from "../words.js";
 
 export function home(state, act) {
-  const { visits, counts } = state;
+  const { visits, counts, status } = state;
   const left = (visits ?? []).find((visit) => !visit.finished_at);
   return html`
     <section class="home">
@@ -20,7 +20,7 @@ export function home(state, act) {
         <button type="button" id="find" @click=${() => act.go({ screen: "find" })}>${t("home.find")}</button>
         <button type="button" id="history" @click=${() => act.go({ screen: "history" })}>${t("home.history")}</button>
       </div>
-      ${counts ? day(counts) : nothing} ${languages(state, act)}
+      ${counts ? day(counts) : nothing} ${status?.sending ? sending(status.sending, act) : nothing} ${languages(state, act)}
     </section>
   `;
 }
@@ -33,6 +33,11 @@ function day({ done, to_finish: open, referred }) {
     </p>
   `;
 }
+
+const sending = ({ sent, waiting }, act) =>
+  html`<button class="quiet" type="button" id="send" @click=${() => act.go({ screen: "send" })}>
+    ${icon(waiting ? "wait" : "check")} <span>${t("home.sent", { n: sent })} · ${t("home.waiting", { n: waiting })}</span>
+  </button>`;
 
 function languages({ language }, act) {
   const draft = LANGUAGES[language]?.draft;

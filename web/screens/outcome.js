@@ -17,7 +17,7 @@ export function outcome(state, act) {
       <h2>${t("outcome.title", { number: visit.number })}</h2>
       <p class="verdict">${icon(markOf(visit.outcome))} ${ending(state)[0]}</p>
       <p>${ending(state)[1]}</p>
-      ${tiles(state, act)}
+      ${state.status?.sending ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, act)}
       <div class="ends">
         <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
         <button type="button" id="code" aria-expanded=${state.code !== undefined} @click=${act.showCode}>
