@@ -21,9 +21,11 @@ from device.spec import InstrumentSpec
 from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.diary import Diary
+from services.instrument.diary_api import diary_routes
 from services.instrument.exam import Exam
 from services.instrument.explorer import Explorer
 from services.instrument.explorer_api import explorer_routes
+from services.instrument.exporting import Sticks
 from services.instrument.forgery import own_names
 from services.instrument.owner import House, Owner, archive_of, calibrated
 from services.instrument.technician import Door
@@ -102,7 +104,10 @@ def serve(
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
         door = Door(data / "technician.json", clock)
         desk = UpdateDesk(*updater, clock, version("diffuscope"))
-        rooms = explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration), update_routes(desk, door)
+        rooms = (
+            explorer_routes(explorer, store, lambda: owner.exam.head.calibration),
+            diary_routes(diary, Sticks(), clock), update_routes(desk, door),
+        )  # fmt: skip
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)
