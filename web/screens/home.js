@@ -48,27 +48,33 @@ function languages({ language }, act) {
 
 export function find({ typed, visits }, act) {
   const found = (visits ?? []).filter((visit) => visit.number.includes(typed)).slice(0, 20);
+  const [one] = typed ? found : [];
   return html`
     <section class="find">
       <div>
         <h2>${t("find.title")}</h2>
         <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
         ${pad(act.typeNumber)}
-        <button class=${found.length ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
+        ${one
+          ? html`<button class="primary" type="button" id="open-found" @click=${() => act.resume(one)}>
+              ${t("find.open.one", { number: one.number })}
+            </button>`
+          : html`<p class="no-match" aria-live="polite">${typed && visits ? t("find.nomatch", { number: typed }) : "\u00a0"}</p>`}
+        <button class=${one ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
           ${t("find.start", { number: typed })}
         </button>
         <p class="muted">${t("find.scan")}</p>
       </div>
       <div>
-        <h2>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
-        ${found.length ? people(found, act.resume) : html`<p class="muted">${t("find.none")}</p>`}
+        <h2 ?hidden=${typed && !found.length}>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
+        ${found.length ? people(found, act.resume) : typed ? nothing : html`<p class="muted">${t("find.none")}</p>`}
       </div>
     </section>
   `;
 }
 
-/** A tick is for what needs nobody's care today. */
-export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "check");
+/** A referral needs care, pictures go on to somebody: a tick would say that it is done. */
+export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "next");
 
 export function people(visits, open) {
   return html`

@@ -16,7 +16,7 @@ export function outcome(state, act) {
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: visit.number })}</h2>
       <p class="verdict">${icon(markOf(visit.outcome))} ${ending(state)[0]}</p>
-      <p>${ending(state)[1]}</p>
+      <p>${ending(state)[1]} ${visit.outcome.code === "send" ? t("outcome.copy") : nothing}</p>
       ${tiles(state, act)}
       <div class="ends">
         <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
