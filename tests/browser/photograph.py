@@ -31,6 +31,8 @@ class Camera:
         if ready:
             self.page.wait_for_selector(ready)
             self.page.wait_for_timeout(500)
+        if name not in ("person-urgent", "slip"):
+            self.page.evaluate("scrollTo(0, 0)")
         self._count += 1
         self.page.screenshot(path=self.folder / f"{self._count:02d}-{name}.png")
 
