@@ -3,7 +3,7 @@
 import { fileOf, getFolders, askForControls } from "./api.js";
 import { clamp, homeBox } from "./field.js";
 import { get, remember, set, shotOf } from "./memory.js";
-import { typedBy } from "./parts.js";
+import { numberWords, typedBy } from "./parts.js";
 import { cue, freshPicture, take, unlocked } from "./press.js";
 import { codeOf } from "./qr.js";
 import { go } from "./routes.js";
@@ -32,7 +32,7 @@ const moves = {
   },
   /** Whoever has exactly this number; else somebody new. */
   enterNumber() {
-    const same = (get().visits ?? []).find(({ number }) => number === get().typed);
+    const same = (get().visits ?? []).find(({ number }) => [number, numberWords(number)].includes(get().typed));
     if (same) visits.resume(same);
     else moves.begin(get().typed);
   },

@@ -15,7 +15,15 @@ export const slotWords = (state, slot) => {
 // The programme may name fields that this page has never heard of; their own name is better than none.
 export const fieldWord = (field) => (has(`field.${field}`) ? t(`field.${field}`) : field);
 
-export function personWords({ number, fields }) {
+/** A person's number, an automatic one with its check digit apart, so that people who follow each other are seen to. */
+export function numberWords(number) {
+  const prefix = get().protocol?.programme?.prefix;
+  const own = prefix && number.startsWith(prefix) && /^\d{5,}$/.test(number.slice(prefix.length));
+  return own ? `${number.slice(0, -1)}-${number.slice(-1)}` : number;
+}
+
+export function personWords({ number: plain, fields }) {
+  const number = numberWords(plain);
   const sex = fields.sex ? t(`sex.${fields.sex}`) : "";
   const more = [sex, fields.age].filter(Boolean).join(", ");
   return more ? `${number} · ${more}` : number;

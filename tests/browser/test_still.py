@@ -97,6 +97,20 @@ def test_a_code_that_is_read_opens_whoever_has_that_number(open_page: Open, stub
     assert len(stub.stub.visits.kept) == 1
 
 
+def test_a_number_has_its_check_digit_apart_and_is_found_in_both_forms(open_page: Open, stub: Stubbed) -> None:
+    stub.stub.visits.begin(number="A00013", consent="agreed")
+    stub.stub.visits.begin(number="SELF-7", consent="agreed")
+    page = open_page(f"{stub.url}/#/find")
+    expect(page.locator(".people")).to_contain_text("A0001-3")
+    expect(page.locator(".people")).to_contain_text("SELF-7")
+    page.locator("[data-key='1']").tap()
+    expect(page.locator("#open-found")).to_have_text("Open A0001-3")
+    page.locator("[data-key='3']").tap()
+    expect(page.locator("#open-found")).to_have_text("Open A0001-3")
+    page.locator("#open-found").tap()
+    expect(page.locator("h1")).to_contain_text("A0001-3")
+
+
 def test_neither_a_tick_nor_a_typed_age_moves_anything(open_page: Open, stub: Stubbed) -> None:
     visit = stub.stub.visits.begin()
     page = open_page(f"{stub.url}/#/visit/{visit['id']}/person", SIZES["portrait"])

@@ -4,7 +4,7 @@ import { zipOf } from "../api.js";
 import { people } from "./home.js";
 import { ending, openAgain } from "./outcome.js";
 import { icon } from "../icons.js";
-import { choice, slotWords, thumb } from "../parts.js";
+import { choice, numberWords, slotWords, thumb } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, dayName, t, today } from "../words.js";
 
@@ -54,7 +54,7 @@ export function film(state, act) {
   const taken = Object.entries(visit.slots).flatMap(([slot, { captures }]) => captures.map((id) => ({ slot, id })));
   return html`
     <section class="film">
-      <h2>${t("film.title", { number: visit.number })}</h2>
+      <h2>${t("film.title", { number: numberWords(visit.number) })}</h2>
       ${visit.outcome ? html`<p>${ending(state).filter(Boolean).join(" · ")}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       <div class="ends">
@@ -66,7 +66,7 @@ export function film(state, act) {
         ${visit.finished_at
           ? openAgain(visit, act)
           : html`<button type="button" @click=${() => act.resume(visit)}>
-              ${t("home.continue", { number: visit.number })}
+              ${t("home.continue", { number: numberWords(visit.number) })}
             </button>`}
       </div>
       ${taken.length ? away(state, act) : nothing}

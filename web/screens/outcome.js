@@ -3,7 +3,7 @@
 import { markOf } from "./home.js";
 import { icon } from "../icons.js";
 import { underway } from "../memory.js";
-import { personWords, slotWords, tiles } from "../parts.js";
+import { numberWords, personWords, slotWords, tiles } from "../parts.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../words.js";
 
@@ -14,7 +14,7 @@ export function outcome(state, act) {
   if (!visit.outcome) return notYet(act, visit);
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
-      <h2>${t("outcome.title", { number: visit.number })}</h2>
+      <h2>${t("outcome.title", { number: numberWords(visit.number) })}</h2>
       <p class="verdict">${icon(markOf(visit.outcome))} ${ending(state)[0]}</p>
       <p>${ending(state)[1]} ${visit.outcome.code === "send" ? t("outcome.copy") : nothing}</p>
       ${tiles(state, act)}
@@ -59,7 +59,7 @@ function notYet(act, visit) {
   return html`<section class="outcome">
     <h2>${t("outcome.open")}</h2>
     <button class="primary big" type="button" @click=${() => act.resume(visit)}>
-      ${t("home.continue", { number: visit.number })}
+      ${t("home.continue", { number: numberWords(visit.number) })}
     </button>
   </section>`;
 }
