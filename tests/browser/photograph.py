@@ -80,7 +80,7 @@ def states(camera: Camera, stubbed: Stubbed) -> None:
         over(stubbed, page, code)
     for hint in ("noeye", "closer", "left", "still"):
         stub.aim = {"code": hint, "fill": 0.5}
-        page.locator(f".prompt [data-icon], .prompt svg").first.wait_for()
+        page.locator(".prompt [data-icon], .prompt svg").first.wait_for()
         page.wait_for_timeout(1200)
         camera.take(f"aim-{hint}")
     stub.aim = {"code": "ready", "fill": 0.9}

@@ -65,8 +65,10 @@ function notYet(act, visit) {
 }
 
 /** How it ends: the instrument's sentence, which is English; in another language that language's word comes before it. */
-export const ending = ({ visit, language }) =>
-  language === "en" ? [visit.outcome.sentence, ""] : [t(`outcome.${visit.outcome.code}`), visit.outcome.sentence];
+export const ending = ({ visit: { outcome: { code, sentence } }, language }) => {
+  if (language === "en") return [sentence, ""];
+  return [t(`outcome.${code}`), code === "send" ? "" : sentence]; // of pictures that are kept it says no more
+};
 
 /** What the code says: number, date, outcome, telephone of the centre. Never a picture, a name or an age. */
 export function codeText({ visit, protocol }) {
