@@ -3,8 +3,9 @@
 import { fileOf, getFolders, askForControls } from "./api.js";
 import { clamp, homeBox } from "./field.js";
 import { get, remember, set, shotOf } from "./memory.js";
-import { typedBy } from "./parts.js";
+import { numberWords, typedBy } from "./parts.js";
 import { cue, freshPicture, take, unlocked } from "./press.js";
+import { codeOf } from "./qr.js";
 import { go } from "./routes.js";
 import { codeText } from "./screens/outcome.js";
 import { dismiss, lower, raise } from "./states.js";
@@ -30,13 +31,22 @@ const moves = {
     set({ typed });
     visits.refreshList(typed ? { q: typed, limit: "20" } : { day: today(), limit: "20" });
   },
+  /** Whoever has exactly this number; else somebody new. */
+  enterNumber() {
+    const same = (get().visits ?? []).find(({ number }) => [number, numberWords(number)].includes(get().typed));
+    if (same) visits.resume(same);
+    else moves.begin(get().typed);
+  },
   only: (onlyShow) => set({ onlyShow }),
 
-  /** One step back, also where the address was opened directly. */
+  /** One step up: from a picture to its person, from there home; else to where one came from. */
   back() {
+    const { screen, visit, capture } = here();
+    const exam = screen === "aim" || (screen === "picture" && !capture && !get().visit?.finished_at);
     if (get().asking) set({ asking: false });
-    else if (history.state?.depth) history.back();
-    else go({ screen: "home" }, { replace: true });
+    else if (exam) go({ screen: "person", visit });
+    else if (history.state?.depth && screen !== "person" && screen !== "outcome") history.back();
+    else go({ screen: "home" }, { replace: !history.state?.depth });
   },
 
   /** A tile with a picture shows it; one without is aimed at. */
@@ -52,6 +62,7 @@ const moves = {
 const exam = {
   take,
   again: () => unlocked() && toAim(here().slot),
+  keepOld: () => unlocked() && go({ screen: "picture", visit: here().visit, slot: here().slot }),
   next: () => unlocked() && visits.goOn(here().slot),
   keepThis: () => unlocked() && visits.keepPoor(shotOf(get()).id, here().slot),
   useThis: () => unlocked() && visits.useInSlot(here().slot, here().capture),
@@ -65,19 +76,15 @@ const exam = {
   print: () => window.print(),
 
   async showCode() {
-    const { correction, generate } = await import("./vendor/lean-qr-nano.mjs");
-    const drawing = generate(codeText(get()), { minCorrectionLevel: correction.M });
-    const { size } = drawing;
-    const rows = Array.from({ length: size }, (_, y) =>
-      Array.from({ length: size }, (_, x) => (drawing.get(x, y) ? `M${x} ${y}h1v1h-1z` : "")).join(""),
-    );
-    set({ code: get().code ? undefined : { size, path: rows.join("") } });
+    const drawn = await codeOf(codeText(get()));
+    set({ code: get().code ? undefined : drawn });
   },
 
   openFilm: (visit) => {
     set({ visit });
     go({ screen: "film", visit: visit.id });
   },
+  openDetails: () => get().later.details?.open(),
   openPicture: (slot, capture) => go({ screen: "picture", visit: here().visit, slot, capture }),
   pick(id) {
     const { picked } = get();

@@ -1,7 +1,7 @@
 // The page's story: where the person is, what the instrument tells, what is drawn. What a person can do stands in act.js.
 
 import { act, answers } from "./act.js";
-import { askForControls, EventLine, getProtocol, getStatus, letControlsGo, Refusal } from "./api.js";
+import { askForControls, EventLine, getCapture, getProtocol, getStatus, letControlsGo, Refusal } from "./api.js";
 import { page } from "./frame.js";
 import { listenToKeys } from "./keys.js";
 import "./live.js";
@@ -45,13 +45,14 @@ const FILES = {
   history: () => import("./screens/history.js"),
   send: () => import("./screens/send.js"),
   aloud: () => import("./screens/aloud.js"),
+  details: () => import("./screens/details.js"),
   viewer: () => import("./viewer.js"),
 };
 const LATER = {
   find: ["viewer"],
   person: ["viewer", "aloud"],
   aim: ["viewer", "aloud"],
-  picture: ["viewer"],
+  picture: ["viewer", "details"],
   history: ["viewer", "history"],
   send: ["send"],
   film: ["viewer", "history"],
@@ -81,6 +82,10 @@ async function load(route) {
   if (!visit && !get().visit && get().link !== "lost") return leave();
   if (visit?.finished_at && ["aim", "person"].includes(route.screen)) {
     return go({ screen: "outcome", visit: route.visit }, { replace: true }); // it is closed: to be looked at only
+  }
+  if (route.screen === "compare") {
+    const both = await Promise.all([route.capture, route.other].map((id) => politely(() => getCapture(id))));
+    set({ compared: Object.freeze(both.filter(Boolean)) });
   }
   if (route.screen !== "picture" || !visit) return;
   if (!get().status) await refreshStatus(); // after a reload: is a picture being made?

@@ -192,7 +192,7 @@ function plot(points, budget, act, live) {
     ${worthTicks.map((db) => svg`<line class="grid" x1=${LEFT} x2=${WIDE - RIGHT} y1=${y(db)} y2=${y(db)} />
       <text x=${LEFT - 8} y=${y(db) + 5} text-anchor="end">${db}</text>`)}
     ${TICKS_S.filter((s) => Math.log10(s) > first && Math.log10(s) < last).map((s) => svg`
-      <text x=${x(s)} y=${HIGH - BELOW + 22} text-anchor="middle">${s < 1 ? `${number(s * 1000)} ms` : `${number(s)} s`}</text>`)}
+      <text x=${x(s)} y=${HIGH - BELOW + 22} text-anchor=${x(s) > WIDE - 40 ? "end" : "middle"}>${s < 1 ? `${number(s * 1000)} ms` : `${number(s)} s`}</text>`)}
     <text x=${(LEFT + WIDE) / 2} y=${HIGH - 8} text-anchor="middle">${t("explore.x")}</text>
     <text x="4" y=${TOP - 2}>${t("explore.y")}</text>
     <line class="limit" x1=${x(budget)} x2=${x(budget)} y1=${TOP} y2=${HIGH - BELOW} />

@@ -13,7 +13,7 @@ import { isExam, stage } from "./screens/stage.js";
 import { html, nothing } from "./vendor/lit-html.js";
 import { has, t } from "./words.js";
 
-const PLENTY = 500; // weeks of screening
+const PLENTY = 200; // weeks of screening
 
 const SCREENS = { home, find, person, aim, picture, outcome };
 
@@ -72,7 +72,7 @@ function header(state, act) {
 }
 
 // A number is told when it matters: one of thousands changes with every picture, and nobody plans by it.
-const room = (people) => t(people > PLENTY ? "space.plenty" : "space", { n: people });
+const room = (people) => t(people > PLENTY ? "space.plenty" : "space", { n: people > 50 ? Math.floor(people / 10) * 10 : people });
 // With two pictures in the making the instrument is busy, but nobody has to hold still any more.
 function doingOf({ doing, shots }) {
   const own = shots.filter((shot) => !shot.over);
@@ -111,13 +111,15 @@ function menu({ theme, letters, auto, sound, status }, act) {
       </div>
       <label><input type="checkbox" id="auto" .checked=${auto} @change=${act.setAuto} /> ${t("menu.auto")}</label>
       <label><input type="checkbox" id="sound" .checked=${sound} @change=${act.setSound} /> ${t("menu.sound")}</label>
-      <h3>${t("menu.keys")}</h3>
-      <label><input type="checkbox" id="letters" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
-      <dl>
-        ${["take", "tiles", "g", "l", "brightness", "contrast", "zero", "rn"].map(
-          (key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`,
-        )}
-      </dl>
+      <details>
+        <summary>${t("menu.keys")}</summary>
+        <label><input type="checkbox" id="letters" .checked=${letters} @change=${act.setLetters} /> ${t("menu.letters")}</label>
+        <dl>
+          ${["take", "tiles", "g", "l", "brightness", "contrast", "zero", "rn"].map(
+            (key) => html`<dt>${t(`key.${key}`)}</dt><dd>${t(`key.${key}.what`)}</dd>`,
+          )}
+        </dl>
+      </details>
       <a class="button" href="/technician">${t("menu.technician")}</a>
       <p class="muted">${t("app.name")} · ${status ? t("menu.version", { version: status.version }) : ""}</p>
       <button class="primary" type="button" @click=${act.closeMenu}>${t("menu.close")}</button>

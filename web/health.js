@@ -2,6 +2,9 @@
 // first, is told to a screen reader, and is read aloud by a tap: people mend things with their hands and eyes elsewhere.
 
 import { icon } from "./icons.js";
+import { studio } from "./painter.js";
+import { codeOf } from "./qr.js";
+import { copied, report, reportOf, save } from "./report.js";
 import { html, nothing, render } from "./vendor/lit-html.js";
 import { onVoices, speak, voiceFor } from "./voice.js";
 import { t } from "./words.js";
@@ -13,6 +16,9 @@ class InstrumentHealth extends HTMLElement {
   #gone = null;
   #health = null; // what the instrument said last; null when it said nothing
   #large = ""; // the check that could not be heard and is shown large instead
+  #status = { name: "", version: "" };
+  #code = null; // the report as one, while it is shown
+  #said = "";
 
   connectedCallback() {
     this.#gone = new AbortController();
@@ -27,8 +33,11 @@ class InstrumentHealth extends HTMLElement {
 
   async #ask() {
     try {
-      const answer = await fetch("/api/health", { cache: "no-store" });
+      const [answer, status] = await Promise.all(
+        ["/api/health", "/api/status"].map((path) => fetch(path, { cache: "no-store" })),
+      );
       this.#health = answer.ok ? await answer.json() : null;
+      if (status.ok) this.#status = await status.json();
     } catch {
       this.#health = null;
     }
@@ -37,8 +46,28 @@ class InstrumentHealth extends HTMLElement {
   }
 
   #draw() {
-    render(this.#health ? view(this.#health, this.#large, this.#say) : failed(), this);
+    if (!this.#health) return render(failed(), this);
+    const told = report({ text: this.#text(), code: this.#code, said: this.#said }, this.#report);
+    return render([view(this.#health, this.#large, this.#say), told], this);
   }
+
+  #text() {
+    return reportOf(this.#health, this.#status, paintedBy());
+  }
+
+  #tell(said) {
+    this.#said = said;
+    this.#draw();
+  }
+
+  #report = {
+    copy: () => this.#tell(t(copied(this.querySelector("textarea")) ? "report.copied" : "report.notcopied")),
+    save: () => save(this.#text()),
+    code: async () => {
+      this.#code = this.#code ? null : await codeOf(this.#text());
+      this.#draw();
+    },
+  };
 
   #say = async ({ name, remedy }) => {
     this.#large = "";
@@ -62,9 +91,15 @@ function view({ ok, checks }, large, say) {
       <p>${t(ok ? "health.well" : "health.ill")}</p>
       ${ok ? nothing : html`<ul class="checks">${lines(false)}</ul>`}
     </div>
-    <ul class="checks">${lines(true)}</ul>
+    <ul class="checks">
+      ${lines(true)}
+      <li data-painter><b>${t("health.painter")}</b> <span>${paintedBy()}</span></li>
+    </ul>
   `;
 }
+
+// Which of the two painters this page has, on this tablet: cheap chips draw wrong, and then the processor does it.
+const paintedBy = () => t(studio().painter.name === "2d" ? "health.painter.2d" : "health.painter.gl");
 
 const line = (one, large, say) => html`<li data-check=${one.name} data-ok=${one.ok}>
   <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>

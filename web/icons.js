@@ -31,6 +31,12 @@ const PATHS = {
     d="M3 3l18 18M5 12.5a10 10 0 0 1 4-2.4M15.5 10.3a10 10 0 0 1 3.5 2.2M8.5 16a5 5 0 0 1 7 0M12 19.5v.1"></path>`,
 };
 
+/** Where the bright disc belongs in a picture: in its middle, or beside it, where the nose of the person is. */
+export const target = (eye, field) => html`<svg class="icon target" viewBox="0 0 24 24" aria-hidden="true" focusable="false">
+  <circle cx="12" cy="12" r="11"></circle>
+  <circle class="disc" cx=${field === "nerve" ? 12 : eye === "OD" ? 18 : 6} cy="12" r="2.5"></circle>
+</svg>`;
+
 export function icon(name) {
   return html`<svg class="icon" viewBox="0 0 24 24" aria-hidden="true" focusable="false">${PATHS[name]}</svg>`;
 }

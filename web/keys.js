@@ -11,7 +11,7 @@ export function listenToKeys(act) {
     if (event.defaultPrevented || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
     if (document.querySelector("dialog[open]") || typing(event.target)) return;
     const { route } = get();
-    if (route.screen === "find" && onFind(event, act)) return;
+    if (route.screen === "find" && onFind(event, act)) return event.preventDefault(); // a code reader's Enter is no tap
     if (SHUTTERS.has(event.key)) {
       if (route.screen !== "aim" || event.target.closest("button, a, summary, eye-pic")) return;
       event.preventDefault();
@@ -22,10 +22,10 @@ export function listenToKeys(act) {
   });
 }
 
-function onFind({ key }, act) {
+function onFind({ key, target }, act) {
   if (/^[0-9A-Za-z-]$/.test(key)) act.typeNumber(key.toUpperCase());
   else if (key === "Backspace") act.typeNumber("erase");
-  else if (key === "Enter" && get().typed) act.begin(get().typed);
+  else if (key === "Enter" && get().typed && !target.closest(".find")) act.enterNumber();
   else return false;
   return true;
 }

@@ -47,6 +47,7 @@ export const store = createStore({
   zoom: 1,
   note: "",
   picked: Object.freeze([]), // two pictures to compare
+  compared: Object.freeze([]), // what is known of these two
   folders: null, // where a visit can be copied to
   copied: null,
   outbox: null, // who waits to be sent: the Send screen

@@ -1,7 +1,7 @@
 // Pieces that several screens share: tiles, thumbnails, the words of a person, the bar and the chips of states.
 
 import { fileOf } from "./api.js";
-import { icon } from "./icons.js";
+import { icon, target } from "./icons.js";
 import { get, lostShots, slotPlan } from "./memory.js";
 import { shownStates, timeLeft, wordsOf } from "./states.js";
 import { html, nothing } from "./vendor/lit-html.js";
@@ -15,7 +15,15 @@ export const slotWords = (state, slot) => {
 // The programme may name fields that this page has never heard of; their own name is better than none.
 export const fieldWord = (field) => (has(`field.${field}`) ? t(`field.${field}`) : field);
 
-export function personWords({ number, fields }) {
+/** A person's number, an automatic one with its check digit apart, so that people who follow each other are seen to. */
+export function numberWords(number) {
+  const prefix = get().protocol?.programme?.prefix;
+  const own = prefix && number.startsWith(prefix) && /^\d{5,}$/.test(number.slice(prefix.length));
+  return own ? `${number.slice(0, -1)}-${number.slice(-1)}` : number;
+}
+
+export function personWords({ number: plain, fields }) {
+  const number = numberWords(plain);
   const sex = fields.sex ? t(`sex.${fields.sex}`) : "";
   const more = [sex, fields.age].filter(Boolean).join(", ");
   return more ? `${number} · ${more}` : number;
@@ -24,7 +32,7 @@ export function personWords({ number, fields }) {
 // ---- the four tiles: a taken picture is always shown, also a poor one, with a mark that says what it is
 
 const FACES = {
-  empty: ["circle", "tile.empty"],
+  empty: ["circle", "tile.empty"], // a field that this page knows is drawn instead
   good: ["star", "tile.good"],
   poor: ["pen", "tile.poor"],
   could_not: ["cross", "tile.could_not"],
@@ -65,7 +73,7 @@ function tile(state, act, { id, eye, field }) {
       ?disabled=${Boolean(state.visit?.finished_at) && !capture}
       @click=${() => act.chooseTile(id)}
     >
-      <span class="thumb">${capture ? thumb(capture, act) : nothing}<span class="mark">${icon(mark)}</span></span>
+      <span class="thumb">${capture ? thumb(capture, act) : nothing}<span class="mark">${face === "empty" && has(`field.${field}`) ? target(eye, field) : icon(mark)}</span></span>
       <span class="tile-word">${short}</span>
     </button>
   `;
@@ -132,7 +140,7 @@ export function choice({ label, field, value, options, choose, many = false }) {
           aria-pressed=${on(one)}
           @click=${() => choose(one)}
         >
-          ${on(one) ? icon("check") : nothing}<span>${word}</span>
+          ${icon("check")}<span>${word}</span>
         </button>`,
       )}
     </div>

@@ -136,6 +136,7 @@ const act = {
     event.preventDefault();
     const { pin, hasPin, wait } = get();
     if (wait > 0 || !pin) return;
+    if (pin.length < 4) return set({ error: { code: "pin.short", message: t("pin.short"), remedy: "" } }); // the digits stay
     await tapped(hasPin ? "/api/technician/unlock" : "/api/technician/pin", { pin }, () => set({ view: "opening" }));
     if (get().view === "opening") await look();
   },

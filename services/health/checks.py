@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from device.errors import DiffuscopeError, StoreError
 
 PEOPLE_LEFT = 10  # a morning in a village, both eyes of each
+PLENTY = 200  # the page says no number above it either: it changes with every picture, and nobody plans by it
 LATE_S = 1.0  # beside its budget a picture needs an exposure and the writing
 HOTTEST_C = 80.0  # a Raspberry Pi slows down from here
 EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # nobody had this instrument before
@@ -64,11 +65,11 @@ class Facts:
 
 def camera(facts: Facts) -> Check:
     """The head is open, plans are made, and nothing has gone wrong since the last frame."""
-    value, remedy = facts.state, ""
+    value, remedy = "open", ""
     if facts.problem is not None:
         value, remedy = facts.problem.message, facts.problem.remedy
     elif facts.state == "starting":
-        remedy = "The instrument is getting ready. Wait a minute."
+        value, remedy = "getting ready", "The instrument is getting ready. Wait a minute."
     return Check("camera", not remedy, value, "open, and nothing wrong", remedy, of_release=True)
 
 
@@ -94,7 +95,7 @@ def captures(facts: Facts) -> Check:
 def space(facts: Facts) -> Check:
     """Room for the people of a morning; what is half-kept gives its room up, so it is told and counted as free."""
     people, torn = facts.people_left, facts.torn_bytes
-    value = f"{people} people"
+    value = f"{people} people" if people <= PLENTY else f"plenty, more than {PLENTY} people"
     if torn:
         value += f"; half-kept pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
     ok = people >= PEOPLE_LEFT
@@ -135,7 +136,8 @@ def clock(facts: Facts) -> Check:
     earliest = max(EARLIEST, facts.newest or EARLIEST)
     how = "set by the network" if facts.clock_was_set else "never compared with another clock"
     value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
-    return Check("clock", facts.now >= earliest, value, limit, "Set date and time before the next picture.")
+    ok, remedy = facts.now >= earliest, "Set date and time before the next picture."
+    return Check("clock", ok, value, limit, remedy, known=facts.clock_was_set or not ok)
 
 
 def speed(facts: Facts) -> Check:

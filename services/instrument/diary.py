@@ -44,6 +44,17 @@ class Diary:
         """The newest sentences, newest first: `at`, `level`, `text`, `code`, `about` (a capture), `detail`."""
         return list(islice((entry for entry in self._newest_first() if about in (None, entry["about"])), limit))
 
+    def kept(self) -> bytes:
+        """All of it, one line of JSON for each sentence, the oldest first."""
+        return "".join(f"{json.dumps(entry)}\n" for entry in self._oldest_first()).encode()
+
+    def told(self) -> bytes:
+        """All of it as sentences, one on a line with its moment, the oldest first; details stand below, set in."""
+        return "".join(_sentence(entry) for entry in self._oldest_first()).encode()
+
+    def _oldest_first(self) -> list[dict[str, Any]]:
+        return list(self._newest_first())[::-1]
+
     def _newest_first(self) -> Iterator[dict[str, Any]]:
         for path in (self._path, *(Path(f"{self._path}.{k}") for k in range(1, FILES))):
             if not path.is_file():
@@ -53,6 +64,14 @@ class Diary:
                     yield json.loads(line)
                 except ValueError:  # a power cut tears the line that is being written
                     continue
+
+
+def _sentence(entry: dict[str, Any]) -> str:
+    """One entry for people: moment, what is the matter, sentence, code and capture in brackets."""
+    level = "" if entry["level"] == "info" else f"{entry['level'].upper()}: "
+    more = ", ".join(filter(None, (entry["code"], entry["about"])))
+    detail = "".join(f"    {line}\n" for line in (entry["detail"] or "").splitlines())
+    return f"{entry['at']}  {level}{entry['text']}{f' ({more})' if more else ''}\n{detail}"
 
 
 class _Line(logging.Formatter):

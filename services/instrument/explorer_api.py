@@ -1,4 +1,4 @@
-"""What a technician asks about accuracy and time, and about what happened lately."""
+"""What a technician asks about accuracy and time on this device."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,6 @@ from pydantic import BaseModel, ConfigDict
 from device.errors import CalibrationMissing
 from device.recon.reconstructor import Recipe
 from device.values import Calibration
-from services.instrument.diary import Diary
 from services.instrument.explorer import Explorer, Kept
 from services.instrument.pace import Pace
 from services.records.store import Store
@@ -22,9 +21,7 @@ class Choice(BaseModel):
     pace: Pace
 
 
-def explorer_routes(
-    explorer: Explorer, diary: Diary, store: Store, calibration: Callable[[], Calibration]
-) -> APIRouter:
+def explorer_routes(explorer: Explorer, store: Store, calibration: Callable[[], Calibration]) -> APIRouter:
     """Addresses under /api/technician; `calibration` says with what the head sees now."""
     router = APIRouter(prefix="/api/technician")
 
@@ -52,11 +49,6 @@ def explorer_routes(
         """A kept capture as another method makes it, with the calibration that is in force now."""
         kept = _kept(store, id, calibration())
         return Response(explorer.picture(kept, Recipe(method, bin, rounds)), media_type="image/png")
-
-    @router.get("/diary")
-    def entries(limit: int = Query(100, ge=1, le=1000), about: str | None = None) -> dict[str, Any]:
-        """What the instrument logged, newest first; `about` a capture, or everything."""
-        return {"entries": diary.entries(limit, about)}
 
     return router
 

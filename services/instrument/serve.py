@@ -22,9 +22,11 @@ from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.carrier import Carrier
 from services.instrument.diary import Diary
+from services.instrument.diary_api import diary_routes
 from services.instrument.exam import Exam
 from services.instrument.explorer import Explorer
 from services.instrument.explorer_api import explorer_routes
+from services.instrument.exporting import Sticks
 from services.instrument.forgery import own_names
 from services.instrument.owner import House, Owner, archive_of, calibrated
 from services.instrument.technician import Door
@@ -104,7 +106,8 @@ def serve(
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
         door = Door(data / "technician.json", clock)
         desk = UpdateDesk(*updater, clock, version("diffuscope"))
-        rooms = explorer_routes(explorer, diary, store, lambda: owner.exam.head.calibration), update_routes(desk, door)
+        rooms = [explorer_routes(explorer, store, lambda: owner.exam.head.calibration), update_routes(desk, door)]
+        rooms.append(diary_routes(diary, Sticks(), clock))
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms, carrier=carrier)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)

@@ -39,9 +39,15 @@ def looks_automatic(prefix: str, number: str) -> bool:
     return bool(prefix) and re.fullmatch(f"{re.escape(prefix)}[0-9]+", number, re.ASCII) is not None
 
 
+def whole(number: str) -> str:
+    """A number whose check digit stands apart, as the page shows it (A0001-3), in one piece; others as they are."""
+    apart = re.fullmatch(rf"([A-Z]+)([0-9]{{{LEAST_DIGITS},}})-([0-9])", number, re.ASCII)
+    return "".join(apart.groups()) if apart and check_digit(apart[2] + apart[3]) == "0" else number
+
+
 def tidy(number: str) -> str:
-    """A number as it is kept: capitals, no spaces around; InputError where it cannot be one."""
-    tidied = number.strip().upper()
+    """A number as it is kept: capitals, no spaces around, in one piece; InputError where it cannot be one."""
+    tidied = whole(number.strip().upper())
     if not _NUMBER.fullmatch(tidied):
         remedy = "Type up to 20 letters, digits or hyphens, or leave it empty for the next number."
         raise InputError(f"number: {number[:40]!r} is not a number of a person", remedy)

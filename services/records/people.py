@@ -58,6 +58,7 @@ class People:
         self, limit: int, day: str | None = None, open: bool | None = None, digits: str | None = None
     ) -> list[Visit]:
         """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number."""
+        digits = numbering.whole(digits.upper()) if digits else None
         with told(), Session(self.engine) as session:
             return visits.read(session, self.protocol, visits.found(session, limit, day, open, digits))
 

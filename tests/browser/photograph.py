@@ -6,6 +6,7 @@ Each language, each size, one PNG per screen and per state; `--language` and `--
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
@@ -13,87 +14,144 @@ from tests.browser.conftest import CHROMIUM, free_port
 from tests.browser.looks import SIZES
 from tests.browser.stub import Stub, Stubbed
 from tests.browser.stub_visits import unsent
-from tests.browser.test_states import CAUSES, NUMBERS, STOPS, TELLS
+from tests.browser.test_states import CAUSES, STOPS, TELLS, over, tell
+from tests.browser.walk import tap
 
 LANGUAGES = ["en", "en-XA", "ta", "hi", "te"]
 
 
+class Camera:
+    """Takes numbered photographs of one page into a folder."""
+
+    def __init__(self, page: Page, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.page, self.folder, self._count = page, folder, 0
+
+    def take(self, name: str, ready: str | None = None) -> None:
+        """As it is now, or as soon as there is what `ready` selects; a breath later, for pictures that fade in."""
+        if ready:
+            self.page.wait_for_selector(ready)
+            self.page.wait_for_timeout(500)
+        if name not in ("person-urgent", "slip"):
+            self.page.evaluate("scrollTo(0, 0)")
+        self._count += 1
+        self.page.screenshot(path=self.folder / f"{self._count:02d}-{name}.png")
+
+    def tap(self, selector: str) -> None:
+        tap(self.page, selector)
+
+
 def photograph(page: Page, stubbed: Stubbed, folder: Path) -> None:
-    """Walk through all screens, then hold every state still."""
-    stub = stubbed.stub
-    folder.mkdir(parents=True, exist_ok=True)
-    count = 0
+    """Walk through all screens, and hold every state still on the way."""
+    stub, camera = stubbed.stub, Camera(page, folder)
 
-    def take(name: str) -> None:
-        nonlocal count
-        count += 1
-        page.screenshot(path=folder / f"{count:02d}-{name}.png")
-
-    def at(place: str, mark: str) -> None:
+    def at(place: str, mark: str, name: str) -> None:
         page.goto(f"{stubbed.url}/#/{place}")
-        page.wait_for_selector(mark)
-        page.wait_for_timeout(600)
-        take(place.split("/")[2] if place.startswith("visit/") else place or "home")
+        camera.take(name, mark)
 
-    visit = stub.visits.begin(consent="agreed", sex="woman", age=54, complaints=["pain"], diabetes="yes")
-    at("", "#new")
-    at("find", ".pad")
-    at(f"visit/{visit['id']}/person", ".person")
-    at(f"visit/{visit['id']}/aim/R-centre", "eye-live[data-frame]")
+    at("", "#new", "home-empty")
+    visit = stub.visits.begin(consent="agreed", sex="woman", age=54, complaints=["flashes"], diabetes="yes")
+    at("find", ".people", "find")
+    for digit in "142":
+        page.locator(f"[data-key='{digit}']").tap()
+    camera.take("find-match", "#start:not([hidden])")
+    page.locator("[data-key='9']").tap()
+    page.locator(".people").wait_for(state="detached")
+    camera.take("find-nobody", "#start:not([hidden])")
+    at(f"visit/{visit['id']}/person", ".person", "person")
+    page.locator("[data-field=complaints] [data-value=pain]").tap()
+    page.locator(".urgent").scroll_into_view_if_needed()
+    camera.take("person-urgent")
+    page.locator("[data-field=complaints] [data-value=pain]").tap()
+    at(f"visit/{visit['id']}/aim/R-centre", "eye-live[data-frame]", "aim")
+    states(camera, stubbed)
+    camera.tap("#could-not")
+    camera.take("why", ".reasons")
+    camera.tap("#not-asked")
+    shots(camera, stub, visit)
+    after(camera, stubbed, visit, at)
+
+
+def states(camera: Camera, stubbed: Stubbed) -> None:
+    """Every stop, every chip, every hint of aiming, the menu and what can be said aloud."""
+    page, stub = camera.page, stubbed.stub
     for code in [*STOPS, *TELLS]:
-        stub.tell("notice", {"code": code, **NUMBERS})
-        page.locator(f"[data-code='{code}']").wait_for()
-        take(code)
-        stub.tell("notice", {"code": code, "over": True})
-        page.wait_for_timeout(100)
+        tell(stubbed, page, code)
+        camera.take(code)
+        over(stubbed, page, code)
     for hint in ("noeye", "closer", "left", "still"):
         stub.aim = {"code": hint, "fill": 0.5}
-        page.wait_for_timeout(900)
-        take(f"aim-{hint}")
-    shots(page, stub, take)
-    page.wait_for_timeout(500)
-    page.locator("#finish").tap()
-    page.wait_for_selector("#code")
-    page.wait_for_timeout(500)
-    page.locator("#code").tap()
-    page.wait_for_selector(".outcome > figure.code")
-    take("outcome")
+        page.locator(".prompt [data-icon], .prompt svg").first.wait_for()
+        page.wait_for_timeout(1200)
+        camera.take(f"aim-{hint}")
+    stub.aim = {"code": "ready", "fill": 0.9}
+    camera.tap("#open-menu")
+    camera.take("menu", "dialog[open]")
+    page.keyboard.press("Escape")
+
+
+def shots(camera: Camera, stub: Stub, visit: dict[str, Any]) -> None:
+    """Making, told, every cause, not clear after many tries, and good."""
+    page, slot = camera.page, visit["slots"]["R-centre"]
+    stub.hold = "verdict"
+    for cause in [*CAUSES, "poor"]:
+        slot["tries"] = 2 if cause == "poor" else 0
+        stub.verdicts = ["shot.moved" if cause == "poor" else f"shot.{cause}"]
+        camera.tap("#shutter")
+        if stub.hold:
+            camera.take("making", ".stage[data-mark=quick]")
+            stub.hold = "keep"
+            camera.take("told", "[data-phase=told]")
+            stub.hold = None
+        camera.take(f"shot-{cause}", "[data-phase=kept] .stage[data-mark=final]")
+        camera.tap("#again")
+    slot["tries"] = 0
+    camera.tap("#shutter")
+    camera.take("good", "[data-phase=kept] [data-verdict=good] #result-title")
+    camera.tap("#open-details")
+    camera.take("details", "#details[open]")
+    page.keyboard.press("Escape")
+
+
+def after(camera: Camera, stubbed: Stubbed, visit: dict[str, Any], at: Callable[[str, str, str], None]) -> None:
+    """The rest of the visit, its end, and how it is looked at later."""
+    page, stub = camera.page, stubbed.stub
+    for hold in (None, "keep"):
+        camera.tap("#next")
+        stub.hold = hold
+        camera.tap("#shutter")
+        page.wait_for_selector("[data-phase=told]" if hold else "[data-phase=kept] .stage[data-mark=final]")
+    camera.tap("#finish")
+    camera.take("finishing", "#finishing progress")
+    stub.hold = None
+    camera.take("outcome", "#done")
+    camera.tap("#code")
+    camera.take("outcome-code", ".outcome > figure.code")
     page.emulate_media(media="print")
-    take("slip")
+    camera.take("slip")
     page.emulate_media(media="screen")
     stub.sending = True
     stub.unsent = [unsent(visit, code, 3) for code in ("send.refused", "send.link")] + [unsent(visit)]
-    for place, mark in (("", "#send"), ("send", ".send .people li"), (f"visit/{visit['id']}/outcome", "#by-itself")):
-        at(place, mark)
-    at("history", ".history [data-visit]")
-    at(f"visit/{visit['id']}/film", ".film li")
-    ids = visit["slots"]["R-centre"]["captures"][:2]
-    at(f"visit/{visit['id']}/compare/{ids[0]}/{ids[1]}", ".two [data-mark=final]")
-
-
-def shots(page: Page, stub: Stub, take: Callable[[str], None]) -> None:
-    """Making, told, and every cause."""
-    for cause in [*CAUSES, None]:
-        stub.visits.kept["v142"]["slots"]["R-centre"]["tries"] = 2 if cause is None else 0
-        stub.verdicts = [f"shot.{cause}" if cause else "shot.moved"]
-        stub.refine_s = 2.0 if cause == CAUSES[0] else 0.1
-        page.wait_for_timeout(500)
-        page.locator("#shutter").tap()
-        if cause == CAUSES[0]:
-            page.wait_for_selector(".stage[data-mark=quick]")
-            take("making")
-            page.wait_for_selector("[data-phase=told]")
-            take("told")
-        page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
-        page.wait_for_timeout(300)
-        take(f"shot-{cause or 'poor'}")
-        page.wait_for_timeout(300)
-        page.locator("#again").tap()
-    stub.verdicts = []
-    page.wait_for_timeout(500)
-    page.locator("#shutter").tap()
-    page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
-    take("good")
+    at("", "#send", "home-sending")
+    at("send", ".send .people li", "send")
+    at(f"visit/{visit['id']}/outcome", "#by-itself", "outcome-sending")
+    stub.sending = False
+    declined = stub.visits.begin(consent="declined")
+    at(f"visit/{declined['id']}/person", ".person", "declined")
+    camera.tap("#finish")
+    camera.take("outcome-refer", ".outcome")
+    stub.visits.begin(consent="agreed", sex="man", age=61)
+    at("", "#continue", "home")
+    at("history", ".history [data-visit]", "history")
+    at(f"visit/{visit['id']}/film", ".film li", "film")
+    for pick in page.locator(".pick").all()[:2]:
+        pick.tap()
+    camera.tap("#copy")
+    camera.take("film-picked", "[data-folder]")
+    camera.tap("#compare")
+    camera.take("compare", ".two figure:last-child [data-mark=final]")
+    page.locator("[data-value=true]").tap()
+    camera.take("compare-over", "#swap")
 
 
 def main() -> None:

@@ -72,6 +72,7 @@ def test_letters_that_are_switched_off_do_nothing_and_the_shutter_keys_still_wor
 ) -> None:
     page = aiming(open_page, stub, has_touch=False, is_mobile=False)
     strike(page, "#open-menu", back=True)
+    strike(page, "#menu summary")
     strike(page, "#letters", "Space")
     page.keyboard.press("Escape")
     reach(page, SHUTTER)

@@ -69,8 +69,9 @@ def test_axe_finds_nothing_while_a_picture_is_made_and_told(open_page: Open, stu
     tap(page, "#again")
     taken(page)
     looked.at("good", "[data-verdict=good]")
-    page.get_by_text("Details").tap()
-    looked.at("details", "details[open]")
+    tap(page, "#open-details")
+    looked.at("details", "#details[open]")
+    page.keyboard.press("Escape")
     stub.stub.verdicts = ["shot.dark"]
     stub.stub.visits.kept["v142"]["slots"]["R-centre"]["tries"] = 3
     tap(page, "#again")

@@ -189,8 +189,9 @@ def test_an_old_live_picture_says_its_age(open_page: Open, stub: Stubbed) -> Non
 def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, stub: Stubbed) -> None:
     stub.stub.warnings = ["The frame was partly saturated."]
     page = aiming(open_page, stub)
-    page.locator(SHUTTER).tap()
-    expect(page.locator(".card")).to_contain_text("partly saturated")
+    taken(page)
+    page.get_by_role("button", name="Details: with a warning").tap()
+    expect(page.locator("#details")).to_contain_text("partly saturated")
 
 
 def test_silence_is_a_lost_link_and_the_shutter_says_so(open_page: Open, stub: Stubbed) -> None:
@@ -221,6 +222,7 @@ def test_the_theme_is_chosen_in_the_menu_and_remembered(open_page: Open, stub: S
 def test_letter_keys_can_be_switched_off(open_page: Open, stub: Stubbed) -> None:
     page = aiming(open_page, stub)
     page.get_by_role("button", name="Menu").tap()
+    page.get_by_text("Keys", exact=True).tap()
     page.locator("#letters").uncheck()
     page.get_by_role("button", name="Close").tap()
     taken(page)

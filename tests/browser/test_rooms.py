@@ -1,6 +1,7 @@
 """The technician's other rooms on the real server: health, accuracy against time, the diary."""
 
 import json
+import re
 import shutil
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -151,3 +152,39 @@ def test_the_diary_tells_what_happened_in_sentences(inside: Page) -> None:
     assert "a picture was kept after" in said
     assert "started, version" in said
     assert faults(inside, ".diary li") == []
+
+
+def test_the_diary_is_read_of_one_picture_and_taken_away(inside: Page) -> None:
+    stick = {"id": "/media/BLUE", "name": "BLUE", "free_bytes": 10**9}
+    inside.route("**/api/exports", lambda route: route.fulfill(json={"folders": [stick]}))
+    inside.route("**/diary/export", lambda route: route.fulfill(json={"folder": "diary-2026-11-22"}))
+    enter(inside, "diary")
+    with inside.expect_download() as saved:
+        inside.get_by_role("link", name="Save as a file").tap()
+    assert "a picture was kept after" in Path(saved.value.path()).read_text()
+    inside.get_by_role("button", name="Copy to USB").tap()
+    with inside.expect_request("**/diary/export") as asked:
+        inside.get_by_role("button", name="BLUE").tap()
+    assert asked.value.post_data_json == {"folder": "/media/BLUE"}
+    expect(inside.get_by_role("note")).to_have_text("Copied to BLUE/diary-2026-11-22.")
+    entry = inside.locator(".diary li", has_text="a picture was kept after")
+    entry.get_by_text("More").tap()
+    entry.get_by_role("button", name="Only this picture").tap()
+    expect(inside.get_by_text("Only what is about")).to_be_visible()
+    expect(inside.locator(".diary li", has_text="started, version")).to_have_count(0)
+    inside.get_by_role("button", name="Everything").tap()
+    expect(inside.locator(".diary li", has_text="started, version").first).to_be_visible()
+
+
+def test_the_report_is_copied_saved_and_shown_as_a_code(inside: Page) -> None:
+    enter(inside, "health")
+    text = inside.get_by_label("Report for whoever helps")
+    expect(text).to_have_value(re.compile(r"ok  Lamp: dark\n.*drawn by: the \w+", re.DOTALL))
+    with inside.expect_download() as saved:
+        inside.locator("#report-save").tap()
+    assert "ok  Pictures: safe" in Path(saved.value.path()).read_text()
+    inside.locator("#report-copy").tap()
+    expect(inside.get_by_role("note")).to_have_text("Copied.")
+    inside.locator("#report-code").tap()
+    expect(inside.get_by_role("img", name="The report as a code for a telephone")).to_be_visible()
+    assert faults(inside, ".report svg") == []

@@ -242,15 +242,15 @@ def test_a_limit_of_light_offers_no_other_eye_where_nobody_aims(open_page: Open,
 def test_a_picture_of_the_other_eye_is_moved_by_hand_and_back(open_page: Open, stub: Stubbed) -> None:
     page = aiming(open_page, stub)
     taken(page)
-    page.locator("summary").tap()
+    tap(page, "#open-details")
     expect(page.locator("#other-eye")).to_have_text("It is the left eye")
     assert look_for_faults(page) == []
     tap(page, "#other-eye")
     expect(page.locator("[data-slot='L-centre']")).to_have_attribute("data-face", "good")
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "empty")
     expect(page.locator("[data-slot='L-centre']")).to_have_attribute("aria-current", "step")
-    if not page.locator("#other-eye").is_visible():
-        page.locator("summary").tap()
+    expect(page.locator("#details")).to_be_hidden()
+    tap(page, "#open-details")
     tap(page, "#other-eye")
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "good")
     assert stub.stub.captures[0]["eye"] == "OD"

@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from device.errors import InputError
-from services.records.numbering import check_digit, is_checked, looks_automatic, numbered, tidy
+from services.records.numbering import check_digit, is_checked, looks_automatic, numbered, tidy, whole
 from services.records.protocol import VISIONS, load_protocol
 from services.records.visit import Decided, SlotState, Taken, decided_after, outcome
 
@@ -22,6 +22,14 @@ def test_an_automatic_number_is_checked_and_tidy(prefix: str, counter: int) -> N
     assert is_checked(prefix, number)
     assert tidy(f" {number.lower()} ") == number
     assert looks_automatic(prefix, number) == bool(prefix)
+
+
+@given(st.from_regex("[A-Z]{1,4}", fullmatch=True), counters)
+def test_a_number_with_its_check_digit_apart_is_the_same_number(prefix: str, counter: int) -> None:
+    number = numbered(prefix, counter)
+    assert tidy(f"{number[:-1]}-{number[-1]}".lower()) == number
+    wrong = f"{number[:-1]}-{(int(number[-1]) + 1) % 10}"
+    assert whole(wrong) == wrong
 
 
 @given(counters, st.integers(0, 20), st.integers(1, 9))

@@ -65,6 +65,11 @@ def test_a_picture_is_as_slow_as_somebody_wished() -> None:
     assert judged(replace(WELL, presses=[(30.8, 0.8)] * 100))[SPEED].ok
 
 
+def test_a_number_of_people_that_nobody_plans_by_is_not_told() -> None:
+    told = [check.value for n in (200, 201) for check in judged(replace(WELL, people_left=n)) if check.name == "space"]
+    assert told == ["200 people", "plenty, more than 200 people"]
+
+
 def test_what_is_half_kept_is_told_with_the_room_that_is_left() -> None:
     space = next(check for check in judged(replace(WELL, torn_bytes=[9_500_000, 1])) if check.name == "space")
     assert (space.ok, space.value) == (True, "100 people; half-kept pictures aside: 2, 10 MB")
@@ -74,7 +79,7 @@ def test_parts_that_a_head_does_not_have_are_no_failure() -> None:
     bare = replace(WELL, battery=None, head_c=None, computer_c=None, newest=None, presses=[], unsent=None)
     checks = judged(bare)
     assert all(check.ok for check in checks)
-    assert [check.name for check in checks if not check.known] == ["battery", "heat", "speed", "sending"]
+    assert [check.name for check in checks if not check.known] == ["battery", "heat", "clock", "speed", "sending"]
 
 
 def test_an_update_is_judged_by_what_a_release_can_break_and_not_by_a_battery() -> None:

@@ -1,5 +1,6 @@
 """The diary: sentences that outlive a start, in their order, whatever tears its last line."""
 
+import json
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,3 +69,17 @@ def test_what_libraries_say_is_not_in_it_and_nothing_is_kept_after_the_end(tmp_p
     diary.close()
     log.info("too late")
     assert diary.entries(9) == []
+
+
+def test_the_whole_of_it_is_told_oldest_first_with_what_went_wrong_set_in(diary: Diary) -> None:
+    log.info("a picture was kept", extra={"about": "20260101T000000-OD-abc"})
+    try:
+        raise KeyError("psf")
+    except KeyError:
+        log.exception("the head stopped", extra={"code": "camera.missing"})
+    kept, stopped, *trace = diary.told().decode().splitlines()
+    assert kept.endswith("  a picture was kept (20260101T000000-OD-abc)")
+    assert stopped.endswith("  ERROR: the head stopped (camera.missing)")
+    assert all(line.startswith("    ") for line in trace)
+    assert "KeyError: 'psf'" in trace[-1]
+    assert [json.loads(line) for line in diary.kept().splitlines()] == diary.entries(10)[::-1]

@@ -10,12 +10,16 @@ export function aim(state, act) {
   const { eye, part } = slotWords(state, state.route.slot);
   if (state.asking) return html`<h2 class="slot-title">${eye} · ${part}</h2> ${reasons(state, act)} ${tiles(state, act)}`;
   const answered = Object.values(state.visit?.slots ?? {}).every((slot) => slot.state !== "empty");
+  const here = state.visit?.slots[state.route.slot];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
     ${tiles(state, act)} ${state.later.aloud?.toSay(state) ?? nothing} ${chips(state, act)}
     <div class="actions">${shutter(state, act)}</div>
     <div class="last finish">
-      ${state.visit?.slots[state.route.slot]?.state === "could_not"
+      ${here?.capture
+        ? html`<button class="quiet" type="button" id="keep-old" @click=${act.keepOld}>${icon("check")} ${t("aim.keep")}</button>`
+        : nothing}
+      ${here?.state === "could_not"
         ? nothing
         : html`<button class="quiet" type="button" id="could-not" @click=${act.ask}>${icon("cross")} ${t("result.couldnot")}</button>`}
       <button class=${answered ? "primary" : "quiet"} type="button" id="finish" @click=${act.finish}>

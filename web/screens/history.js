@@ -4,9 +4,9 @@ import { zipOf } from "../api.js";
 import { people } from "./home.js";
 import { ending, openAgain } from "./outcome.js";
 import { icon } from "../icons.js";
-import { choice, slotWords, thumb } from "../parts.js";
+import { choice, numberWords, slotWords, thumb } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, dayName, t, today } from "../words.js";
+import { calendarDay, clockTime, dayName, t, today } from "../words.js";
 
 const KEEP = {
   all: () => true,
@@ -55,7 +55,7 @@ export function film(state, act) {
   const taken = Object.entries(visit.slots).flatMap(([slot, { captures }]) => captures.map((id) => ({ slot, id })));
   return html`
     <section class="film">
-      <h2>${t("film.title", { number: visit.number })}</h2>
+      <h2>${t("film.title", { number: numberWords(visit.number) })}</h2>
       ${visit.outcome ? html`<p>${ending(state).filter(Boolean).join(" · ")}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       <div class="ends">
@@ -67,7 +67,7 @@ export function film(state, act) {
         ${visit.finished_at
           ? openAgain(visit, act)
           : html`<button type="button" @click=${() => act.resume(visit)}>
-              ${t("home.continue", { number: visit.number })}
+              ${t("home.continue", { number: numberWords(visit.number) })}
             </button>`}
       </div>
       ${taken.length ? away(state, act) : nothing}
@@ -82,13 +82,18 @@ function nameOf(state, id) {
   return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotWords(state, slot), n: captures.indexOf(id) + 1 });
 }
 
+/** Of several tries: whether this is the one that counts. */
+const isUsed = ({ visit }, id) =>
+  Object.values(visit?.slots ?? {}).some(({ capture, captures }) => capture === id && captures.length > 1);
+const used = (state, id) =>
+  isUsed(state, id) ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing;
+
 function frame(state, act, { slot, id }) {
   const on = state.picked.includes(id);
-  const used = state.visit.slots[slot].capture === id && state.visit.slots[slot].captures.length > 1;
   return html`<li>
     <button type="button" class="open" data-id=${id} @click=${() => act.openPicture(slot, id)}>
       <span class="thumb">${thumb(id, act)}</span> <span>${nameOf(state, id)}</span>
-      ${used ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing}
+      ${used(state, id)}
     </button>
     <button type="button" class="pick" aria-pressed=${on} @click=${() => act.pick(id)}>
       ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
@@ -116,7 +121,7 @@ function away({ visit, folders, copied }, act) {
 // ---- two pictures: side by side, or one over the other
 
 export function compare(state, act) {
-  const { blink, redfree, loupe } = state;
+  const { blink, redfree, loupe, route, front = 0 } = state;
   return html`
     <section class="compare" ?data-blink=${blink}>
       <div class="ends">
@@ -129,13 +134,13 @@ export function compare(state, act) {
           ],
           choose: act.setBlink,
         })}
-        ${blink
-          ? html`<button class="primary" type="button" id="swap" @click=${act.swap}>
-              ${t("compare.swap")}
-            </button>`
-          : nothing}
         <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(!redfree)}>${t("tool.redfree")}</button>
         <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => act.setLoupe(!loupe)}>${t("tool.loupe")}</button>
+        ${blink
+          ? html`<button class="primary" type="button" id="swap" @click=${act.swap}>
+              ${t("compare.swap", { name: nameOf(state, front ? route.capture : route.other) })}
+            </button>`
+          : nothing}
       </div>
       <div class="two">${[0, 1].map((i) => side(state, act, i))}</div>
     </section>
@@ -145,8 +150,9 @@ export function compare(state, act) {
 function side(state, act, i) {
   const { route, status, blink, front = 0, redfree, loupe } = state;
   const id = [route.capture, route.other][i];
+  const taken = state.compared.find((one) => one.id === id);
   return html`<figure class=${blink && i !== front ? "behind" : ""}>
-    <figcaption>${nameOf(state, id)}</figcaption>
+    <figcaption><b>${nameOf(state, id)}</b> ${taken ? clockTime(taken.taken_at) : nothing} ${used(state, id)}</figcaption>
     <eye-pic
       aria-label=${nameOf(state, id)}
       .head=${status}

@@ -1,7 +1,7 @@
 // Home: one big button, what is unfinished, how the day went, the language. Find: a number pad and today's people.
 
 import { icon } from "../icons.js";
-import { choice, pad, personWords } from "../parts.js";
+import { choice, numberWords, pad, personWords } from "../parts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { clockTime, LANGUAGES, t } from "../words.js";
 
@@ -13,7 +13,7 @@ export function home(state, act) {
       <button class="primary big" type="button" id="new" @click=${() => act.begin()}>${icon("person")} ${t("home.new")}</button>
       ${left
         ? html`<button class="big" type="button" id="continue" @click=${() => act.resume(left)}>
-            ${icon("next")} <span>${t("home.continue", { number: left.number })}</span>
+            ${icon("next")} <span>${t("home.continue", { number: numberWords(left.number) })}</span>
           </button>`
         : nothing}
       <div class="pair">
@@ -52,28 +52,34 @@ function languages({ language }, act) {
 }
 
 export function find({ typed, visits }, act) {
-  const found = (visits ?? []).filter((visit) => visit.number.includes(typed)).slice(0, 20);
+  const found = (visits ?? []).filter(({ number }) => number.includes(typed) || numberWords(number).includes(typed)).slice(0, 20);
+  const [one] = typed ? found : [];
   return html`
     <section class="find">
       <div>
         <h2>${t("find.title")}</h2>
         <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
         ${pad(act.typeNumber)}
-        <button class=${found.length ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
+        ${one
+          ? html`<button class="primary" type="button" id="open-found" @click=${() => act.resume(one)}>
+              ${t("find.open.one", { number: numberWords(one.number) })}
+            </button>`
+          : html`<p class="no-match" aria-live="polite">${typed && visits ? t("find.nomatch", { number: typed }) : "\u00a0"}</p>`}
+        <button class=${one ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
           ${t("find.start", { number: typed })}
         </button>
         <p class="muted">${t("find.scan")}</p>
       </div>
       <div>
-        <h2>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
-        ${found.length ? people(found, act.resume) : html`<p class="muted">${t("find.none")}</p>`}
+        <h2 ?hidden=${typed && !found.length}>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
+        ${found.length ? people(found, act.resume) : typed ? nothing : html`<p class="muted">${t("find.none")}</p>`}
       </div>
     </section>
   `;
 }
 
-/** A tick is for what needs nobody's care today. */
-export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "check");
+/** A referral needs care, pictures go on to somebody: a tick would say that it is done. */
+export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "next");
 
 export function people(visits, open) {
   return html`

@@ -3,7 +3,7 @@
 import { markOf } from "./home.js";
 import { icon } from "../icons.js";
 import { underway } from "../memory.js";
-import { personWords, slotWords, tiles } from "../parts.js";
+import { numberWords, personWords, slotWords, tiles } from "../parts.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../words.js";
 
@@ -14,9 +14,9 @@ export function outcome(state, act) {
   if (!visit.outcome) return notYet(act, visit);
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
-      <h2>${t("outcome.title", { number: visit.number })}</h2>
+      <h2>${t("outcome.title", { number: numberWords(visit.number) })}</h2>
       <p class="verdict">${icon(markOf(visit.outcome))} ${ending(state)[0]}</p>
-      <p>${ending(state)[1]}</p>
+      <p>${ending(state)[1]} ${state.status?.sending || visit.outcome.code !== "send" ? nothing : t("outcome.copy")}</p>
       ${state.status?.sending ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, act)}
       <div class="ends">
         <button type="button" id="print" @click=${act.print}>${t("outcome.print")}</button>
@@ -59,14 +59,16 @@ function notYet(act, visit) {
   return html`<section class="outcome">
     <h2>${t("outcome.open")}</h2>
     <button class="primary big" type="button" @click=${() => act.resume(visit)}>
-      ${t("home.continue", { number: visit.number })}
+      ${t("home.continue", { number: numberWords(visit.number) })}
     </button>
   </section>`;
 }
 
 /** How it ends: the instrument's sentence, which is English; in another language that language's word comes before it. */
-export const ending = ({ visit, language }) =>
-  language === "en" ? [visit.outcome.sentence, ""] : [t(`outcome.${visit.outcome.code}`), visit.outcome.sentence];
+export const ending = ({ visit: { outcome: { code, sentence } }, language }) => {
+  if (language === "en") return [sentence, ""];
+  return [t(`outcome.${code}`), code === "send" ? "" : sentence]; // of pictures that are kept it says no more
+};
 
 /** What the code says: number, date, outcome, telephone of the centre. Never a picture, a name or an age. */
 export function codeText({ visit, protocol }) {

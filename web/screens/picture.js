@@ -17,6 +17,7 @@ export function picture(state, act) {
     ${card(state, act, shot)} ${state.picture === "none" ? nothing : tools(state, act)} ${tiles(state, act)}
     ${chips(state, act)}
     <div class="actions">${actions(state, act, shot)}</div>
+    ${shot.capture ? (state.later.details?.sheet(state, act, shot) ?? nothing) : nothing}
     ${state.visit?.finished_at || complete(state, shot)
       ? nothing
       : html`<button class="quiet finish" type="button" id="finish" @click=${act.finish}>${t("finish.now")}</button>`}
@@ -35,31 +36,37 @@ function triesOf({ visit }, shot) {
 const exhausted = (state, shot) =>
   shot.verdict?.code === "shot.poor" || triesOf(state, shot) > (state.protocol?.retakes ?? 2);
 
-// ---- the card
+// ---- the card: as tall with a verdict as without, so that what stands under it stays where it is
 
 function card(state, act, shot) {
-  if (!shot.verdict && !shot.over) return makingCard(state, shot);
+  if (!shot.verdict && !shot.over) return makingCard(shot);
   const side = state.states.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
   const [name, word, text] = verdictWords(state, shot);
-  const warnings = shot.capture?.report?.warnings ?? [];
   return html`
     <div class="card" data-verdict=${shot.verdict?.word ?? "none"} data-code=${shot.verdict?.code ?? shot.failed?.code ?? ""}>
       <div class="heading">
         <h2 tabindex="-1" id="result-title">${icon(name)} ${word}</h2>
-        ${which(state, shot)}
+        ${timer(state, act, shot) ?? (shot.capture ? detailsButton(act, shot.capture) : nothing)}
       </div>
       <p>${text}</p>
       ${side ? html`<p class="ask">${wordsOf(side)} ${side.buttons.map((one) => does(side, one, act))}</p>` : nothing}
-      ${shot.over ? nothing : html`${bar(shot)} <p class="muted">${t("make.goon")}</p>`}
-      ${timer(state, act, shot)} ${warnings.map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
-      ${shot.capture ? details(state, act, shot) : nothing}
+      ${shot.over ? nothing : bar(shot)}
     </div>
   `;
 }
 
+function detailsButton(act, { report }) {
+  const warned = report?.warnings?.length;
+  return html`<button class="quiet" type="button" id="open-details" aria-haspopup="dialog" @click=${act.openDetails}>
+    ${warned ? icon("warn") : nothing} ${t(warned ? "result.details.warn" : "result.details")}
+  </button>`;
+}
+
 function verdictWords(state, shot) {
   if (shot.failed) return ["warn", t("verdict.again"), wordsOf(shot.failed)];
-  if (shot.verdict?.word === "good") return ["star", t("verdict.good"), t("verdict.good.what")];
+  if (shot.verdict?.word === "good") {
+    return ["star", t("verdict.good"), [t("verdict.good.what"), shot.over ? "" : t("make.goon")].join(" ")];
+  }
   if (!shot.verdict) return ["check", t("verdict.none"), ""];
   if (exhausted(state, shot)) return ["pen", t("verdict.again"), wordsOf({ code: "shot.poor", n: triesOf(state, shot) })];
   const cause = STATES[shot.verdict.code] ? wordsOf({ code: shot.verdict.code }) : "";
@@ -67,28 +74,20 @@ function verdictWords(state, shot) {
 }
 
 function timer(state, act, shot) {
-  if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return nothing;
+  if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return null;
   const left = timeLeft(state.timer);
   return left
     ? html`<p class="clock">${left}</p>`
     : html`<button type="button" data-do="timer" @click=${() => act.stateDo("timer")}>${icon("wait")} ${t("do.timer")}</button>`;
 }
 
-function which(state, shot) {
-  const { eye, part } = slotWords(state, shot.slot);
-  return html`<p class="muted">${eye} · ${part}</p>`;
-}
-
-function makingCard(state, shot) {
+function makingCard(shot) {
   const left = Math.round(shot.stage.left); // 0: not known, and then nothing is promised
   const words = { expose: "make.expose", keep: "make.keep" };
   const promise = left >= 1 ? t("make.left", { n: left }) : shot.stage.fraction >= 0.9 ? t("make.soon") : "\u00a0";
   return html`
     <div class="card making">
-      <div class="heading">
-        <h2>${t(words[shot.stage.name] ?? "make.refine")}</h2>
-        ${which(state, shot)}
-      </div>
+      <div class="heading"><h2>${t(words[shot.stage.name] ?? "make.refine")}</h2></div>
       <p class="muted">${promise}</p>
       ${bar(shot)}
     </div>
@@ -97,37 +96,9 @@ function makingCard(state, shot) {
 
 const bar = ({ stage }) => html`<progress max="1" .value=${stage.fraction} aria-label=${t("make.progress")}></progress>`;
 
-// For the technician: how the picture was made, the files to take away; and for who took it of the wrong eye.
-function details({ grey, visit }, act, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
-  const total = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
-  const rows = [
-    ["method", report.method],
-    ["rounds", report.rounds],
-    ["stopped", report.stopped],
-    ["seconds", t("detail.seconds.value", { s: number(total, 2) })],
-    ["calibration", calibration],
-    ["id", id],
-  ];
-  return html`
-    <details>
-      <summary>${t("result.details")}</summary>
-      ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
-      <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
-      <p class="links">
-        ${visit?.finished_at
-          ? nothing
-          : html`<button type="button" id="other-eye" @click=${() => act.otherEyeIs(slot, id)}>
-              ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
-            </button>`}
-        ${["picture", "raw", "report"].map((key) => html`<a href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
-      </p>
-    </details>
-  `;
-}
-
 // ---- tools
 
-function tools({ redfree, brightness, contrast, loupe, zoom, grey }, act) {
+function tools({ redfree, brightness, contrast, loupe, zoom }, act) {
   const step = (tool, label, by) => html`
     <div class="step" role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -142,7 +113,7 @@ function tools({ redfree, brightness, contrast, loupe, zoom, grey }, act) {
       <div class="pair">
         ${[false, true].map(
           (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => act.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : grey ? "tool.plain" : "tool.colour")}
+            ${t(on ? "tool.redfree" : "tool.plain")}
           </button>`,
         )}
       </div>

@@ -57,8 +57,10 @@ function sourceOf(shot) {
 function prompt(state, act) {
   const stop = standing(state);
   const [tone, name, text] = stop ? ["stop"] : promptOf(state);
+  const { eye, part } = slotWords(state, state.route.slot);
+  const title = state.route.screen === "picture" && eye ? html`<b class="title">${eye} · ${part}</b> ` : "";
   return html`<div class="prompt" role="status" data-tone=${tone}>
-    ${stop ? stateBar(stop, act) : html`${icon(name)} <span>${text}</span>`}
+    ${stop ? stateBar(stop, act) : html`${icon(name)} <span>${title}${text}</span>`}
   </div>`;
 }
 
