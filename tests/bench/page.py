@@ -191,7 +191,7 @@ def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
             lasted.append(first(noted, "kept") - tapped)
             frames.append(sum(name == "live" for name, *_ in noted))
         anew(page, url)
-    head(f"going on while that of a large sensor is refined, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
+    head(f"going on while it is refined, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
     show("tap to the next screen", answers, 0.1)
     show("longest time without a live picture", gaps, 1.0)
     show("  how long the picture was still made", lasted)
