@@ -13,7 +13,7 @@ from tests.browser.conftest import CHROMIUM, free_port
 from tests.browser.looks import SIZES
 from tests.browser.stub import Stub, Stubbed
 from tests.browser.stub_visits import unsent
-from tests.browser.test_states import CAUSES, NUMBERS, STOPS, TELLS
+from tests.browser.test_states import CAUSES, STOPS, TELLS, over, tell
 
 LANGUAGES = ["en", "en-XA", "ta", "hi", "te"]
 
@@ -41,10 +41,9 @@ def photograph(page: Page, stubbed: Stubbed, folder: Path) -> None:
     at(f"visit/{visit['id']}/person", ".person")
     at(f"visit/{visit['id']}/aim/R-centre", "eye-live[data-frame]")
     for code in [*STOPS, *TELLS]:
-        stub.tell("notice", {"code": code, **NUMBERS})
-        page.locator(f"[data-code='{code}']").wait_for()
+        tell(stubbed, page, code)
         take(code)
-        stub.tell("notice", {"code": code, "over": True})
+        over(stubbed, page, code)
         page.wait_for_timeout(100)
     for hint in ("noeye", "closer", "left", "still"):
         stub.aim = {"code": hint, "fill": 0.5}
