@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 
 LOOK_S = 1.0
 FIRST_S, LAST_S = 60.0, 3600.0  # between tries: doubled from one to the other
+MOST_DOUBLED = 10  # a link may fail for months
 SPREAD = 0.2  # of a wait, by chance: after a power cut not every device of a district asks at once
 GLANCE_S = 0.1
 HUNG_UP_S = 20.0  # no receiver waits longer for the next piece
@@ -114,23 +115,23 @@ class Sender:
             return False
         except (SendUnreachable, SendUntrusted, SendLocked) as error:
             if not self._closing.is_set():
-                self._fail(self.outbox.waiting(parked=PARKED), error)
+                self._fail(first[0], error, self.outbox.waiting(parked=PARKED))
                 self._put_off()
         except OWN as error:
-            self._fail(first, error)
+            self._fail(first[0], error, first)
         else:
             self._fails = 0
             self.outbox.arrived(first[0], receipt)
             log.info("sent, and seen at the receiver by its %s", receipt.confirmed, extra={"about": first[0].visit})
         return True
 
-    def _fail(self, which: list[Waiting], error: DiffuscopeError) -> None:
-        log.warning("not sent: %s", error, extra={"code": error.code, "about": which[0].visit})
+    def _fail(self, one: Waiting, error: DiffuscopeError, which: list[Waiting]) -> None:
+        log.warning("not sent: %s", error, extra={"code": error.code, "about": one.visit})
         self.outbox.failed(which, error)
 
     def _put_off(self) -> None:
         wait_s = min(FIRST_S * 2.0**self._fails, LAST_S)
-        self._fails += 1
+        self._fails = min(self._fails + 1, MOST_DOUBLED)
         self._due_s = self._clock.now_s() + wait_s * (1.0 - SPREAD * self._chance())
 
     def _pause(self) -> None:

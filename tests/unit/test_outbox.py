@@ -326,6 +326,27 @@ def test_one_whose_picture_is_damaged_keeps_nobody_else(shelf: Shelf) -> None:
     assert mine.standing()["send.stuck"]["n"] == 1
 
 
+def test_a_link_may_fail_for_months(shelf: Shelf) -> None:
+    mine = sender(shelf, Van([LINK]))
+    for _ in range(1100):  # 2.0 ** 1024 is no number
+        mine._put_off()
+    assert mine.wait_s == LAST_S
+    shelf.clock.sleep(LAST_S)
+    shelf.finished()
+    assert mine.step()
+    assert mine.wait_s == LAST_S
+
+
+def test_one_that_is_opened_again_while_the_link_fails_is_no_trouble(shelf: Shelf) -> None:
+    visit = shelf.finished()
+    mine = sender(shelf, Van([LINK], between=lambda: shelf.reopen(visit)))
+    assert mine.step()
+    assert mine.standing() == {}
+    shelf.clock.sleep(FIRST_S)
+    shelf.finish(visit)
+    assert shelf.outbox.waiting()[0].tries == 0
+
+
 def test_try_now_does_not_wait(shelf: Shelf) -> None:
     shelf.finished()
     mine = sender(shelf, Van([LINK]))
