@@ -17,6 +17,7 @@ from device.values import Eye, Image, Mask
 SAMPLES_PER_DEG = 4.0  # of the small copy, at least; a vein is 0.4 deg wide
 LEAST_PER_DEG = 3.0  # coarser pictures show no vessels
 COARSE_PER_DEG = 2.0  # for what is as large as a disc or a macula
+BESIDE_DEG = 4.0  # above and below a disc's middle, where its vessels have left it
 FOVEA_DEG = (2.0, -15.0)  # from the disc of a right eye: down, right
 ABOUT_DEG = 2.5  # how far from there the macula may be: eyes differ, and heads are held aslant
 DISC_DEG = 5.0  # what is farther from the disc's middle is another thing
@@ -76,7 +77,8 @@ def laterality(picture: Image, px_per_deg: float, field_deg: float) -> Lateralit
 
     `picture` is linear, float32 (rows, cols), upright and not mirrored, zero or anything outside the field.
     """
-    if px_per_deg < LEAST_PER_DEG or not np.isfinite(picture).all():
+    narrow = min(picture.shape) < px_per_deg * field_deg / 2
+    if narrow or px_per_deg < LEAST_PER_DEG or not np.isfinite(picture).all():
         return Laterality(None, 0.0)
     n = max(1, int(px_per_deg / SAMPLES_PER_DEG))
     right, left = (signs(_small(seen, n), px_per_deg / n, field_deg) for seen in (picture, picture[:, ::-1]))
@@ -94,9 +96,10 @@ def signs(picture: Image, per_deg: float, field_deg: float) -> Signs:
     field = (away < field_deg / 2 - RIM_DEG / 2).astype(np.float32)
     level = max(float(picture[field > 0].mean(dtype=np.float64)), FAINT)
     logs = np.clip(np.log(np.maximum(picture / np.float32(level), np.float32(0.05))), -1.5, 1.5) * field
+    spot = 2 * max(1, round(0.35 * per_deg)) + 1
+    logs = ndimage.grey_opening(logs, size=(spot, spot)) * field  # exudates are bright dots, dark between them
     vessels = _upright_vessels(logs, away < field_deg / 2 - 1.5 * RIM_DEG, per_deg)
-    wide = 2 * max(1, round(0.35 * per_deg)) + 1
-    filled = ndimage.grey_closing(logs, size=(wide, wide)) * field  # vessels are narrower, and dark
+    filled = ndimage.grey_closing(logs, size=(spot, spot)) * field  # vessels are narrower, and dark
 
     m = max(1, round(per_deg / COARSE_PER_DEG))
     weight, per_deg = _small(field, m), per_deg / m
@@ -145,7 +148,10 @@ def _flat(logs: Image, weight: Image, per_deg: float) -> Image:
 
 
 def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
-    """How many dark lines run up and down through a place or a little beside it; 1 is as many as everywhere."""
+    """How many dark lines run up and down above and below a place, as out of a disc; 1 is as many as everywhere.
+
+    In the place itself they are not asked for: what shines in patches is dark between them.
+    """
     sigma = max(0.25 * per_deg, 1.0)
     down, across, both = (
         ndimage.gaussian_filter(logs, sigma, order=order, mode="constant") for order in ((2, 0), (0, 2), (1, 1))
@@ -153,9 +159,13 @@ def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
     bend = np.hypot((down - across) / 2, both)
     line = np.maximum((down + across) / 2 + bend, 0) * inside
     upright = line * (1 + (across - down) / np.maximum(2 * bend, FAINT)) / 2  # the square of the angle's cosine
-    along = 2.5 * per_deg, 0.8 * per_deg
+    along = 1.5 * per_deg, 0.8 * per_deg
     weight = ndimage.gaussian_filter(inside.astype(np.float32), along, mode="constant", truncate=2.5)
     density = ndimage.gaussian_filter(upright, along, mode="constant", truncate=2.5) / np.maximum(weight, 0.05)
     usual = max(float(upright[inside].mean(dtype=np.float64)), FAINT)
-    vessels: Image = ndimage.maximum_filter(density, size=(1, 2 * round(1.5 * per_deg) + 1)) / usual
+    near = ndimage.maximum_filter(density, size=(1, 2 * round(2.0 * per_deg) + 1)) / usual
+    far = round(BESIDE_DEG * per_deg)
+    above, below = np.zeros_like(near), np.zeros_like(near)
+    above[far:], below[:-far] = near[:-far], near[far:]
+    vessels: Image = np.sqrt(above * below)
     return vessels
