@@ -37,8 +37,7 @@ MACULA, MACULA_STEEP = 0.06, 90.0
 class Laterality:
     """Which eye a picture seems to be of, None where that is not sure.
 
-    `confidence` is that in the likelier eye, 0 to 1; `disc` is where its disc is, (row, col) pixels of the picture, None
-    where no eye is named.
+    `confidence` is that in the likelier eye, 0 to 1; `disc` is its disc's (row, col) in it, None without an eye.
     """
 
     eye: Eye | None
@@ -103,7 +102,7 @@ def signs(picture: Image, per_deg: float, field_deg: float) -> Signs:
 
     m = max(1, round(per_deg / COARSE_PER_DEG))
     weight, per_deg = _small(field, m), per_deg / m
-    light = _flat(_small(filled, m) / np.maximum(weight, FAINT), weight, per_deg)
+    light = _flat(np.divide(_small(filled, m), weight.clip(FAINT), dtype=np.float32), weight, per_deg)
     around = _mean(light, weight, 4.0 * per_deg)
     disc = np.maximum(_mean(light, weight, 1.6 * per_deg) - around, 0) * _small(vessels, m)
     dark = around - _mean(light, weight, 1.5 * per_deg)
@@ -136,7 +135,7 @@ def _small(picture: Image, n: int) -> Image:
 
 def _mean(image: Image, weight: Image, sigma: float) -> Image:
     """Gaussian mean over what is in the field."""
-    weights = np.maximum(ndimage.gaussian_filter(weight, sigma, mode="constant"), 0.02)
+    weights = ndimage.gaussian_filter(weight, sigma, mode="constant").clip(0.02)
     mean: Image = ndimage.gaussian_filter(image * weight, sigma, mode="constant") / weights
     return mean
 
@@ -167,5 +166,5 @@ def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
     far = round(BESIDE_DEG * per_deg)
     above, below = np.zeros_like(near), np.zeros_like(near)
     above[far:], below[:-far] = near[:-far], near[far:]
-    vessels: Image = np.sqrt(above * below)
+    vessels: Image = np.sqrt(above * below, dtype=np.float32)
     return vessels
