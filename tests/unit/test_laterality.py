@@ -19,7 +19,7 @@ OTHER: dict[Eye | None, Eye | None] = {"OD": "OS", "OS": "OD", None: None}
 PHOTOS = Path(__file__).parents[2].parent / "shared" / "data" / "fundus" / "hrf" / "images"
 # In pixels of the photograph: where the picture's middle is to be, between macula and disc; 54.4 pixels are a degree.
 EYES: dict[str, tuple[Eye, int, int]] = {
-    "06_dr.JPG": ("OD", 1142, 2051), "07_h.jpg": ("OD", 1177, 2168), "09_g.jpg": ("OS", 1206, 1920),
+    "06_dr.JPG": ("OD", 1142, 2051), "07_h.jpg": ("OD", 1177, 2168), "09_g.jpg": ("OS", 1206, 1482),
 }  # fmt: skip
 
 
