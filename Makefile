@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -96,6 +96,9 @@ bench: .venv/ready browser ## Print figures of speed and truth, measured on this
 
 bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
 	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
+
+bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
+	@$(BIN)/python -m tests.bench.sides "$(DATA)"
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"

@@ -35,7 +35,9 @@ class CameraSpec(Table):
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
     device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
     row_us: float = Field(default=30.0, gt=0, le=1000)
-    upright: bool = False  # somebody checked that its pictures stand upright and are not mirrored (hardware/assembly.md)
+    upright: bool = (
+        False  # somebody checked that its pictures stand upright and are not mirrored (hardware/assembly.md)
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -17,6 +17,7 @@ from device.values import Eye, Image, Mask
 SAMPLES_PER_DEG = 4.0  # of the small copy, at least; a vein is 0.4 deg wide
 LEAST_PER_DEG = 3.0  # coarser pictures show no vessels
 COARSE_PER_DEG = 2.0  # for what is as large as a disc or a macula
+BESIDE_DEG = 4.0  # above and below a disc's middle, where its vessels have left it
 FOVEA_DEG = (2.0, -15.0)  # from the disc of a right eye: down, right
 ABOUT_DEG = 2.5  # how far from there the macula may be: eyes differ, and heads are held aslant
 DISC_DEG = 5.0  # what is farther from the disc's middle is another thing
@@ -36,8 +37,7 @@ MACULA, MACULA_STEEP = 0.06, 90.0
 class Laterality:
     """Which eye a picture seems to be of, None where that is not sure.
 
-    `confidence` is that in the likelier eye, 0 to 1; `disc` is where its disc is, (row, col) pixels of the picture, None
-    where no eye is named.
+    `confidence` is that in the likelier eye, 0 to 1; `disc` is its disc's (row, col) in it, None without an eye.
     """
 
     eye: Eye | None
@@ -76,7 +76,8 @@ def laterality(picture: Image, px_per_deg: float, field_deg: float) -> Lateralit
 
     `picture` is linear, float32 (rows, cols), upright and not mirrored, zero or anything outside the field.
     """
-    if px_per_deg < LEAST_PER_DEG or not np.isfinite(picture).all():
+    narrow = min(picture.shape) < px_per_deg * field_deg / 2
+    if narrow or px_per_deg < LEAST_PER_DEG or not np.isfinite(picture).all():
         return Laterality(None, 0.0)
     n = max(1, int(px_per_deg / SAMPLES_PER_DEG))
     right, left = (signs(_small(seen, n), px_per_deg / n, field_deg) for seen in (picture, picture[:, ::-1]))
@@ -94,13 +95,14 @@ def signs(picture: Image, per_deg: float, field_deg: float) -> Signs:
     field = (away < field_deg / 2 - RIM_DEG / 2).astype(np.float32)
     level = max(float(picture[field > 0].mean(dtype=np.float64)), FAINT)
     logs = np.clip(np.log(np.maximum(picture / np.float32(level), np.float32(0.05))), -1.5, 1.5) * field
+    spot = 2 * max(1, round(0.35 * per_deg)) + 1
+    logs = ndimage.grey_opening(logs, size=(spot, spot)) * field  # exudates are bright dots, dark between them
     vessels = _upright_vessels(logs, away < field_deg / 2 - 1.5 * RIM_DEG, per_deg)
-    wide = 2 * max(1, round(0.35 * per_deg)) + 1
-    filled = ndimage.grey_closing(logs, size=(wide, wide)) * field  # vessels are narrower, and dark
+    filled = ndimage.grey_closing(logs, size=(spot, spot)) * field  # vessels are narrower, and dark
 
     m = max(1, round(per_deg / COARSE_PER_DEG))
     weight, per_deg = _small(field, m), per_deg / m
-    light = _flat(_small(filled, m) / np.maximum(weight, FAINT), weight, per_deg)
+    light = _flat(np.divide(_small(filled, m), weight.clip(FAINT), dtype=np.float32), weight, per_deg)
     around = _mean(light, weight, 4.0 * per_deg)
     disc = np.maximum(_mean(light, weight, 1.6 * per_deg) - around, 0) * _small(vessels, m)
     dark = around - _mean(light, weight, 1.5 * per_deg)
@@ -133,7 +135,7 @@ def _small(picture: Image, n: int) -> Image:
 
 def _mean(image: Image, weight: Image, sigma: float) -> Image:
     """Gaussian mean over what is in the field."""
-    weights = np.maximum(ndimage.gaussian_filter(weight, sigma, mode="constant"), 0.02)
+    weights = ndimage.gaussian_filter(weight, sigma, mode="constant").clip(0.02)
     mean: Image = ndimage.gaussian_filter(image * weight, sigma, mode="constant") / weights
     return mean
 
@@ -145,7 +147,10 @@ def _flat(logs: Image, weight: Image, per_deg: float) -> Image:
 
 
 def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
-    """How many dark lines run up and down through a place or a little beside it; 1 is as many as everywhere."""
+    """How many dark lines run up and down above and below a place, as out of a disc; 1 is as many as everywhere.
+
+    In the place itself they are not asked for: what shines in patches is dark between them.
+    """
     sigma = max(0.25 * per_deg, 1.0)
     down, across, both = (
         ndimage.gaussian_filter(logs, sigma, order=order, mode="constant") for order in ((2, 0), (0, 2), (1, 1))
@@ -153,9 +158,13 @@ def _upright_vessels(logs: Image, inside: Mask, per_deg: float) -> Image:
     bend = np.hypot((down - across) / 2, both)
     line = np.maximum((down + across) / 2 + bend, 0) * inside
     upright = line * (1 + (across - down) / np.maximum(2 * bend, FAINT)) / 2  # the square of the angle's cosine
-    along = 2.5 * per_deg, 0.8 * per_deg
+    along = 1.5 * per_deg, 0.8 * per_deg
     weight = ndimage.gaussian_filter(inside.astype(np.float32), along, mode="constant", truncate=2.5)
     density = ndimage.gaussian_filter(upright, along, mode="constant", truncate=2.5) / np.maximum(weight, 0.05)
     usual = max(float(upright[inside].mean(dtype=np.float64)), FAINT)
-    vessels: Image = ndimage.maximum_filter(density, size=(1, 2 * round(1.5 * per_deg) + 1)) / usual
+    near = ndimage.maximum_filter(density, size=(1, 2 * round(2.0 * per_deg) + 1)) / usual
+    far = round(BESIDE_DEG * per_deg)
+    above, below = np.zeros_like(near), np.zeros_like(near)
+    above[far:], below[:-far] = near[:-far], near[far:]
+    vessels: Image = np.sqrt(above * below, dtype=np.float32)
     return vessels

@@ -13,7 +13,7 @@ Beside = Callable[[Session, Capture], None]
 
 @dataclass(frozen=True)
 class Errand:
-    """A slot of a visit and the part it looks at, how often it was tried and may be, and what `beside` writes with it."""
+    """A slot of a visit and its part, how often it was tried and may be tried, and what `beside` writes with it."""
 
     visit: str | None = None
     slot: str | None = None

@@ -32,7 +32,7 @@ class Question:
 
 
 def question(session: Session) -> Question | None:
-    """The newest capture of an open visit that seems to be of the other eye, and of which nobody said which it is of."""
+    """The newest capture of an open visit that seems to be of the other eye, while nobody said which it is of."""
     newest = select(CaptureRow.id).order_by(schema.KEPT.desc()).limit(ASKED)
     seen, moved, confirmed = (
         func.json_extract(CaptureRow.report, f"$.{path}") for path in ("laterality.eye", "moved", "confirmed")

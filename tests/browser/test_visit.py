@@ -190,6 +190,22 @@ def test_the_wrong_eye_is_asked_about_and_changed_by_one_tap(open_page: Open, st
     expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "empty")
 
 
+def test_who_keeps_the_eye_says_so_to_the_instrument_and_is_not_asked_again(open_page: Open, stub: Stubbed) -> None:
+    page = aiming(open_page, stub)
+    taken(page)
+    asked = {"code": "eye.side", "id": stub.stub.captures[0]["id"], "slot": "R-centre", "other": "OS"}
+    stub.stub.tell("notice", asked)
+    expect(page.locator(".ask")).to_be_visible()
+    with page.expect_request("**/eye") as sent:
+        page.locator("[data-do=keepEye]").tap()
+    assert sent.value.post_data_json["eye"] == "OD"
+    expect(page.locator(".ask")).to_have_count(0)
+    stub.stub.tell("notice", asked)  # of before it heard the answer
+    stub.stub.tell("notice", {"code": "eye.side", "over": True})
+    expect(page.locator("[data-slot='R-centre']")).to_have_attribute("data-face", "good")
+    expect(page.locator(".ask")).to_have_count(0)
+
+
 def test_a_finished_visit_can_be_opened_again_and_the_code_holds_no_name(open_page: Open, stub: Stubbed) -> None:
     stub.stub.visits.begin(consent="agreed", name="Lakshmi")
     page = settled(open_page(f"{stub.url}/#/visit/v142/aim/R-centre"))

@@ -186,9 +186,7 @@ def say(rig: Rig, capture: str, eye: str) -> dict[str, Any]:
     return dict(answer.json()["slots"])
 
 
-def test_who_took_the_other_eye_is_asked_until_somebody_says_which_it_is(
-    rig: Rig, equipped: tuple[Rig, Shelf]
-) -> None:
+def test_who_took_the_other_eye_is_asked_until_somebody_says_which_it_is(rig: Rig, equipped: tuple[Rig, Shelf]) -> None:
     ledger = rig.exam.head.light.ledger
     kept = faults.other_eye(rig, equipped[1]).facts["id"]
     assert rig.store.get(kept).report["laterality"]["eye"] == "OS"
