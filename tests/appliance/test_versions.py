@@ -89,7 +89,7 @@ def until_settled(device: Device, machine: Machine, state: str) -> None:
     end_s = time.monotonic() + 300
     while slowly() and json.loads(path.read_text())["state"] != state:
         assert time.monotonic() < end_s, device.diary()
-        assert machine.is_there("/"), device.diary()
+        assert machine.is_on(), device.diary()
 
 
 def put_in(device: Device, bundle: Path) -> None:
