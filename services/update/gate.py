@@ -132,6 +132,12 @@ def refuse_wrong(release: Release, compatible: str, runs: str, modules: Path) ->
         raise UpdateOlder(f"it is version {release.version}, and {runs} runs")
     if number(runs) < number(release.minimum):
         raise UpdateTooFar(f"version {release.version} needs {release.minimum} or newer, and {runs} runs")
-    kernel = os.uname().release
-    if (modules / kernel).is_dir() and not release.has_kernel:
-        raise UpdateWrongDevice(f"it comes without a kernel, and this device runs Linux {kernel}", WITHOUT_KERNEL)
+    if not release.has_kernel and _has_modules(modules):
+        raise UpdateWrongDevice(f"it has no kernel, and this device runs Linux {os.uname().release}", WITHOUT_KERNEL)
+
+
+def _has_modules(modules: Path) -> bool:
+    try:
+        return (modules / os.uname().release).is_dir()
+    except PermissionError:  # hidden from this process, so there are some
+        return True

@@ -40,6 +40,7 @@ class Machine:
     """A booted container, driven from outside."""
 
     def __init__(self, leader: int) -> None:
+        self._leader = leader
         self._enter = ["nsenter", "-t", str(leader), "-a", "--"]
 
     def run(self, *words: str, check: bool = True) -> str:
@@ -60,11 +61,15 @@ class Machine:
         return [said[name] for name in names]
 
     def is_there(self, path: str) -> bool:
-        """Whether there is such a file; whoever enters a machine at the moment of its end may wait for ever."""
+        return subprocess.run([*self._enter, "test", "-e", path], check=False).returncode == 0
+
+    def is_on(self) -> bool:
+        """Whether its first process lives; asked from outside: who enters a machine that ends may hold up its end."""
         try:
-            return subprocess.run([*self._enter, "test", "-e", path], check=False, timeout=20).returncode == 0
-        except subprocess.TimeoutExpired:
+            said = Path(f"/proc/{self._leader}/stat").read_text()
+        except (FileNotFoundError, ProcessLookupError):
             return False
+        return said.rpartition(")")[2].split()[0] not in "ZX"
 
     def blanked(self) -> list[Blanked]:
         """Every run of the blanker so far."""
