@@ -104,9 +104,9 @@ def serve(
             )
 
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
-        door = Door(data / "technician.json", clock)
-        rooms = [explorer_routes(explorer, store, lambda: owner.exam.head.calibration), diary_routes(diary, Sticks(), clock)]
-        rooms.append(update_routes(UpdateDesk(*updater, clock, version("diffuscope")), door))
+        door, desk = Door(data / "technician.json", clock), UpdateDesk(*updater, clock, version("diffuscope"))
+        rooms = [explorer_routes(explorer, store, lambda: owner.exam.head.calibration), update_routes(desk, door)]
+        rooms.append(diary_routes(diary, Sticks(), clock))
         app = create_app(owner, door, protocol, own_names() + names, rooms=rooms, carrier=carrier)
         config = uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=1)
         log.info("started, version %s", app.version)

@@ -298,6 +298,7 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
         "/api/controller": {"post"}, "/api/protocol": {"get"},
         "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
         "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
+        "/api/outbox": {"get"}, "/api/outbox/try": {"post"},
         "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
     }  # fmt: skip
     served = {path: set(verbs) for path, verbs in book["paths"].items()}

@@ -12,7 +12,7 @@ def test_health_lists_every_check_and_driven_faults_fail_them(old_rig: Any, wait
     old_rig.request("POST", "/api/captures", json={"eye": "OD"})
     well = old_rig.request("GET", "/api/health").json()
     assert {check["name"] for check in well["checks"]} == {
-        "camera", "lamp", "calibration", "captures", "space", "battery", "heat", "clock", "speed",
+        "camera", "lamp", "calibration", "captures", "space", "battery", "heat", "clock", "speed", "sending",
     }  # fmt: skip
     old_rig.world.faults.add("camera.missing")
     old_rig.exam.preview(0, wait_s=0.0)
