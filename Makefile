@@ -60,7 +60,7 @@ test-appliance: .venv/ready ## Update a device from version to version, with rea
 	@systemd/image/install
 	@$(BIN)/python -m pytest tests/appliance -rP
 
-test-arm64: .venv/ready ## Run the solver's tests on an emulated 64-bit ARM, as root; half an hour and more, not in CI.
+test-arm64: .venv/ready ## Run the solver's tests on an emulated 64-bit ARM, as root; half an hour, not in CI.
 	@tests/arm64/run
 
 browser: ## Install headless Chromium (Debian package) where it is missing.
