@@ -21,9 +21,9 @@ from services.instrument.api import create_app
 from services.instrument.carrier import Https, SendSettings
 from services.instrument.exam import Exam
 from services.instrument.owner import Owner
-from tests.journey import faults
+from tests.journey import asking, faults
+from tests.journey.asking import Attentive, Said, Shelf
 from tests.journey.conftest import GateClock, MakeRig, Rig, builder, traced, until
-from tests.journey.faults import Attentive, Said, Shelf
 from tests.receiver import receiving
 from tests.simulated import SCENES, coarse
 from tests.site import identity
@@ -48,7 +48,7 @@ def equipped(plans: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
         papers = identity(folder)
         shelf = Shelf(receiver=undo.enter_context(receiving(*papers)))
         way = Https(SendSettings.model_validate(shelf.receiver.settings(folder, authority=papers[0])))
-        made = {"head": faults.equipped, "store": {"free_bytes": shelf}, "clock": clock, "bulletin": Attentive()}
+        made = {"head": asking.equipped, "store": {"free_bytes": shelf}, "clock": clock, "bulletin": Attentive()}
         yield build(folder, undo, **made, carrier=way), shelf
 
 
@@ -59,7 +59,7 @@ def rig(equipped: tuple[Rig, Shelf]) -> Iterator[Rig]:
     rig.app.state.notices.look()
     yield rig
     faults.mended(rig)
-    shelf.free_bytes, shelf.asked, rig.clock.start = faults.MOST_BYTES, lambda: None, began
+    shelf.free_bytes, shelf.asked, rig.clock.start = asking.MOST_BYTES, lambda: None, began
     rig.app.state.notices.look()
 
 
@@ -216,7 +216,7 @@ def test_who_took_the_other_eye_is_asked_until_somebody_says_which_it_is(rig: Ri
 def test_the_eye_that_was_asked_for_comes_and_nobody_is_asked(rig: Rig, slot: str, said: str | None) -> None:
     visit = rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
     eye = "OD" if slot[0] == "R" else "OS"
-    assert faults.pressed(rig, eye, visit=visit, slot=slot).code == "good"
+    assert asking.pressed(rig, eye, visit=visit, slot=slot).code == "good"
     report = rig.store.captures(1)[0].report
     assert (report["laterality"] or {}).get("eye") == said
     assert asked(rig) is None
