@@ -75,7 +75,7 @@ class Exam:
         self._pressed = Keys()
         self.progress = Progress(bulletin, clock, head.spec.camera.exposure_s, budget_s)
         self.underway = Underway(store)
-        self.fitness = Fitness(head, store, bulletin, clock, lambda: self._press is not None or self._closing)
+        self.fitness = Fitness(head, store, bulletin, clock, lambda: self._press is not None or self._closing, watchdog)
         self._owner = Thread(target=self._own_the_head, name="head", daemon=True)
         self._owner.start()
 

@@ -21,6 +21,7 @@ from device.recon.witness import Witness
 from device.spec import InstrumentSpec
 from device.values import Capture
 from services.instrument.bulletin import Bulletin
+from services.instrument.watchdog import Watchdog
 from services.records.picture import read_raw_tiff
 from services.records.store import Store
 
@@ -33,8 +34,12 @@ ASKED = 200  # captures whose refraction is in their report
 class Fitness:
     """What is known about one head's calibration. `step` and `begin` belong to the thread that owns the head."""
 
-    def __init__(self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, pressed: Callable[[], bool]) -> None:
-        self._head, self._store, self._bulletin, self._clock, self._pressed = head, store, bulletin, clock, pressed
+    def __init__(
+        self, head: Head, store: Store, bulletin: Bulletin, clock: Clock, pressed: Callable[[], bool],
+        watchdog: Watchdog,
+    ) -> None:  # fmt: skip
+        self._head, self._store, self._bulletin, self._clock = head, store, bulletin, clock
+        self._pressed, self._watchdog = pressed, watchdog
         self._witness: Witness | None = None
         self._waiting: deque[Capture] = deque(maxlen=LOOKED_AT)
         self._sights: deque[Sight] = deque(maxlen=LOOKED_AT)
@@ -80,6 +85,7 @@ class Fitness:
         self._tell()
 
     def _give_way(self) -> None:
+        self._watchdog.beat()  # on a busy computer a look may last longer than systemd waits for a sign of life
         if self._pressed():
             raise Busy("somebody presses")
 

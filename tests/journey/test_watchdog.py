@@ -98,6 +98,15 @@ def test_a_picture_in_the_making_beats_between_its_rounds(make_rig: Any, ear: Ea
     assert heard.count("WATCHDOG=1") > kept.report["rounds"]
 
 
+def test_a_look_at_a_kept_picture_beats_while_it_lasts(make_rig: Any, ear: Ear) -> None:
+    rig = make_rig(watchdog=ear.address)
+    ear.all_until("STATUS=aim")
+    rig.exam.press("OD").result(30)
+    until(lambda: ear.heard.count("STATUS=aim") == 1 and not rig.exam.fitness.due)
+    after = ear.heard[ear.heard.index("STATUS=aim") :]
+    assert after.count("WATCHDOG=1") > 5  # an idle owner beats once in two seconds
+
+
 def test_a_hung_owner_beats_no_more_until_it_goes_on(make_rig: Any, ear: Ear) -> None:
     """The web server lives, and so does every other thread: it does not help."""
     rig = make_rig(watchdog=ear.address)
