@@ -75,7 +75,7 @@ def faults(page: Page, ready: str) -> list[str]:
 def test_health_says_of_every_part_how_it_is(inside: Page) -> None:
     enter(inside, "health")
     checks = inside.locator("li[data-check]")
-    expect(checks).to_have_count(9)
+    expect(checks).to_have_count(10)
     assert {check.get_attribute("data-ok") for check in checks.all()} == {"true"}
     assert faults(inside, "li[data-check]") == []
 

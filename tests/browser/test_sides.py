@@ -113,7 +113,7 @@ def test_a_finish_waits_for_the_picture_in_the_making_and_refers_nobody_falsely(
     assert look_for_faults(page) == []
     assert stub.stub.visits.kept["v142"]["finished_at"] is None
     stub.stub.hold = None
-    expect(page.locator(".outcome .verdict")).to_contain_text("Send")
+    expect(page.locator(".outcome .verdict")).to_contain_text("eye specialist")
     expect(page.locator("[data-slot='L-centre']")).to_have_attribute("data-face", "good")
 
 
