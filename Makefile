@@ -38,7 +38,7 @@ test: .venv/ready browser buses strace ## Run every test that needs no Raspberry
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, voice and technician's rooms.
 	@$(BIN)/python -m pytest tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
 
-test-paper: .venv/ready ## Run the paper's experiments again, and hold every claim that `diffuscope paper` prints.
+test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics
 
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.

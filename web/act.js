@@ -96,7 +96,8 @@ const exam = {
   linkZoom({ target, detail }) {
     for (const pic of document.querySelectorAll(".two eye-pic")) if (pic !== target) pic.view = detail;
   },
-  listFolders: async () => set({ folders: (await visits.politely(getFolders)) ?? null, copied: null }),
+  listFolders: async () => set({ folders: (await visits.politely(getFolders)) ?? null, copied: null, zipped: false }),
+  zipped: () => set({ folders: null, copied: null, zipped: true }),
   copyTo: visits.copyTo,
 };
 

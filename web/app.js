@@ -35,7 +35,7 @@ async function arrive(route) {
   set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
   lock(); // a double tap must not also press what stands there on the new screen
   lower("link.slow");
-  if (!same) set({ visits: null, folders: null, copied: null, blink: false });
+  if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
   await load(route);
   if (!same) requestAnimationFrame(() => focusOn(route.screen));
 }
@@ -232,9 +232,9 @@ addEventListener("pagehide", letControlsGo);
 
 act.heardAim = ({ detail }) => heardAim(detail);
 act.heardLate = ({ detail: seconds }) => {
+  if (seconds && get().prompt) set({ prompt: null }); // nobody is ready by an old picture
   if (seconds >= LATE_S && get().link === "live") {
     raise({ code: "link.slow", n: seconds, from: "page" });
-    if (get().prompt) set({ prompt: null }); // nobody is ready by a picture of some seconds ago
   } else lower("link.slow");
 };
 

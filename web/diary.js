@@ -42,6 +42,7 @@ class InstrumentDiary extends HTMLElement {
       this.#now.about = about;
       this.#load();
     },
+    saved: () => this.#set({ folders: null, said: t("film.zipped"), bad: "" }),
     sticks: async () => {
       const answer = await this.#ask("/api/exports");
       if (answer) this.#set({ folders: answer.folders, said: answer.folders.length ? "" : t("film.nofolder"), bad: "" });
@@ -62,7 +63,7 @@ function view({ entries, worst, about, folders, said, bad }, act) {
     <div class="row">
       <button type="button" @click=${act.again}>${t("diary.again")}</button>
       <button type="button" aria-pressed=${worst} @click=${act.worst}>${t("diary.worst")}</button>
-      <a class="button" href="/api/technician/diary.txt" download>${t("diary.save")}</a>
+      <a class="button" href="/api/technician/diary.txt" download @click=${act.saved}>${t("diary.save")}</a>
       <button type="button" id="to-usb" @click=${act.sticks}>${t("film.copy")}</button>
       ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} @click=${() => act.copy(stick)}>
         ${stick.name}

@@ -84,11 +84,12 @@ customElements.define("instrument-health", InstrumentHealth);
 const failed = () => html`<p class="bad" role="alert">${t("health.failed")}</p>`;
 
 function view({ ok, checks }, large, say) {
+  const unknown = checks.filter((one) => one.ok && !one.known).length;
   const lines = (which) => checks.filter((one) => one.ok === which).map((one) => line(one, large === one.name, say));
   return html`
     <h2>${t("health.title")}</h2>
     <div role="status" aria-atomic="false">
-      <p>${t(ok ? "health.well" : "health.ill")}</p>
+      <p>${t(ok ? (unknown ? "health.notill" : "health.well") : "health.ill", { n: unknown })}</p>
       ${ok ? nothing : html`<ul class="checks">${lines(false)}</ul>`}
     </div>
     <ul class="checks">
@@ -103,7 +104,7 @@ const paintedBy = () => t(studio().painter.name === "2d" ? "health.painter.2d" :
 
 const line = (one, large, say) => html`<li data-check=${one.name} data-ok=${one.ok}>
   <b>${one.ok ? (one.known ? "✓" : "–") : "✕"} ${t(`health.${one.name}`)}</b> <span>${one.value}</span>
-  <small>${t("health.limit", { limit: one.limit })}</small>
+  ${one.known ? html`<small>${t("health.limit", { limit: one.limit })}</small>` : nothing}
   ${one.ok ? nothing : html`<p class="bad" ?data-large=${large}>${one.remedy}</p> ${loud(one, say)}`}
 </li>`;
 

@@ -49,6 +49,7 @@ export const store = createStore({
   picked: Object.freeze([]), // two pictures to compare
   compared: Object.freeze([]), // what is known of these two
   folders: null, // where a visit can be copied to
+  zipped: false, // whether the browser was asked to save it
   copied: null,
   outbox: null, // who waits to be sent: the Send screen
   finishing: null, // the visit that is finished as soon as its last picture is there

@@ -230,6 +230,7 @@ export const TECHNICIAN = {
 
   "health.title": "How the instrument is",
   "health.well": "All is well.",
+  "health.notill": { one: "Nothing is wrong. {n} thing is not known.", other: "Nothing is wrong. {n} things are not known." },
   "health.ill": "Something needs attention.",
   "health.failed": "The instrument does not say how it is. Trying again…",
   "health.aloud": "{name}. {remedy}",

@@ -107,21 +107,27 @@ def outcome(protocol: Protocol, fields: Mapping[str, Any], slots: Mapping[str, S
     weak = [eye for eye in SIDE if _sees_less(fields.get(f"vision_{eye.lower()}"), limit)]
     if weak:
         return Outcome("refer_vision", f"Refer: vision of {_eyes(weak)} below {limit}.")
-    blank = _without_pictures(protocol, slots)
-    if blank:
-        return Outcome("refer_picture", f"Refer: picture of {_eyes(blank)} not possible.")
-    return Outcome("send", "The pictures are kept. An eye specialist looks at them next.")
+    if lacking := _lacking(protocol, slots):
+        return Outcome("refer_picture", f"Refer: {'; '.join(lacking)}.")
+    empty = sum(slot.required and slots[slot.id].state == "empty" for slot in protocol.slots)
+    missing = f", {empty} not taken" if empty else ""
+    return Outcome("send", f"The pictures are kept{missing}. They are for an eye specialist.")
 
 
 def _sees_less(vision: Any, limit: Vision) -> bool:
     return vision is not None and VISIONS.index(cast(Vision, vision)) > VISIONS.index(limit)
 
 
-def _without_pictures(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[Eye]:
-    """Eyes of which a required picture could not be taken, or of which there is none at all."""
+def _lacking(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[str]:
+    """What is said of eyes without a picture, or without a required one; what nobody tried was not impossible."""
     failed = {slot.eye for slot in protocol.slots if slot.required and slots[slot.id].state == "could_not"}
     seen = {slot.eye for slot in protocol.slots if slots[slot.id].state == "taken"}
-    return [eye for eye in protocol.eyes if eye in failed or eye not in seen]
+    said: tuple[tuple[str, list[Eye]], ...] = (
+        ("picture of {} not possible", [eye for eye in protocol.eyes if eye in failed and eye not in seen]),
+        ("not every picture of {} possible", [eye for eye in protocol.eyes if eye in failed and eye in seen]),
+        ("picture of {} not taken", [eye for eye in protocol.eyes if eye not in failed and eye not in seen]),
+    )
+    return [words.format(_eyes(eyes)) for words, eyes in said if eyes]
 
 
 def _eyes(eyes: Sequence[str]) -> str:

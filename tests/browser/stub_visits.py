@@ -18,7 +18,7 @@ SENTENCES = {
     "refer_today": "See the doctor today.",
     "refer_vision": "Refer: vision of the left eye below 6/18.",
     "refer_picture": "Refer: picture not possible.",
-    "send": "The pictures are kept. An eye specialist looks at them next.",
+    "send": "The pictures are kept. They are for an eye specialist.",
 }
 
 

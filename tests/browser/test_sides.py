@@ -243,7 +243,7 @@ def test_a_picture_of_the_other_eye_is_moved_by_hand_and_back(open_page: Open, s
     page = aiming(open_page, stub)
     taken(page)
     tap(page, "#open-details")
-    expect(page.locator("#other-eye")).to_have_text("It is the left eye")
+    expect(page.locator("#other-eye")).to_have_text("Change to the left eye")
     assert look_for_faults(page) == []
     tap(page, "#other-eye")
     expect(page.locator("[data-slot='L-centre']")).to_have_attribute("data-face", "good")

@@ -328,6 +328,11 @@ def test_a_visit_is_copied_to_a_stick_and_saved_as_a_file(open_page: Open, stub:
     page.locator("[data-folder='/media/usb-1']").tap()
     expect(page.get_by_role("note")).to_contain_text("Copied to USB stick BLUE.")
     expect(page.get_by_role("link", name="ZIP")).to_have_attribute("href", "/api/visits/v142/export.zip")
+    name = {"content-disposition": 'attachment; filename="visit.zip"'}
+    page.route("**/export.zip", lambda route: route.fulfill(body=b"PK", headers=name))
+    with page.expect_download():
+        page.get_by_role("link", name="ZIP").tap()
+    expect(page.get_by_role("note")).to_contain_text("Look in its downloads.")
 
 
 def test_another_screen_holds_the_controls_until_they_are_taken(open_page: Open, stub: Stubbed) -> None:

@@ -33,6 +33,8 @@ from device.values import Calibration, Image
 from tests import scenes
 from tests.simulated import SCENES, coarse, expected, exposed, having, world
 
+pytestmark = pytest.mark.paper  # some minutes: every shipped scene is rendered both ways
+
 COARSER = 2
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 ROUNDING = 2e-3  # what single precision and one-electron counts make of an exact zero

@@ -130,3 +130,21 @@ def test_the_limit_itself_is_not_referred(worse: str) -> None:
     assert told.code == ("send" if worse == VISIONS[LIMIT] else "refer_vision")
     if told.code == "refer_vision":
         assert told.sentence == "Refer: vision of the left eye below 6/18."
+
+
+@pytest.mark.parametrize(
+    ("right", "left", "sentence"),
+    [
+        (("taken", "could_not"), ("empty", "empty"),
+         "Refer: not every picture of the right eye possible; picture of the left eye not taken."),
+        (("could_not", "empty"), ("could_not", "could_not"), "Refer: picture of both eyes not possible."),
+        (("taken", "taken"), ("could_not", "empty"), "Refer: picture of the left eye not possible."),
+        (("taken", "empty"), ("taken", "taken"), "The pictures are kept, 1 not taken. They are for an eye specialist."),
+        (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
+    ],
+)  # fmt: skip
+def test_what_was_not_tried_was_not_impossible(right: tuple[str, str], left: tuple[str, str], sentence: str) -> None:
+    refused = SlotState((), Decided(None, "pupil"))
+    of = {"taken": SlotState((Taken("a", None),)), "empty": SlotState(), "could_not": refused}
+    states = dict(zip(("R-centre", "R-nerve", "L-centre", "L-nerve"), (*right, *left), strict=True))
+    assert outcome(PROTOCOL, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence

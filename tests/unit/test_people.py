@@ -153,7 +153,7 @@ def test_a_picture_that_was_pressed_before_the_finish_is_not_lost(store: Store, 
     assert [one.capture for one in people.get(visit).slots["R-centre"].taken] == ["late"]
     ending = people.get(visit).outcome
     assert ending is not None
-    assert ending.sentence == "Refer: picture of the left eye not possible."  # of the right one there is one now
+    assert ending.sentence == "Refer: picture of the left eye not taken."  # of the right one there is one now
     with pytest.raises(VisitFinished):
         people.errand("OD", None, visit, "R-centre")
 

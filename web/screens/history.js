@@ -101,10 +101,11 @@ function frame(state, act, { slot, id }) {
   </li>`;
 }
 
-function away({ visit, folders, copied }, act) {
+function away({ visit, folders, copied, zipped }, act) {
+  const said = copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : "";
   return html`
     <div class="ends">
-      <a class="button" href=${zipOf(visit.id)} download>${t("film.zip")}</a>
+      <a class="button" href=${zipOf(visit.id)} download @click=${act.zipped}>${t("film.zip")}</a>
       <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
         (stick) => html`<button type="button" data-folder=${stick.folder} @click=${() => act.copyTo(stick)}>
@@ -112,9 +113,7 @@ function away({ visit, folders, copied }, act) {
         </button>`,
       )}
     </div>
-    <p role="note">
-      ${copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : ""}
-    </p>
+    <p role="note">${zipped ? t("film.zipped") : said}</p>
   `;
 }
 
