@@ -15,7 +15,7 @@ export function toSay({ aloud, route }) {
   const field = route.slot.split("-")[1];
   const key = has(`say.${field}`) ? `say.${field}` : "say.still";
   return html`<div class="aloud">
-    ${button(aloud, key, "say", t(key), under(aloud, key))}
+    ${button(aloud, key, "say", t(key), inOwnWords(aloud, key))}
     <button type="button" id="say-more" aria-haspopup="dialog" @click=${open}>
       <span lang=${aloud.tag}>${LANGUAGES[aloud.tag].name}</span><small>${t("voice.more")}</small>
     </button>
@@ -26,7 +26,8 @@ export function toSay({ aloud, route }) {
 export function toAsk({ aloud }) {
   if (!aloud) return nothing;
   return html`<div class="asking">
-    ${button(aloud, "say.consent", "say", t("consent"), under(aloud, "say.consent"))} ${languages(aloud)}
+    ${button(aloud, "say.consent", "say", t("consent"), aloud.able ? inOwnWords(aloud, "say.consent") : noVoice(aloud))}
+    ${languages(aloud)}
   </div>`;
 }
 
@@ -48,7 +49,6 @@ export function sheet({ aloud, saying }) {
 const inOwnWords = ({ tag, words }, key) =>
   words[key] === t(key) ? nothing : html`<small lang=${tag}>${words[key]}</small>`;
 const noVoice = ({ tag }) => html`<small>${t("voice.none", { language: languageName(tag) })}</small>`;
-const under = (aloud, key) => (aloud.able ? inOwnWords(aloud, key) : noVoice(aloud));
 const each = (aloud, key) => button(aloud, key, nothing, t(key), inOwnWords(aloud, key));
 
 function button({ able }, key, id, words, under) {
