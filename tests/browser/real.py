@@ -10,7 +10,7 @@ import uvicorn
 
 from device.spec import load_head
 from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, coarsened
-from tests.journey.faults import Attentive, Shelf, equipped
+from tests.journey.asking import Attentive, Shelf, equipped
 
 
 class Watch(GateClock):
