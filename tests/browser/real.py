@@ -9,8 +9,8 @@ from pathlib import Path
 import uvicorn
 
 from device.spec import load_head
-from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, coarsened
 from tests.journey.asking import Attentive, Shelf, equipped
+from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, coarsened
 
 
 class Watch(GateClock):

@@ -11,7 +11,8 @@ from device.values import Charge
 from tests.browser.conftest import Complaints, free_port
 from tests.browser.real import Real
 from tests.browser.walk import SHUTTER, Open, live, settled, tap
-from tests.journey.faults import MOST_BYTES, rest
+from tests.journey.asking import MOST_BYTES
+from tests.journey.faults import rest
 
 pytestmark = pytest.mark.browser
 
