@@ -32,7 +32,7 @@ def check(
     offer = updater.check(download)
     typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.runs}.")
     if offer and (waiting := unsent(load(settings).instrument)):
-        typer.echo(f"{waiting} people wait to be sent: they stay on the device, and are sent after the update.")
+        typer.echo(f"Waiting to be sent: {waiting}. They stay on the device, and are sent after the update.")
 
 
 @app.command()
