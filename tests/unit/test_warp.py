@@ -7,9 +7,9 @@ from device.clock import VirtualClock
 from device.errors import SettingError
 from device.recon.geometry import Grid
 from device.recon.model import Model, otf
+from device.recon.prepare import Linear
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.recon.refraction import Refractor
-from device.recon.prepare import Linear
 from device.recon.shading import Shading
 from device.recon.warp import ElasticOtf, transform, warped
 from device.values import Geometry, Psf, Sensor
