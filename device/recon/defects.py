@@ -8,12 +8,15 @@ surroundings by more than the noise and the sharpest edge of the PSF holds somet
 * values below the black level that no noise explains;
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
   deviations plus the PSF's own sharpness times the ring's range;
-* gaps without light (dead columns, rows, areas) behind a sharp edge.
+* gaps without light (dead columns, rows, areas) behind a sharp edge;
+* the halo of a reflex: around a saturated area, light beyond what the blurred smooth field explains.
 
 A frame without a suspect costs one pass over its pixels.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +24,10 @@ from scipy import ndimage
 
 from device.recon import kernels
 from device.recon.kernels import Pixels
+from device.recon.model import field_radius_px, tight_model
+from device.recon.plan import Planner
+from device.recon.prepare import Linear, Preparer
+from device.recon.shading import Shading
 from device.values import Calibration, Image, Mask, Psf
 
 NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250 frames
@@ -31,6 +38,12 @@ NARROW_PX = 25  # dead columns and rows up to this width are told by their brigh
 SHADOW = 0.1  # of the light around it: a narrow gap is darker
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
+HALO = 0.01  # of the light that the field explains: more is a reflex. Overexposed eyes have 0.003 and less
+HALO_SD = 3.0  # standard errors of a ring's mean excess
+HALO_MARGIN = 3  # samples beyond the last ring with an excess
+HALO_TURNS = 5  # the halo spoils the first fit of the field that shows it
+HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
+LEAST_AREA = 2  # samples of a saturated area that may have a halo
 PASSES = 3  # an outlier hides its neighbour until it is left out
 SAMPLES, LEVELS = 20_000, 6
 LINE = np.float32(1.25)  # variance of a pixel minus the mean of four, in units of a pixel's variance
@@ -103,6 +116,7 @@ class DefectFinder:
         if calibration.bad is not None and calibration.bad.shape == shape:
             self._bad = calibration.bad
         self._ranges = ring_ranges(calibration.psfs[index])
+        self._calibration, self._shape, self._index = calibration, shape, index
         self._suspect: Mask = np.zeros(shape, np.bool_)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Mask | None:
@@ -131,7 +145,16 @@ class DefectFinder:
         self._add_outliers(counts, offset, noise, places, defective)
         if np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX:
             defective |= self._gaps(np.where(defective, np.float32(0), counts - offset), dark_dn)
+        if saturated.any() and self._halo is not None:
+            defective |= self._halo.mask(counts, dark, defective)
         return defective if defective.any() else None
+
+    @cached_property
+    def _halo(self) -> "HaloFinder | None":
+        """Planned at the first saturated frame; None where no field is known."""
+        if not isfinite(field_radius_px(self._calibration)):
+            return None
+        return HaloFinder(self._calibration, self._shape, self._index)
 
     def _least_dn(self, offset: Image, noise: PixelNoise) -> float:
         """The lowest value above dark that a working pixel gives: half the black level below it."""
@@ -164,6 +187,73 @@ class DefectFinder:
         return _with_sharp_border(narrow, self._suspect) | _with_sharp_border(
             (light <= dark_dn) & ~narrow, self._suspect
         )
+
+
+class HaloFinder:
+    """The search for halos of reflexes on coarse samples, planned for one calibration with a known field."""
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int], index: int) -> None:
+        n = max(1, round(min(shape) / HALO_SAMPLES))
+        self._model = tight_model(calibration, shape, n, Planner(None, effort="FFTW_ESTIMATE"), index)
+        self._shading, self._prepare = Shading(self._model), Preparer(calibration, self._model.grid)
+        self._smooth: Image = np.zeros(self._model.grid.shape, np.float32)
+
+    def mask(self, counts: Pixels, dark: Pixels | None, defective: Mask) -> Mask:
+        """The pixels of halos, (rows, cols): rings around saturated areas with more light than the field explains.
+
+        The field is fitted outside the halos that are known so far, and their rings measured again, HALO_TURNS times.
+        """
+        frame = self._prepare(counts, dark, defective)
+        lost = frame.good < 0.5
+        labels, count = ndimage.label(lost)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
+        areas = [k for k in range(1, count + 1) if sizes[k] >= LEAST_AREA]
+        distance, nearest = ndimage.distance_transform_edt(~lost, return_indices=True)
+        owner, ring = labels[tuple(nearest)], np.ceil(distance).astype(np.int64)
+        reach = np.zeros(count + 1, np.int64)
+        good = frame.good.copy()
+        for _ in range(HALO_TURNS):
+            excess, noise = self._excess(replace(frame, good=good, missing=1 - float(good.mean())))
+            grown = reach.copy()
+            for k in areas:
+                grown[k] = max(reach[k], _halo_rings(excess, noise, frame.good > 0.5, ring, owner == k))
+            if np.array_equal(grown, reach):
+                break
+            reach = grown
+            good = np.where((reach[owner] > 0) & (ring <= reach[owner] + HALO_MARGIN), np.float32(0), frame.good)
+        return self._on_sensor(good < frame.good, defective.shape)
+
+    def _excess(self, frame: Linear) -> tuple[Image, float]:
+        """The light beyond the blurred smooth field, as a share of it, and the robust sd of that share where it is lit."""
+        _, stray = self._shading.fit(frame, self._smooth)
+        explained = self._model.blur(self._smooth)[self._model.grid.slices] + np.float32(stray)
+        lit = explained > 0.2 * float(explained.max())
+        excess = np.where(lit, frame.y - explained, 0) / np.maximum(explained, 1e-20)
+        usable = lit & (frame.good > 0.5)
+        noise = float(np.median(np.abs(excess[usable]))) / 0.6745 if usable.any() else float("inf")
+        return np.asarray(excess, np.float32), noise
+
+    def _on_sensor(self, samples: Mask, shape: tuple[int, int]) -> Mask:
+        """The pixels of these samples of the window."""
+        grid = self._model.grid
+        pixels = np.zeros(shape, np.bool_)
+        block = np.repeat(np.repeat(samples, grid.n, 0), grid.n, 1)
+        top, left = grid.first_px
+        pixels[top : top + block.shape[0], left : left + block.shape[1]] = block
+        return pixels
+
+
+def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64], own: Mask) -> int:
+    """How many rings around an area, from the first on, have an excess; 0 if there is no halo."""
+    near = own & good & (ring > 0)
+    rings = ring[near]
+    if not rings.size:
+        return 0
+    number = np.bincount(rings)
+    mean = np.bincount(rings, excess[near]) / np.maximum(number, 1)
+    limit = np.maximum(HALO, HALO_SD * noise / np.sqrt(np.maximum(number / 4, 1)))
+    below = np.flatnonzero((mean[1:] <= limit[1:]) & (number[1:] > 0))
+    return int(below[0]) if below.size else int(rings.max())
 
 
 def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:
