@@ -19,7 +19,11 @@ from services.records.store import Store
 
 def live_routes(app: FastAPI, owner: Owner, people: People, shown: Callable[[Capture], dict[str, Any]]) -> None:
     """What goes on while a page is open; `shown` is a capture as JSON."""
+    _preview(app, owner, people)
+    _events(app, owner, shown)
 
+
+def _preview(app: FastAPI, owner: Owner, people: People) -> None:
     @app.get("/api/preview")
     def preview(
         after: int = Query(0, ge=0), eye: Eye | None = None, visit: str | None = Query(None, pattern=NAME)
@@ -42,6 +46,8 @@ def live_routes(app: FastAPI, owner: Owner, people: People, shown: Callable[[Cap
         told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
         return Response(live.jpeg, media_type="image/jpeg", headers=told)
 
+
+def _events(app: FastAPI, owner: Owner, shown: Callable[[Capture], dict[str, Any]]) -> None:
     @app.get("/api/events")
     async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:
         """What happens, as server-sent events, with a heartbeat (`beat`) every second.

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 
 from tests.browser.conftest import Complaints, free_port
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, live, new_person, settled, tap, taken
+from tests.browser.walk import SHUTTER, Open, live, new_person, settled, taken, tap
 from tests.journey.faults import rest
 
 pytestmark = pytest.mark.browser
