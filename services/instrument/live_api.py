@@ -40,7 +40,6 @@ def _preview(app: FastAPI, owner: Owner, people: People) -> None:
         wanted.permit()
         live = owner.preview(after, wanted)
         if live is None:
-            wanted.permit()  # where the consent was withdrawn meanwhile, the page hears why none came
             return Response(status_code=204)
         age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
         told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}

@@ -81,7 +81,8 @@ def test_consent_that_is_withdrawn_while_aiming_turns_the_lamp_off(make_rig: Mak
     time.sleep(ENOUGH_S)
     assert rig.world.frames <= frames + 1, "only the frame that was being exposed"
     assert rig.world.glow is None
-    refused(answer, code)
+    assert answer.status_code == 204
+    refused(rig.request("GET", f"/api/preview?after=100000&visit={visit}&eye=OD"), code)
     assert rig.request("GET", "/api/status").json()["problem"] is None
 
 
