@@ -94,6 +94,12 @@ def _row(name: str, scores: Scores) -> tuple[str, ...]:
     return name, f"{scores.pcc:.3f}", f"{scores.psnr_db:.1f}", f"{scores.ssim:.3f}"
 
 
+def dots_before_and_after(bench: Bench, take: Take) -> tuple[Image, Image]:
+    """The two pictures that are shown: the paper's solver with the floor, and the same after its flat field."""
+    direct = floored(bench.tikhonov(take, DOT_MU))
+    return direct, flattened(direct, take)
+
+
 class Cell(NamedTuple):
     """One setting of the sweep: the screen, the weight, the floor, and the scores before and after the flat field."""
 
@@ -121,8 +127,7 @@ def run_dots(bench: Bench) -> Outcome:
     """The lattice before and after the flat field: the pictures of one setting, and the scores of every setting."""
     bench.say("S1: dots over 51 degrees")
     take = bench.take("paper_dots")
-    direct = floored(bench.tikhonov(take, DOT_MU))
-    after = flattened(direct, take)
+    direct, after = dots_before_and_after(bench, take)
     dots = found(direct, take)
     row = dots.places[np.abs(dots.places[:, 0] - take.row(0)) <= 2, 1]
     bench.say("S1: every weight and floor, curved and flat screen")
