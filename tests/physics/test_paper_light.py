@@ -11,7 +11,7 @@ from services.instrument.paper.light import HEAD, SCENE, human_light, shipped_he
 from services.instrument.paper.report import EXPERIMENTS
 from services.instrument.paper.rules import SCENES as RULED
 from services.instrument.paper.rules import rules
-from services.instrument.paper.screen import dots_before_and_after
+from services.instrument.paper.screen import FLAT, cells, dots_before_and_after
 
 pytestmark = pytest.mark.paper
 
@@ -65,3 +65,7 @@ def test_readme_has_the_ssim_that_is_not_reproduced() -> None:
     take = bench.take("paper_dots")
     found = [take.score(picture).ssim for picture in dots_before_and_after(bench, take)]
     assert said == pytest.approx(found, abs=0.0006)
+    flat = bench.take("paper_dots", FLAT)
+    settings = [*cells("curved", take, bench), *cells("flat", flat, bench)]
+    lower = sum(one.after.ssim < one.before.ssim for one in settings)
+    assert figures(r"lower after the correction than before in (\d+) of (\d+) settings") == (lower, len(settings))
