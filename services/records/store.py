@@ -1,12 +1,14 @@
 """The shelf: a capture is on it whole or not at all, whatever happens in between.
 
     shelf.sqlite                  what was kept: rows
+    shelf.sqlite-wal              rows that are not in the main file yet (`checkpoint`)
     captures/<id>/<name>          and their files
     captures/.<id>.part/          being written; no row yet
     torn/<id>/                    found half-kept at an opening: never listed, for the technician; gives its room up
     snapshots/                    the tables as they were before each migration (snapshots.py)
 
-The row is the promise: it is written last, when every file it names is on the disk.
+The row is the promise: it is written last, when every file it names is on the disk. A folder that has all files of a
+capture and no row may have lost its row: it is neither moved nor removed, and `orphans` names it.
 """
 
 import hashlib
@@ -35,6 +37,7 @@ from services.records.snapshots import Snapshots
 log = logging.getLogger(__name__)
 
 RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
+WHOLE = frozenset({"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"})  # of every release's captures
 LATELY = 100  # visits by which the next ones are judged
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
@@ -44,6 +47,7 @@ class Store:
     """Captures kept in one folder; opening it brings the tables up to date and moves half-kept captures aside.
 
     `swept` names what was moved, as found in `torn/`. Any thread may read while one keeps; keepers wait for each other.
+    Opening and closing write the rows of the log into the main file.
     """
 
     swept: tuple[str, ...]
@@ -70,11 +74,33 @@ class Store:
                 self._refuse_to_begin_anew()
                 schema.migrate(self.engine, snapshots.make)
                 self.swept = self._sweep()
+                schema.checkpoint(self.engine)
             undo.pop_all()
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Write the log's rows into the main file, if the disk lets it, and let go of the database."""
+        try:
+            self.checkpoint()
+        except StoreError as error:  # nothing is lost: the rows stay in the log
+            log.warning("the log of the database stays: %s", error)
         self.engine.dispose()
+
+    def checkpoint(self) -> bool:
+        """Write the log's rows into the main file and empty the log; False if somebody reads or writes meanwhile.
+
+        Until then a row is in the log alone, where one wrong byte loses every row behind it without an error.
+        """
+        if self.log_bytes() == 0:
+            return True
+        with told():
+            return schema.checkpoint(self.engine)
+
+    def log_bytes(self) -> int:
+        """The length of the log."""
+        try:
+            return (self.folder / "shelf.sqlite-wal").stat().st_size
+        except FileNotFoundError:
+            return 0
 
     def __enter__(self) -> Self:
         return self
@@ -86,7 +112,7 @@ class Store:
         """Keep a capture and its files by name, and return it with their SHA-256 once no power cut can undo it.
 
         What `beside` writes is kept with it, or not at all.
-        Errors: StoreFull (nothing is left of it), StoreError (what was written goes to `torn/` at the next opening),
+        Errors: StoreFull (nothing is left of it), StoreError (the next opening judges what was written by its row),
         SettingError (a name or report that cannot be kept).
         """
         _refuse_names(capture.id, files)
@@ -159,8 +185,18 @@ class Store:
         return self._room_bytes() * number // total_bytes if total_bytes else self.space_left() // pictures
 
     def torn(self) -> dict[str, int]:
-        """What lies in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
-        return {place.name: disk.size_bytes(place) for place in sorted(self._torn.iterdir())}
+        """The half-kept in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
+        places = [place for place in sorted(self._torn.iterdir()) if not _is_whole(place)]
+        return {place.name: disk.size_bytes(place) for place in places}
+
+    def orphans(self) -> list[str]:
+        """The captures whose folder has all its files and which have no row: not listed, and never removed.
+
+        Those that an earlier release moved to `torn/` are among them.
+        """
+        with told(), disk.alone(self._lock):  # one that is being kept gets its row
+            folders = [*self._strays(), *self._torn.iterdir()]
+            return sorted(folder.name for folder in folders if _is_whole(folder))
 
     def _room_bytes(self) -> int:
         free_bytes = self._free_bytes(self.folder) + sum(self.torn().values())
@@ -197,12 +233,16 @@ class Store:
         if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
             raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
 
-    def _sweep(self) -> tuple[str, ...]:
-        """Move every folder without a row aside."""
+    def _strays(self) -> list[Path]:
+        """Every folder without a row."""
         with Session(self.engine) as session:
             kept = set(session.scalars(select(CaptureRow.id)))
-        strays = sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
-        swept = tuple(disk.move_aside(stray, self._torn) for stray in strays)
+        return sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
+
+    def _sweep(self) -> tuple[str, ...]:
+        """Move every half-kept folder without a row aside."""
+        half = [stray for stray in self._strays() if stray.name.startswith(".") or not _is_whole(stray)]
+        swept = tuple(disk.move_aside(stray, self._torn) for stray in half)
         if swept:
             disk.settle(self._torn)
             disk.settle(self._captures)
@@ -222,6 +262,10 @@ class Store:
         for folder in folders:
             if folder.exists():
                 raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+
+
+def _is_whole(folder: Path) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} >= WHOLE
 
 
 def _row(session: Session, id: str) -> CaptureRow:
