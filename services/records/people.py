@@ -50,17 +50,25 @@ class People:
         return self.get(self._once(key, f"begin {number}", act))
 
     def get(self, id: str) -> Visit:
-        """One visit; NotKept if there is none."""
+        """One visit; NotKept if there is none, StoreDamaged if it cannot be read."""
         with told(), Session(self.engine) as session:
-            return visits.read(session, self.protocol, [visits.row(session, id)])[0]
+            return visits.read_one(session, self.protocol, visits.row(session, id))
 
     def visits(
         self, limit: int, day: str | None = None, open: bool | None = None, digits: str | None = None
     ) -> list[Visit]:
-        """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number."""
+        """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number.
+
+        Without those that `damaged` counts.
+        """
         digits = numbering.whole(digits.upper()) if digits else None
         with told(), Session(self.engine) as session:
             return visits.read(session, self.protocol, visits.found(session, limit, day, open, digits))
+
+    def damaged(self) -> int:
+        """How many visits cannot be read: they are not listed, and asked for alone are refused."""
+        with told(), Session(self.engine) as session:
+            return visits.damaged(session, self.protocol)
 
     def counts(self, day: str | None = None) -> dict[str, int]:
         """How many visits of a day (None: of all) are done, are to be finished, and were referred."""
@@ -225,7 +233,7 @@ class People:
         return end if self.clock.wall() < end else None
 
     def _read(self, session: Session, row: VisitRow) -> Visit:
-        return visits.read(session, self.protocol, [row])[0]
+        return visits.read_one(session, self.protocol, row)
 
     def _tell_outcome(self, session: Session, row: VisitRow) -> None:
         """Write down how a visit ends by what is known of it now."""

@@ -2,11 +2,13 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from alembic import command
@@ -17,22 +19,29 @@ from sqlalchemy import (
     REAL,
     URL,
     CheckConstraint,
+    ColumnElement,
     Connection,
     Engine,
     ForeignKey,
     Index,
     Integer,
+    Row,
+    Select,
     Text,
+    case,
     create_engine,
     event,
+    func,
     literal_column,
+    select,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
-from device.values import Capture, Eye
+from device.values import EYES, Capture
+from services.records import reading
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 
@@ -61,7 +70,7 @@ class CaptureRow(Shelf):
     simulated: Mapped[int]
     calibration_id: Mapped[str] = mapped_column(Text)
     report: Mapped[str] = mapped_column(Text)
-    files: Mapped[list["FileRow"]] = relationship(lazy="selectin", order_by="FileRow.name")
+    files: Mapped[list["FileRow"]] = relationship(order_by="FileRow.name")
 
     __table_args__ = (
         CheckConstraint("eye IN ('OD', 'OS')", name="eye_is_an_eye"),
@@ -72,7 +81,13 @@ class CaptureRow(Shelf):
     )
 
 
-KEPT = literal_column("captures.rowid", Integer)  # grows with each capture that is kept, as no date does
+KEPT = literal_column("captures.rowid", Integer).label("kept")  # grows with each one that is kept, as no date does
+CAPTURES: Select[*tuple[Any, ...]] = select(
+    KEPT, CaptureRow.id, CaptureRow.eye, CaptureRow.taken_at, CaptureRow.simulated, CaptureRow.calibration_id,
+    CaptureRow.report,
+)  # fmt: skip
+CaptureColumns = Row[*tuple[Any, ...]]
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # of a capture, and of each of its files
 
 
 class FileRow(Shelf):
@@ -291,8 +306,14 @@ def open_engine(path: Path) -> Engine:
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
     """Set up one new connection of the driver."""
     connection.isolation_level = None
+    connection.text_factory = _decoded
     for pragma in PRAGMAS:
         connection.execute(pragma).close()
+
+
+def _decoded(content: bytes) -> str:
+    """Text as it is, also where it is no UTF-8: `reading` refuses that for its row, the driver would for all rows."""
+    return content.decode(errors="surrogateescape")
 
 
 def _begin(connection: Connection) -> None:
@@ -348,6 +369,11 @@ def migration_config() -> Config:
     return config
 
 
+def json_part(column: Any, path: str) -> ColumnElement[Any]:
+    """What SQL's `json_extract` gives; NULL where the column is no JSON, for which that would fail the whole query."""
+    return case((func.json_valid(column), func.json_extract(column, path)))
+
+
 def utc_text(moment: datetime) -> str:
     """A moment as UTC text that sorts as time does; refuses a time without a zone (SettingError)."""
     if moment.tzinfo is None:
@@ -390,14 +416,35 @@ def row_of(capture: Capture, lengths_bytes: Mapping[str, int]) -> CaptureRow:
     )
 
 
-def capture_of(row: CaptureRow) -> Capture:
-    """The capture that a row describes; its moment is in UTC."""
-    return Capture(
-        id=row.id,
-        eye=cast(Eye, row.eye),  # the table's own check lets nothing else in
-        taken_at=datetime.fromisoformat(row.taken_at),
-        simulated=bool(row.simulated),
-        calibration_id=row.calibration_id,
-        report=json.loads(row.report),
-        files={file.name: file.sha256 for file in row.files},
-    )
+def capture_rows(session: Session, query: Select[*tuple[Any, ...]]) -> Sequence[CaptureColumns]:
+    """The rows of a query that narrows CAPTURES, as they are: nothing in them is known to be readable."""
+    return session.execute(query).all()
+
+
+def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, object]]]) -> Capture:
+    """The capture of a row of CAPTURES, with the names and SHA-256 of `files`, by capture; its moment is in UTC.
+
+    StoreDamaged if one of its rows cannot be read.
+    """
+    with reading.one_record(row.id):
+        if not NAME.fullmatch(reading.text(row.id)) or row.id not in files:
+            raise ValueError("no files belong to it")
+        return Capture(
+            id=row.id,
+            eye=reading.one_of(row.eye, *EYES),
+            taken_at=reading.moment(row.taken_at),
+            simulated=bool(reading.one_of(row.simulated, 0, 1)),
+            calibration_id=reading.text(row.calibration_id),
+            report=reading.report(row.report),
+            files={reading.text(name): reading.text(digest) for name, digest in files[row.id]},
+        )
+
+
+def files_of(session: Session, rows: Sequence[CaptureColumns]) -> dict[str, list[tuple[object, object]]]:
+    """The names and SHA-256 of the files of these captures, by capture."""
+    ids = [row.id for row in rows if isinstance(row.id, str) and NAME.fullmatch(row.id)]
+    found: dict[str, list[tuple[object, object]]] = defaultdict(list)
+    query = select(FileRow.capture_id, FileRow.name, FileRow.sha256).where(FileRow.capture_id.in_(ids))
+    for capture, name, digest in session.execute(query.order_by(FileRow.name)):
+        found[capture].append((name, digest))
+    return found

@@ -13,11 +13,11 @@ capture and no row may have lost its row: it is neither moved nor removed, and `
 
 import hashlib
 import logging
-import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -31,6 +31,7 @@ from device.errors import NotKept, SettingError, StoreDamaged, StoreError, Store
 from device.values import Capture
 from services.records import disk, schema
 from services.records.errand import Beside
+from services.records.reading import REMEDY, readable
 from services.records.schema import CaptureRow, FileRow, ShotRow, VisitRow
 from services.records.snapshots import Snapshots
 
@@ -40,7 +41,7 @@ RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit besi
 WHOLE = frozenset({"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"})  # of every release's captures
 LATELY = 100  # visits by which the next ones are judged
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+PAGE = 500  # rows that are read at once where all are
 
 
 class Store:
@@ -74,15 +75,12 @@ class Store:
                 self._refuse_to_begin_anew()
                 schema.migrate(self.engine, snapshots.make)
                 self.swept = self._sweep()
-                schema.checkpoint(self.engine)
+                self._checkpoint_if_possible()
             undo.pop_all()
 
     def close(self) -> None:
         """Write the log's rows into the main file, if the disk lets it, and let go of the database."""
-        try:
-            self.checkpoint()
-        except StoreError as error:  # nothing is lost: the rows stay in the log
-            log.warning("the log of the database stays: %s", error)
+        self._checkpoint_if_possible()
         self.engine.dispose()
 
     def checkpoint(self) -> bool:
@@ -94,6 +92,12 @@ class Store:
             return True
         with told():
             return schema.checkpoint(self.engine)
+
+    def _checkpoint_if_possible(self) -> None:
+        try:
+            self.checkpoint()
+        except StoreError as error:  # nothing is lost: the rows stay in the log
+            log.warning("the log of the database stays: %s", error)
 
     def log_bytes(self) -> int:
         """The length of the log."""
@@ -138,21 +142,29 @@ class Store:
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
         """The newest captures, newest first; with `before`, those kept before the capture of that name (NotKept).
 
-        In the order in which they were kept, whatever the date was set to meanwhile.
+        In the order in which they were kept, whatever the date was set to meanwhile; without those that `damaged`
+        counts.
         """
         if limit < 1:
             raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
-        query = select(CaptureRow).order_by(schema.KEPT.desc()).limit(limit)
+        out: list[Capture] = []
         with self._reading() as session:
-            if before is not None:
-                known = select(schema.KEPT).where(CaptureRow.id == _row(session, before).id)
-                query = query.where(session.scalars(known).one() > schema.KEPT)
-            return [schema.capture_of(row) for row in session.scalars(query)]
+            for page in _pages(session, limit, None if before is None else _row(session, before).kept):
+                out += page.captures
+                if len(out) >= limit:
+                    break
+        return out[:limit]
+
+    def damaged(self) -> int:
+        """How many captures have an entry that cannot be read: they are not listed, and asked for alone are refused."""
+        with self._reading() as session:
+            return sum(page.damaged for page in _pages(session, PAGE))
 
     def get(self, id: str) -> Capture:
-        """The capture of that name; NotKept if there is none, StoreDamaged if its folder is gone."""
+        """The capture of that name; NotKept if there is none, StoreDamaged if its entry is or its folder is gone."""
         with self._reading() as session:
-            capture = schema.capture_of(_row(session, id))
+            row = _row(session, id)
+            capture = schema.capture_of(row, schema.files_of(session, [row]))
         if not (self._captures / capture.id).is_dir():
             raise StoreDamaged(f"the folder of {capture.id} is gone")
         return capture
@@ -160,16 +172,17 @@ class Store:
     def read(self, id: str, name: str) -> bytes:
         """One file of a capture, exactly as it was kept; NotKept if there is none, StoreDamaged if it changed."""
         with self._reading() as session:
-            files = {file.name: file for file in _row(session, id).files}
+            row = _row(session, id)
+            files = dict(schema.files_of(session, [row]).get(row.id, ()))
         if name not in files:
             raise NotKept(f"{id} has no file named {name!r}")
-        file = files[name]  # the path is built from the row alone: a name from outside never touches the disk
+        # The path is built from the row alone: a name from outside never touches the disk.
         try:
-            content = (self._captures / file.capture_id / file.name).read_bytes()
+            content: bytes = (self._captures / row.id / name).read_bytes()
         except OSError as error:
-            raise StoreDamaged(f"{file.name} of {id} cannot be read: {error}") from error
-        if hashlib.sha256(content).hexdigest() != file.sha256:
-            raise StoreDamaged(f"{file.name} of {id} is not what was kept: its SHA-256 differs")
+            raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error
+        if hashlib.sha256(content).hexdigest() != files[name]:
+            raise StoreDamaged(f"{name} of {id} is not what was kept: its SHA-256 differs")
         return content
 
     def people_left(self, pictures: int) -> int:
@@ -268,16 +281,42 @@ def _is_whole(folder: Path) -> bool:
     return folder.is_dir() and {path.name for path in folder.iterdir()} >= WHOLE
 
 
-def _row(session: Session, id: str) -> CaptureRow:
-    row = session.get(CaptureRow, id) if _NAME.fullmatch(id) else None
-    if row is None:
+@dataclass(frozen=True)
+class _Page:
+    """Some captures, newest first, and how many more there are among them whose entry cannot be read."""
+
+    captures: list[Capture]
+    damaged: int
+
+
+def _pages(session: Session, size: int, before: int | None = None) -> Iterator[_Page]:
+    """All captures, newest first, in pages of `size` rows; `before` is the row number of the one that ends them."""
+    while True:
+        query = schema.CAPTURES.order_by(schema.KEPT.desc()).limit(size)
+        rows = schema.capture_rows(session, query if before is None else query.where(before > schema.KEPT))
+        if not rows:
+            return
+        files = schema.files_of(session, rows)
+        found = readable(rows, lambda row: schema.capture_of(row, files))  # noqa: B023  # called at once
+        yield _Page(found, len(rows) - len(found))
+        before = rows[-1].kept
+
+
+def _row(session: Session, id: str) -> schema.CaptureColumns:
+    """The row of a capture, of CAPTURES; NotKept if there is none, StoreDamaged if the name in it is another."""
+    known = schema.NAME.fullmatch(id) is not None
+    rows = schema.capture_rows(session, schema.CAPTURES.where(CaptureRow.id == id)) if known else []
+    if not rows:
         raise NotKept(f"there is no capture named {id!r}")
+    row = rows[0]
+    if row.id != id:  # found by the index, which still says what the row no longer does
+        raise StoreDamaged(f"the entry of {id!r} has another name", REMEDY)
     return row
 
 
 def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
     for name in (id, *files):
-        if not _NAME.fullmatch(name):
+        if not schema.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
     if not files:
         raise SettingError(f"{id} has no files, so there is nothing to keep")

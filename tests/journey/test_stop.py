@@ -1,4 +1,4 @@
-"""`diffuscope run` told to stop: it closes everything, so that the database is one file and nothing waits in its log."""
+"""`diffuscope run` told to stop: everything is closed, so that the database is one file."""
 
 import signal
 import sqlite3
