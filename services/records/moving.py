@@ -61,6 +61,18 @@ def place_of(session: Session, capture: str) -> ShotRow:
     return shot
 
 
+def asked_for(session: Session, capture: str) -> tuple[str, str | None, str | None]:
+    """The eye, visit and slot that a capture was pressed for, wherever it was moved since; StoreDamaged, NotKept."""
+    row = session.get(CaptureRow, capture)
+    if row is None:
+        raise NotKept("the picture of this press is not kept here", "Take the picture again.")
+    report = _report(row)
+    eye, slot = row.eye, report.get("slot")
+    if report.get("moved"):
+        eye, slot = report["moved"][0]["from_eye"], report["moved"][0]["from_slot"]
+    return eye, report.get("visit"), slot
+
+
 def same_field(protocol: Protocol, slot: str, eye: Eye) -> Slot:
     """The slot of that eye which looks at the same part; InputError if the programme has none."""
     field = protocol.slot(slot).field
