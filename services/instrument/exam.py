@@ -35,7 +35,7 @@ from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.errand import NO_ERRAND, Errand
 from services.records.store import Store
-from services.records.underway import Lost, Underway
+from services.records.underway import Underway
 
 log = logging.getLogger(__name__)
 
@@ -97,8 +97,7 @@ class Exam:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         Raises CalibrationOld or CalibrationStale where no picture should rest on the calibration.
-        The same `key` again gives the same picture, however often the network repeats the request; InputError if it was
-        that of another eye, visit or slot.
+        The same `key` again gives the same picture; InputError if it was that of another eye, visit or slot.
         """
         with self._turn:
             if (known := self._pressed.known(key, eye, errand)) is not None:
@@ -221,9 +220,7 @@ class Exam:
         taken_at = self.clock.wall()
         id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
         with self._answering(press, id):
-            self.underway.begin(
-                Lost(id, press.eye, press.errand.visit, press.errand.slot, press.errand.tries), press.key
-            )
+            self.underway.begin(press.under_way(id), press.key)
             self._tell_stage(press, id, "expose")
             begin_s = self.clock.now_s()
             frame, dark = expose(self.head, (press.eye,))
@@ -266,9 +263,7 @@ class Exam:
         """Whatever became of a press, it is under way no longer, nor is what a kill took of its `key`."""
         self.progress.over(id, kept)
         with suppress(StoreError):  # then a restart believes that it was lost, and asks for it again
-            self.underway.end(id)
-            if key is not None:
-                self.underway.answered(key)
+            self.underway.end(id, key)
 
     def _leave(self, press: Press) -> None:
         """The press gives its seat to another."""

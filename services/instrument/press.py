@@ -10,6 +10,7 @@ from device.recon.verdict import Verdict
 from device.values import Capture, Eye, Frame
 from services.records.errand import Errand
 from services.records.people import other_request
+from services.records.underway import Lost
 
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
@@ -32,6 +33,10 @@ class Press:
     eye: Eye
     errand: Errand
     key: str | None
+
+    def under_way(self, id: str) -> Lost:
+        """What is written down of it before its light, under the name of its capture."""
+        return Lost(id, self.eye, self.errand.visit, self.errand.slot, self.errand.tries)
 
 
 @dataclass(frozen=True)

@@ -120,10 +120,8 @@ def serve(
             log.warning("half-kept captures of the last run were moved to torn/: %s", ", ".join(store.swept))
         ready()
         stop.ending(_Server(config, house.bulletin)).run(sockets=[address])
-    if owner.failure is not None:
-        raise owner.failure
-    if stop.has_failed:
-        raise DiffuscopeError("the instrument stopped unexpectedly")
+    if owner.failure is not None or stop.has_failed:
+        raise owner.failure or DiffuscopeError("the instrument stopped unexpectedly")
 
 
 class _Stop:

@@ -34,7 +34,7 @@ def question(session: Session) -> Question | None:
     """The newest capture of an open visit that seems to be of the other eye, while nobody said which it is of."""
     newest = select(CaptureRow.id).order_by(schema.KEPT.desc()).limit(ASKED)
     seen, moved, confirmed = (
-        schema.json_part(CaptureRow.report, f"$.{path}") for path in ("laterality.eye", "moved", "confirmed")
+        reading.json_part(CaptureRow.report, f"$.{path}") for path in ("laterality.eye", "moved", "confirmed")
     )
     found = session.execute(
         select(CaptureRow.id, CaptureRow.eye, ShotRow.slot)

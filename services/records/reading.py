@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import Any, TypeVar
 
+from sqlalchemy import ColumnElement, case, func
+
 from device.errors import StoreDamaged
 from device.values import EYES
 
@@ -36,6 +38,11 @@ def readable(items: Sequence[Item], read: Callable[[Item], Value]) -> list[Value
         except StoreDamaged:
             continue
     return out
+
+
+def json_part(column: Any, path: str) -> ColumnElement[Any]:
+    """What SQL's `json_extract` gives; NULL where the column is no JSON, for which that would fail the whole query."""
+    return case((func.json_valid(column), func.json_extract(column, path)))
 
 
 def text(value: object) -> str:

@@ -2,9 +2,7 @@
 
 import json
 import math
-import re
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,29 +17,22 @@ from sqlalchemy import (
     REAL,
     URL,
     CheckConstraint,
-    ColumnElement,
     Connection,
     Engine,
     ForeignKey,
     Index,
     Integer,
-    Row,
-    Select,
     Text,
-    case,
     create_engine,
     event,
-    func,
     literal_column,
-    select,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
-from device.values import EYES, Capture
-from services.records import reading
+from device.values import Capture
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 
@@ -82,12 +73,6 @@ class CaptureRow(Shelf):
 
 
 KEPT = literal_column("captures.rowid", Integer).label("kept")  # grows with each one that is kept, as no date does
-CAPTURES: Select[*tuple[Any, ...]] = select(
-    KEPT, CaptureRow.id, CaptureRow.eye, CaptureRow.taken_at, CaptureRow.simulated, CaptureRow.calibration_id,
-    CaptureRow.report,
-)  # fmt: skip
-CaptureColumns = Row[*tuple[Any, ...]]
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # of a capture, and of each of its files
 
 
 class FileRow(Shelf):
@@ -369,11 +354,6 @@ def migration_config() -> Config:
     return config
 
 
-def json_part(column: Any, path: str) -> ColumnElement[Any]:
-    """What SQL's `json_extract` gives; NULL where the column is no JSON, for which that would fail the whole query."""
-    return case((func.json_valid(column), func.json_extract(column, path)))
-
-
 def utc_text(moment: datetime) -> str:
     """A moment as UTC text that sorts as time does; refuses a time without a zone (SettingError)."""
     if moment.tzinfo is None:
@@ -414,37 +394,3 @@ def row_of(capture: Capture, lengths_bytes: Mapping[str, int]) -> CaptureRow:
         report=report_text(capture.report),
         files=[FileRow(name=name, sha256=digest, bytes=lengths_bytes[name]) for name, digest in capture.files.items()],
     )
-
-
-def capture_rows(session: Session, query: Select[*tuple[Any, ...]]) -> Sequence[CaptureColumns]:
-    """The rows of a query that narrows CAPTURES, as they are: nothing in them is known to be readable."""
-    return session.execute(query).all()
-
-
-def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, object]]]) -> Capture:
-    """The capture of a row of CAPTURES, with the names and SHA-256 of `files`, by capture; its moment is in UTC.
-
-    StoreDamaged if one of its rows cannot be read.
-    """
-    with reading.one_record(row.id):
-        if not NAME.fullmatch(reading.text(row.id)) or row.id not in files:
-            raise ValueError("no files belong to it")
-        return Capture(
-            id=row.id,
-            eye=reading.one_of(row.eye, *EYES),
-            taken_at=reading.moment(row.taken_at),
-            simulated=bool(reading.one_of(row.simulated, 0, 1)),
-            calibration_id=reading.text(row.calibration_id),
-            report=reading.report(row.report),
-            files={reading.text(name): reading.text(digest) for name, digest in files[row.id]},
-        )
-
-
-def files_of(session: Session, rows: Sequence[CaptureColumns]) -> dict[str, list[tuple[object, object]]]:
-    """The names and SHA-256 of the files of these captures, by capture."""
-    ids = [row.id for row in rows if isinstance(row.id, str) and NAME.fullmatch(row.id)]
-    found: dict[str, list[tuple[object, object]]] = defaultdict(list)
-    query = select(FileRow.capture_id, FileRow.name, FileRow.sha256).where(FileRow.capture_id.in_(ids))
-    for capture, name, digest in session.execute(query.order_by(FileRow.name)):
-        found[capture].append((name, digest))
-    return found

@@ -29,7 +29,7 @@ from sqlalchemy.orm import Session
 from device.clock import Clock, SystemClock
 from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
 from device.values import Capture
-from services.records import disk, schema
+from services.records import captures, disk, schema
 from services.records.errand import Beside
 from services.records.reading import REMEDY, readable
 from services.records.schema import CaptureRow, FileRow, ShotRow, VisitRow
@@ -164,7 +164,7 @@ class Store:
         """The capture of that name; NotKept if there is none, StoreDamaged if its entry is or its folder is gone."""
         with self._reading() as session:
             row = _row(session, id)
-            capture = schema.capture_of(row, schema.files_of(session, [row]))
+            capture = captures.capture_of(row, captures.files_of(session, [row]))
         if not (self._captures / capture.id).is_dir():
             raise StoreDamaged(f"the folder of {capture.id} is gone")
         return capture
@@ -173,7 +173,7 @@ class Store:
         """One file of a capture, exactly as it was kept; NotKept if there is none, StoreDamaged if it changed."""
         with self._reading() as session:
             row = _row(session, id)
-            files = dict(schema.files_of(session, [row]).get(row.id, ()))
+            files = dict(captures.files_of(session, [row]).get(row.id, ()))
         if name not in files:
             raise NotKept(f"{id} has no file named {name!r}")
         # The path is built from the row alone: a name from outside never touches the disk.
@@ -292,20 +292,20 @@ class _Page:
 def _pages(session: Session, size: int, before: int | None = None) -> Iterator[_Page]:
     """All captures, newest first, in pages of `size` rows; `before` is the row number of the one that ends them."""
     while True:
-        query = schema.CAPTURES.order_by(schema.KEPT.desc()).limit(size)
-        rows = schema.capture_rows(session, query if before is None else query.where(before > schema.KEPT))
+        query = captures.CAPTURES.order_by(schema.KEPT.desc()).limit(size)
+        rows = captures.capture_rows(session, query if before is None else query.where(before > schema.KEPT))
         if not rows:
             return
-        files = schema.files_of(session, rows)
-        found = readable(rows, lambda row: schema.capture_of(row, files))  # noqa: B023  # called at once
+        files = captures.files_of(session, rows)
+        found = readable(rows, lambda row: captures.capture_of(row, files))  # noqa: B023  # called at once
         yield _Page(found, len(rows) - len(found))
         before = rows[-1].kept
 
 
-def _row(session: Session, id: str) -> schema.CaptureColumns:
+def _row(session: Session, id: str) -> captures.CaptureColumns:
     """The row of a capture, of CAPTURES; NotKept if there is none, StoreDamaged if the name in it is another."""
-    known = schema.NAME.fullmatch(id) is not None
-    rows = schema.capture_rows(session, schema.CAPTURES.where(CaptureRow.id == id)) if known else []
+    known = captures.NAME.fullmatch(id) is not None
+    rows = captures.capture_rows(session, captures.CAPTURES.where(CaptureRow.id == id)) if known else []
     if not rows:
         raise NotKept(f"there is no capture named {id!r}")
     row = rows[0]
@@ -316,7 +316,7 @@ def _row(session: Session, id: str) -> schema.CaptureColumns:
 
 def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
     for name in (id, *files):
-        if not schema.NAME.fullmatch(name):
+        if not captures.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
     if not files:
         raise SettingError(f"{id} has no files, so there is nothing to keep")

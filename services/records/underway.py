@@ -52,14 +52,15 @@ class Underway:
             disk.write_file(self._folder / f"{press.id}.json", json.dumps(asdict(press) | {"key": key}).encode())
             disk.settle(self._folder)
 
-    def end(self, id: str) -> None:
-        """It was answered; or whoever lost it has heard of it, and has done what was to be done."""
+    def end(self, id: str, key: str | None = None) -> None:
+        """It was answered; or whoever lost it has heard of it, and has done what was to be done.
+
+        With the `key` of a request that has its picture now, what a kill took of that request is over too.
+        """
         with told():
             (self._folder / f"{id}.json").unlink(missing_ok=True)
-
-    def answered(self, key: str) -> None:
-        """The request of this key was answered with a picture: what was lost of it before is not to be taken again."""
-        self.forget(lambda one: self._keys.get(one.id) == key)
+        if key is not None:
+            self.forget(lambda one: self._keys.get(one.id) == key)
 
     def forget(self, over: Callable[[Lost], bool]) -> None:
         """Of what was lost, forget what is over."""

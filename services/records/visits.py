@@ -13,7 +13,7 @@ from sqlalchemy import Integer, case, func, literal_column, select
 from sqlalchemy.orm import Session
 
 from device.errors import NotKept, StoreDamaged
-from services.records import reading, schema
+from services.records import reading
 from services.records.protocol import Protocol
 from services.records.reading import REMEDY, one_record, readable
 from services.records.schema import KEPT, CaptureRow, FieldRow, IdentifierRow, ShotRow, SlotRow, VisitRow
@@ -48,7 +48,7 @@ def found(session: Session, limit: int, day: str | None, open: bool | None, digi
 
 def counts(session: Session, day: str | None) -> dict[str, int]:
     """How many visits of a day (None: of all) are done, are to be finished, and were referred."""
-    code = schema.json_part(VisitRow.outcome, "$.code")
+    code = reading.json_part(VisitRow.outcome, "$.code")
     query = select(
         func.count(VisitRow.finished_at), func.count(), func.count(case((code.like("refer%"), 1)))
     ).select_from(VisitRow)
@@ -132,7 +132,7 @@ def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, A
 def _taken(session: Session, ids: Sequence[str]) -> dict[Pair, list[tuple[object, object]]]:
     """The captures of each slot, oldest first, and what was thought of them, as it is kept."""
     query = (
-        select(ShotRow.visit, ShotRow.slot, ShotRow.capture, schema.json_part(CaptureRow.report, "$.verdict"))
+        select(ShotRow.visit, ShotRow.slot, ShotRow.capture, reading.json_part(CaptureRow.report, "$.verdict"))
         .outerjoin(CaptureRow, CaptureRow.id == ShotRow.capture)  # one without its row still was taken
         .where(ShotRow.visit.in_(ids))
         .order_by(KEPT)

@@ -77,6 +77,6 @@ def test_what_a_kill_took_is_over_when_its_key_was_answered_after_all(tmp_path: 
         before.begin(other, OTHER_KEY)
         again = Underway(store)
         assert again.lost == (lost, other)
-        again.answered(KEY)
+        again.end("20260301T120002-OD-ef", KEY)
         assert again.lost == (other,)
         assert Underway(store).lost == (other,)
