@@ -5,6 +5,7 @@ of the driver. Whatever passes here can be written as JSON: text without half ch
 """
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -16,6 +17,8 @@ from device.errors import StoreDamaged
 from device.values import EYES
 
 REMEDY = "Its entry in the database is damaged. Nothing was removed from the disk. Call the technician."
+# What JSON may say that cannot be written again: no number, one too large for a float, half of a character.
+_RISKY = re.compile(r"NaN|Infinity|[0-9.][eE][+]?[0-9]{3}|[\\]u[dD][89a-fA-F]")
 Item = TypeVar("Item")
 Value = TypeVar("Value")
 
@@ -71,8 +74,9 @@ def moment(value: object) -> datetime:
 
 def parsed(value: object) -> Any:
     """What JSON says; ValueError if it is none, or says what cannot be written as JSON again."""
-    said = json.loads(text(value))
-    json.dumps(said, allow_nan=False, ensure_ascii=False).encode()
+    said = json.loads(written := text(value))
+    if _RISKY.search(written):
+        json.dumps(said, allow_nan=False, ensure_ascii=False).encode()
     return said
 
 

@@ -189,3 +189,12 @@ def test_a_moment_is_one_with_a_zone(store: Store) -> None:
         tables.execute("UPDATE captures SET taken_at = '2026-03-01T12:00:00' WHERE id = 'c0'")
     assert datetime.now(UTC) > min(one.taken_at for one in store.captures())
     assert store.damaged() == 1
+
+
+@pytest.mark.parametrize("said", ["1e3456", "NaN", "-Infinity", "1.5E+999", '"\\ud83d"', '{"a": 1', "[1]"])
+def test_a_report_that_cannot_be_written_as_json_again_is_damaged(store: Store, said: str) -> None:
+    report = said if said.startswith(("{", "[")) else f'{{"noise_dn": {said}}}'
+    with closing(database(store.folder)) as tables:
+        tables.execute("UPDATE captures SET report = ? WHERE id = 'c1'", (report,))
+    assert [one.id for one in store.captures()] == ["c2", "c0"]
+    assert store.damaged() == 1
