@@ -39,8 +39,10 @@ class Facts:
     """What an instrument knows of itself at one moment; None where it has no such part.
 
     `battery` is a share; `newest` when the last capture was; `presses` how long the last presses took, and by how much
-    each was later than it was allowed to be; `torn_bytes` what half-kept captures hold, one by one; `unsent` how many
-    visits wait to be sent, and how many of them need somebody (None: nothing is sent from here).
+    each was later than it was allowed to be; `torn_bytes` what half-kept captures hold, one by one; `orphans` how many
+    captures are on the disk without an entry in the database; `damaged` how many captures and visits have an entry that
+    cannot be read; `unsent` how many visits wait to be sent, and how many of them need somebody (None: nothing is sent
+    from here).
     """
 
     state: str
@@ -60,6 +62,8 @@ class Facts:
     newest: datetime | None
     presses: Sequence[tuple[float, float]]
     torn_bytes: Sequence[int] = ()
+    orphans: int = 0
+    damaged: int = 0
     unsent: tuple[int, int] | None = None
 
 
@@ -88,8 +92,31 @@ def calibration(facts: Facts) -> Check:
 
 
 def captures(facts: Facts) -> Check:
-    """The shelf takes a new file, and gives the newest capture back as it was kept."""
-    return _unless(facts.store, "captures", "safe", "can be written and read", of_release=True)
+    """The shelf takes a new file, gives the newest capture back as it was kept, and every capture has its entry."""
+    limit = "can be written and read"
+    if facts.store is not None:
+        return _unless(facts.store, "captures", "", limit, of_release=True)
+    said, remedies = [], []
+    if facts.orphans:
+        many = _number(facts.orphans, "capture is", "captures are")
+        said.append(f"{many} on the disk without an entry in the database")
+        remedies.append(ORPHANED)
+    if facts.damaged:
+        many = _number(facts.damaged, "entry", "entries")
+        said.append(f"{many} of the database cannot be read")
+        remedies.append(DAMAGED)
+    return Check("captures", not said, "; ".join(said) or "safe", limit, " ".join(remedies), of_release=True)
+
+
+ORPHANED = (
+    "Pictures without an entry are not listed. They stay on the disk: remove nothing, copy the folder of the captures "
+    "to another disk, and call the technician."
+)
+DAMAGED = "What has such an entry is not listed. Its pictures stay on the disk. Call the technician."
+
+
+def _number(number: int, one: str, more: str) -> str:
+    return f"{number} {one if number == 1 else more}"
 
 
 def space(facts: Facts) -> Check:

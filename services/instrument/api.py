@@ -63,6 +63,7 @@ from device.values import Capture, Eye
 from services.health.checks import judged
 from services.health.probe import as_json
 from services.instrument.carrier import Carrier
+from services.instrument.checkpointing import Checkpoints
 from services.instrument.exporting import Sticks
 from services.instrument.fitness import shown as shown_findings
 from services.instrument.forgery import SAFE, OwnPageOnly, own_names
@@ -180,8 +181,9 @@ def create_app(
     outbox, pack = Outbox(store.engine, clock), packer(store, people)
     sender = Sender(outbox, pack, carrier, lambda: owner.is_idle, clock) if carrier is not None else None
     notices = Notices(owner, people, lease, sender)
+    checkpoints = Checkpoints(store, lambda: owner.is_idle, lambda: owner.state == "aim", clock)
     app = FastAPI(
-        title="Diffuscope", version=version("diffuscope"), lifespan=_life(owner, notices),
+        title="Diffuscope", version=version("diffuscope"), lifespan=_life(owner, notices, checkpoints),
         openapi_url="/api/openapi.json", docs_url=None, redoc_url=None,
         responses={"4XX": {"model": Refusal}, "5XX": {"model": Refusal}},
     )  # fmt: skip
@@ -191,7 +193,7 @@ def create_app(
     app.add_middleware(SafeHeaders)
     only_one = Depends(one_screen(lease))
     _captures(app, owner, people, promised, only_one)
-    app.include_router(visits_router(people, lease, promised), dependencies=[only_one])
+    app.include_router(visits_router(people, lease, promised, checkpoints.soon), dependencies=[only_one])
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
     app.include_router(outbox_router(sender), dependencies=[only_one])
     _state(app, owner, people, notices)
@@ -201,17 +203,21 @@ def create_app(
     return app
 
 
-def _life(owner: Owner, notices: Notices) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+def _life(
+    owner: Owner, notices: Notices, checkpoints: Checkpoints
+) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     """What runs beside the server for as long as it runs."""
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
         notices.begin()
+        checkpoints.begin()
         if notices.sender is not None:
             notices.sender.begin()
         yield
         if notices.sender is not None:
             notices.sender.close()
+        checkpoints.close()
         notices.close()
         owner.house.bulletin.close()
 
@@ -327,7 +333,7 @@ def _captures(app: FastAPI, owner: Owner, people: People, promised: Promised, on
     @app.post("/api/captures", status_code=201, dependencies=[only_one])
     async def press(press: Press) -> dict[str, Any]:
         """Take one picture and keep it: of a slot of a visit with consent, or, without both, a test picture."""
-        kept = people.answered(press.key) if press.key else None
+        kept = people.answered(press.key, press.eye, press.visit, press.slot) if press.key else None
         if kept is not None:  # by an instrument that was started anew since then
             return shown(store.get(kept))
         errand = people.errand(press.eye, press.key, press.visit, press.slot)
@@ -377,7 +383,7 @@ def _state(app: FastAPI, owner: Owner, people: People, notices: Notices) -> None
     @app.get("/api/health")
     def health() -> dict[str, Any]:
         """Whether it can take pictures now: every check with its limit and what to do; and how the calibration fits."""
-        known = facts(owner, len(people.protocol.slots), notices.sender)
+        known = facts(owner, people, notices.sender)
         checks = judged(known)
         return {
             "ok": all(check.ok for check in checks), "state": known.state, "space_left": known.captures_left,

@@ -34,7 +34,7 @@ from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
 from services.records.errand import NO_ERRAND, Errand
 from services.records.store import Store
-from services.records.underway import Lost, Underway
+from services.records.underway import Underway
 
 log = logging.getLogger(__name__)
 
@@ -96,10 +96,10 @@ class Exam:
         """Take one picture; the future holds what was kept. Raises Busy while no press can be taken.
 
         Raises CalibrationOld or CalibrationStale where no picture should rest on the calibration.
-        The same `key` again gives the same picture, however often the network repeats the request.
+        The same `key` again gives the same picture; InputError if it was that of another eye, visit or slot.
         """
         with self._turn:
-            if (known := self._pressed.known(key)) is not None:
+            if (known := self._pressed.known(key, eye, errand)) is not None:
                 return known
             if self._closing or self._ended:
                 raise Busy("the instrument is being switched off", "Wait until it is back, then press again.")
@@ -111,7 +111,7 @@ class Exam:
             future.set_running_or_notify_cancel()  # a page that goes away does not take the picture with it
             self._in_the_making += 1
             if key is not None:
-                self._pressed.remember(key, future)
+                self._pressed.remember(key, self._press)
             self._turn.notify_all()
         return future
 
@@ -220,7 +220,7 @@ class Exam:
         id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
         with self._answering(press, id):
             press.errand.permit()  # again: it may have been withdrawn while the press waited
-            self.underway.begin(Lost(id, press.eye, press.errand.visit, press.errand.slot, press.errand.tries))
+            self.underway.begin(press.under_way(id), press.key)
             self._tell_stage(press, id, "expose")
             begin_s = self.clock.now_s()
             frame, dark = expose(self.head, (press.eye,))
@@ -235,7 +235,7 @@ class Exam:
         shot = self._exposed.popleft()
         with self._answering(shot.press, shot.id):
             kept = self._make(shot)
-            self._over(shot.id, kept=True)
+            self._over(shot.id, kept=True, key=shot.press.key)
             self._report_problem(None)
             self._leave(shot.press)
             shot.press.answer.set_result(kept)
@@ -259,11 +259,11 @@ class Exam:
         finally:
             self.head.light.off()
 
-    def _over(self, id: str, kept: bool) -> None:
-        """Whatever became of a press, it is under way no longer."""
+    def _over(self, id: str, kept: bool, key: str | None = None) -> None:
+        """Whatever became of a press, it is under way no longer, nor is what a kill took of its `key`."""
         self.progress.over(id, kept)
         with suppress(StoreError):  # then a restart believes that it was lost, and asks for it again
-            self.underway.end(id)
+            self.underway.end(id, key)
 
     def _leave(self, press: Press) -> None:
         """The press gives its seat to another."""

@@ -137,11 +137,8 @@ def taken_with(store: Store, calibration_id: str, since: datetime) -> Iterable[C
 
 def spheres_dpt(captures: Iterable[Capture]) -> list[tuple[datetime, float]]:
     """The mean sphere that each report found, positive for myopia, and when."""
-    return [
-        (one.taken_at, -one.report["refraction_dpt"]["sphere"])
-        for one in captures
-        if one.report.get("refraction_dpt") is not None
-    ]
+    spheres = ((one.taken_at, (one.report.get("refraction_dpt") or {}).get("sphere")) for one in captures)
+    return [(taken_at, -sphere) for taken_at, sphere in spheres if sphere is not None]
 
 
 def exposures(store: Store, capture: Capture, between: Callable[[], None] = lambda: None) -> Exposures:

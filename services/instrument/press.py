@@ -9,6 +9,8 @@ from device.recon.aim import Aim
 from device.recon.verdict import Verdict
 from device.values import EYES, Capture, Eye, Frame
 from services.records.errand import Errand, Permit, permit_test_picture
+from services.records.people import other_request
+from services.records.underway import Lost
 
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
@@ -43,6 +45,10 @@ class Press:
     errand: Errand
     key: str | None
 
+    def under_way(self, id: str) -> Lost:
+        """What is written down of it before its light, under the name of its capture."""
+        return Lost(id, self.eye, self.errand.visit, self.errand.slot, self.errand.tries)
+
 
 @dataclass(frozen=True)
 class Exposed:
@@ -62,14 +68,20 @@ class Keys:
     """The last presses by the names that pages gave them; whoever uses it holds the exam's turn."""
 
     def __init__(self) -> None:
-        self._answers: OrderedDict[str, Future[Capture]] = OrderedDict()
+        self._presses: OrderedDict[str, Press] = OrderedDict()
 
-    def known(self, key: str | None) -> Future[Capture] | None:
-        """The answer to a press with this key, if there was one lately."""
-        return None if key is None else self._answers.get(key)
+    def known(self, key: str | None, eye: Eye, errand: Errand) -> Future[Capture] | None:
+        """The answer to this press, if there was one with this key lately; InputError if that was another press."""
+        press = None if key is None else self._presses.get(key)
+        if press is None:
+            return None
+        before = press.eye, press.errand.visit, press.errand.slot
+        if before != (eye, errand.visit, errand.slot):
+            raise other_request()
+        return press.answer
 
-    def remember(self, key: str, answer: Future[Capture]) -> None:
+    def remember(self, key: str, press: Press) -> None:
         """From now on this key is that press."""
-        self._answers[key] = answer
-        while len(self._answers) > REMEMBERED:
-            self._answers.popitem(last=False)
+        self._presses[key] = press
+        while len(self._presses) > REMEMBERED:
+            self._presses.popitem(last=False)

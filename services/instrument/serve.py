@@ -5,17 +5,20 @@ import logging
 import os
 import signal
 import socket
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from threading import Event
+from types import FrameType
+from typing import Self
 
 import uvicorn
 
 from device.calibration.archive import Archive
 from device.clock import SystemClock
 from device.dose import light_limits
-from device.errors import InputError
+from device.errors import DiffuscopeError, InputError
 from device.head import open_bench, open_head
 from device.spec import InstrumentSpec
 from services.instrument.api import create_app
@@ -41,6 +44,7 @@ log = logging.getLogger(__name__)
 
 BACKLOG = 128
 HANDED_OVER = 3  # the file descriptor of sd_listen_fds(3)
+STOPPED_BY = (signal.SIGTERM, signal.SIGINT)
 
 
 def bound(host: str, port: int) -> socket.socket:
@@ -84,17 +88,18 @@ def serve(
     protocol: Protocol, names: tuple[str, ...] = (), updater: tuple[Path | None, Path | None] = (None, None),
     carrier: Carrier | None = None,
 ) -> None:  # fmt: skip
-    """Open the head and the shelf, say `ready`, and serve the page at `address` until it is told to stop.
+    """Open the head and the shelf, say `ready`, and serve the page at `address` until SIGTERM, SIGINT or a failure.
 
     The page is there while the exam still makes its plans; raises what keeps it from making them. It answers to
     `names`, beside its own and local ones. `updater`: its folder, and where it takes wishes; `carrier`: to a receiver.
+    Whatever ends it, everything that was opened is closed. SystemExit(0) for a signal before the server was there.
     """
     clock = SystemClock()
-    with address, Store(data, clock=clock) as store, ExitStack() as undo:
+    with _Stop() as stop, address, Store(data, clock=clock) as store, ExitStack() as undo:
         book = LightBook(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_of(spec, data))
         diary = undo.enter_context(closing(Diary(data / "diary")))
-        house = House(spec, archive, store, Bulletin(), clock, watchdog, _stop_the_process)
+        house = House(spec, archive, store, Bulletin(), clock, watchdog, stop.failed)
         explorer = Explorer(data / "explorer", data / "plans", clock, spec, house.bulletin.tell)
 
         def exam() -> Exam:
@@ -104,6 +109,7 @@ def serve(
             )
 
         owner = Owner(house, exam, lambda: open_bench(spec, clock))
+        undo.callback(owner.close)
         door, desk = Door(data / "technician.json", clock), UpdateDesk(*updater, clock, version("diffuscope"))
         rooms = [explorer_routes(explorer, store, lambda: owner.exam.head.calibration), update_routes(desk, door)]
         rooms.append(diary_routes(diary, Sticks(), clock))
@@ -112,13 +118,54 @@ def serve(
         log.info("started, version %s", app.version)
         if store.swept:
             log.warning("half-kept captures of the last run were moved to torn/: %s", ", ".join(store.swept))
-        try:
-            ready()
-            _Server(config, house.bulletin).run(sockets=[address])
-        finally:
-            owner.close()
-        if owner.failure is not None:
-            raise owner.failure
+        ready()
+        stop.ending(_Server(config, house.bulletin)).run(sockets=[address])
+    if owner.failure is not None or stop.has_failed:
+        raise owner.failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+class _Stop:
+    """Ends the server on SIGTERM, on SIGINT, or when the head has failed, so that every `close` runs afterwards.
+
+    uvicorn handles the signals too, but raises them again once its server has ended, and SIGTERM then kills the
+    process before anything is closed. A signal that comes before there is a server raises SystemExit(0) in the main
+    thread; one that comes while everything is being closed changes nothing. The earlier handlers are restored at exit.
+    """
+
+    def __init__(self) -> None:
+        self._failed = Event()
+        self._server: uvicorn.Server | None = None
+
+    def __enter__(self) -> Self:
+        self._before = {number: signal.signal(number, self._stop) for number in STOPPED_BY}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether `failed` was called."""
+        return self._failed.is_set()
+
+    def failed(self) -> None:
+        """End the server, from any thread; systemd starts it anew."""
+        self._failed.set()
+        if self._server is not None:
+            self._server.should_exit = True
+
+    def ending(self, server: uvicorn.Server) -> uvicorn.Server:
+        """The same server, which is the one to be ended from now on."""
+        self._server = server
+        if self._failed.is_set():
+            server.should_exit = True
+        return server
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._server is None:
+            raise SystemExit(0)
+        self._server.handle_exit(number, frame)
 
 
 class _Server(uvicorn.Server):
@@ -128,11 +175,12 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._bulletin = bulletin
 
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave the signals to `_Stop`."""
+        yield
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End the streams, then what uvicorn does."""
         self._bulletin.close()
         await super().shutdown(sockets)
-
-
-def _stop_the_process() -> None:
-    os.kill(os.getpid(), signal.SIGTERM)  # the server closes its connections and what it holds; systemd starts it anew

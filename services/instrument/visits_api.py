@@ -1,5 +1,6 @@
 """The addresses of persons and visits: what a page asks of the shelf, in the page's own words."""
 
+from collections.abc import Callable
 from datetime import date
 from typing import Annotated, Any
 
@@ -74,11 +75,11 @@ class Asking(Order):
     release: bool = False
 
 
-def visits_router(people: People, lease: Lease, promised: Promised) -> APIRouter:
-    """What there is to ask about persons and visits."""
+def visits_router(people: People, lease: Lease, promised: Promised, finished: Callable[[], None]) -> APIRouter:
+    """What there is to ask about persons and visits; `finished` hears of each finish."""
     router = APIRouter()
     _reading(router, people)
-    _changing(router, people, promised)
+    _changing(router, people, promised, finished)
 
     @router.post("/api/captures/{id}/eye")
     def move(id: str, order: OfEye) -> dict[str, Any]:
@@ -123,7 +124,7 @@ def _reading(router: APIRouter, people: People) -> None:
         return shown_visit(people.get(id), people)
 
 
-def _changing(router: APIRouter, people: People, promised: Promised) -> None:
+def _changing(router: APIRouter, people: People, promised: Promised, finished: Callable[[], None]) -> None:
     @router.post("/api/visits", status_code=201)
     def begin(order: Begin) -> dict[str, Any]:
         """Begin a visit; without a number, of somebody new with the next one."""
@@ -153,7 +154,9 @@ def _changing(router: APIRouter, people: People, promised: Promised) -> None:
     def finish(id: str, order: Order) -> dict[str, Any]:
         """Finish with what there is, once no picture of it is being made any more; the answer has the outcome."""
         promised.wait(id)
-        return shown_visit(people.finish(order.key, id), people)
+        visit = people.finish(order.key, id)
+        finished()
+        return shown_visit(visit, people)
 
     @router.post("/api/visits/{id}/reopen")
     def reopen(id: str, order: Order) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from services.health.checks import Facts
 from services.instrument.owner import Owner
 from services.instrument.pace import BUDGET_S
 from services.instrument.sending import Sender
+from services.records.people import People
 from services.records.store import Store
 
 COMPUTER_HEAT = Path("/sys/class/thermal/thermal_zone0/temp")
@@ -24,19 +25,16 @@ GLANCE_S = 0.02
 PRESSES = 100
 
 
-def facts(owner: Owner, pictures: int, sender: Sender | None = None) -> Facts:
-    """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts.
-
-    `pictures` is how many the protocol takes of a person.
-    """
+def facts(owner: Owner, people: People, sender: Sender | None = None) -> Facts:
+    """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts."""
     house, head = owner.house, owner.head
     chips, bus = head.chips if head is not None else Chips(), house.spec.bus
-    newest, store = _shelf(house.store)
+    newest, orphans, damaged, store = _shelf(house.store, people)
     battery, thermometer = chips.battery, chips.thermometer
     return Facts(
         state=owner.state, problem=owner.problem, lamp_is_dark=head is None or _goes_dark(head, house.clock),
         calibration=_calibration(owner), store=store,
-        captures_left=house.store.space_left(), people_left=house.store.people_left(pictures),
+        captures_left=house.store.space_left(), people_left=house.store.people_left(len(people.protocol.slots)),
         battery=_told(lambda: battery.read().fraction) if battery else None, emptiest=bus.emptiest if bus else 0.0,
         head_c=_told(thermometer.read_c) if thermometer else None, warmest_c=bus.warmest_c if bus else 100.0,
         computer_c=int(COMPUTER_HEAT.read_text()) / 1000 if COMPUTER_HEAT.exists() else None,
@@ -44,7 +42,7 @@ def facts(owner: Owner, pictures: int, sender: Sender | None = None) -> Facts:
         newest=newest[0].taken_at if newest else None,
         presses=[(spent_s, spent_s - _budget_s(one)) for one in newest if (spent_s := _press_s(one)) > 0],
         unsent=None if sender is None else sender.in_need(),
-        torn_bytes=list(house.store.torn().values()),
+        torn_bytes=list(house.store.torn().values()), orphans=orphans, damaged=damaged,
     )  # fmt: skip
 
 
@@ -76,23 +74,26 @@ def _calibration(owner: Owner) -> DiffuscopeError | None:
     return None
 
 
-def _shelf(store: Store) -> tuple[list[Capture], StoreError | None]:
-    """The last captures, and what is wrong with the shelf: it must take a file and give the newest capture back."""
+def _shelf(store: Store, people: People) -> tuple[list[Capture], int, int, StoreError | None]:
+    """The last captures, how many have no entry, how many entries cannot be read, and what is wrong with the shelf.
+
+    It must take a file and give the newest capture back.
+    """
     try:
         newest = store.captures(PRESSES)
         store.try_out()
         for name in newest[0].files if newest else ():
             store.read(newest[0].id, name)
+        return newest, len(store.orphans()), store.damaged() + people.damaged(), None
     except StoreError as error:
-        return [], error
-    return newest, None
+        return [], 0, 0, error
 
 
 def _press_s(capture: Capture) -> float:
     """From the button to the kept picture; 0 where its report does not say."""
-    return float(sum(capture.report.get("seconds", {}).values()))
+    return float(sum(spent_s or 0.0 for spent_s in (capture.report.get("seconds") or {}).values()))
 
 
 def _budget_s(capture: Capture) -> float:
     """What it was allowed to take; reports did not say before a person could choose."""
-    return float(capture.report.get("budget_s", BUDGET_S))
+    return float(capture.report.get("budget_s") or BUDGET_S)

@@ -3,17 +3,16 @@
 Or somebody says that its eye is the right one: then nobody asks again.
 """
 
-import json
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import Row, select
 from sqlalchemy.orm import Session
 
 from device.errors import InputError, NotKept
 from device.values import Eye
-from services.records import schema
+from services.records import reading, schema
 from services.records.light_book import count_also
 from services.records.protocol import CHOOSE, Protocol, Slot
 from services.records.schema import CaptureRow, ShotRow, VisitRow
@@ -35,17 +34,23 @@ def question(session: Session) -> Question | None:
     """The newest capture of an open visit that seems to be of the other eye, while nobody said which it is of."""
     newest = select(CaptureRow.id).order_by(schema.KEPT.desc()).limit(ASKED)
     seen, moved, confirmed = (
-        func.json_extract(CaptureRow.report, f"$.{path}") for path in ("laterality.eye", "moved", "confirmed")
+        reading.json_part(CaptureRow.report, f"$.{path}") for path in ("laterality.eye", "moved", "confirmed")
     )
     found = session.execute(
         select(CaptureRow.id, CaptureRow.eye, ShotRow.slot)
         .join(ShotRow, ShotRow.capture == CaptureRow.id)
         .join(VisitRow, VisitRow.id == ShotRow.visit)
         .where(CaptureRow.id.in_(newest), VisitRow.finished_at.is_(None))
-        .where(seen.is_not(None), seen != CaptureRow.eye, moved.is_(None), confirmed.is_(None))
+        .where(seen.in_(OTHER), CaptureRow.eye.in_(OTHER), seen != CaptureRow.eye)
+        .where(moved.is_(None), confirmed.is_(None))
         .order_by(schema.KEPT.desc())
-    ).first()
-    return None if found is None else Question(found.id, found.slot, OTHER[found.eye])
+    ).all()
+    return next(iter(reading.readable(found, _question)), None)
+
+
+def _question(row: Row[str, str, str]) -> Question:
+    with reading.one_record(row.id):
+        return Question(reading.text(row.id), reading.text(row.slot), OTHER[row.eye])
 
 
 def place_of(session: Session, capture: str) -> ShotRow:
@@ -56,6 +61,18 @@ def place_of(session: Session, capture: str) -> ShotRow:
     if session.get(CaptureRow, capture) is None:
         raise NotKept(f"there is no capture named {capture!r}")
     raise NotKept("this is a test picture: it belongs to no person", "Take the picture again for this person.")
+
+
+def asked_for(session: Session, capture: str) -> tuple[str, str | None, str | None]:
+    """The eye, visit and slot that a capture was pressed for, wherever it was moved since; StoreDamaged, NotKept."""
+    row = session.get(CaptureRow, capture)
+    if row is None:
+        raise NotKept("the picture of this press is not kept here", "Take the picture again.")
+    report = _report(row)
+    eye, slot = row.eye, report.get("slot")
+    if report.get("moved"):
+        eye, slot = report["moved"][0]["from_eye"], report["moved"][0]["from_slot"]
+    return eye, report.get("visit"), slot
 
 
 def same_field(protocol: Protocol, slot: str, eye: Eye) -> Slot:
@@ -75,7 +92,7 @@ def relabel(session: Session, shot: ShotRow, to: Slot, at: datetime, by: str | N
     a tap is no proof.
     """
     row = session.get_one(CaptureRow, shot.capture)
-    report: dict[str, Any] = json.loads(row.report)
+    report = _report(row)
     told = {"from_eye": row.eye, "from_slot": shot.slot, "eye": to.eye, "at": at.isoformat(), "by": by}
     report |= {"slot": to.id, "moved": [*report.get("moved", []), told]}
     counted = {row.eye, *(one["from_eye"] for one in report["moved"])}
@@ -84,8 +101,14 @@ def relabel(session: Session, shot: ShotRow, to: Slot, at: datetime, by: str | N
     row.eye, row.report, shot.slot = to.eye, schema.report_text(report), to.id
 
 
+def _report(row: CaptureRow) -> dict[str, Any]:
+    """The report of a capture; StoreDamaged if it cannot be read."""
+    with reading.one_record(row.id):
+        return reading.report(row.report)
+
+
 def confirm(session: Session, shot: ShotRow, at: datetime, by: str | None) -> None:
     """Write into a capture's report that its eye is the right one; `by` as in `relabel`."""
     row = session.get_one(CaptureRow, shot.capture)
-    report: dict[str, Any] = json.loads(row.report)
+    report = _report(row)
     row.report = schema.report_text(report | {"confirmed": {"eye": row.eye, "at": at.isoformat(), "by": by}})

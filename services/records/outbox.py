@@ -13,7 +13,8 @@ from sqlalchemy.orm import Session
 
 from device.clock import Clock
 from device.errors import DiffuscopeError, SendUnreachable
-from services.records import schema
+from services.records import reading, schema
+from services.records.reading import one_record, readable
 from services.records.schema import FileRow, SendingRow, ShotRow, VisitRow
 from services.records.store import told
 
@@ -71,26 +72,30 @@ class Outbox:
     ) -> list[Waiting]:
         """Those that wait, the one that was finished first before the others.
 
-        With `parked`, without those that such errors keep; with `sizes`, how large each is.
+        With `parked`, without those that such errors keep; with `sizes`, how large each is. One whose rows cannot be
+        read is left out: it is damaged, and the list of visits counts it.
         """
         query = select(VisitRow, SendingRow, self._stuck()).outerjoin(SendingRow, OF_ITS_FINISH).where(UNSENT)
         if parked is not None:
             query = query.where(or_(SendingRow.error.is_(None), SendingRow.error.not_in(parked)))
-        query = query.order_by(VisitRow.finished_at, VisitRow.id).limit(limit)
+        query = query.order_by(VisitRow.finished_at, VisitRow.id)
         with told(), Session(self.engine) as session:
-            found = [_waiting(*row) for row in session.execute(query)]
+            rows = session.execute(query.limit(limit)).all()
+            found = readable(rows, lambda row: _waiting(*row))
+            if len(found) < len(rows):  # what cannot be read must not stand before the others for ever
+                found = readable(session.execute(query).all(), lambda row: _waiting(*row))[:limit]
             return _with_sizes(session, found) if sizes else found
 
     def trouble(self) -> Trouble:
         """How many wait, and how it stands with them."""
         stuck, failing = self._stuck(), SendingRow.error.is_not(None)
-        query = select(
-            func.count(), func.count(case((stuck, 1))), func.min(case((stuck, SendingRow.failing_since))),
-            func.count(case((and_(failing, not_(stuck)), 1))),
-        ).select_from(VisitRow).outerjoin(SendingRow, OF_ITS_FINISH).where(UNSENT)  # fmt: skip
+        numbers = func.count(), func.count(case((stuck, 1))), func.count(case((and_(failing, not_(stuck)), 1)))
+        query = select(*numbers).select_from(VisitRow).outerjoin(SendingRow, OF_ITS_FINISH).where(UNSENT)
+        dates = select(SendingRow.failing_since).join(VisitRow, OF_ITS_FINISH).where(UNSENT, stuck)
         with told(), Session(self.engine) as session:
-            waiting, many, since, tried = session.execute(query).one()
-        return Trouble(waiting, many, None if since is None else datetime.fromisoformat(since), tried)
+            waiting, many, tried = session.execute(query).one()
+            since = readable(session.scalars(dates).all(), _since) if many else []
+        return Trouble(waiting, many, min((one for one in since if one is not None), default=None), tried)
 
     def _stuck(self) -> ColumnElement[bool]:
         """Kept by what does not pass, or by a link that has failed for days."""
@@ -133,14 +138,22 @@ class Outbox:
 
 
 def _waiting(visit: VisitRow, sending: SendingRow | None, stuck: bool | None) -> Waiting:
-    assert visit.finished_at is not None  # asked for
-    finished_at = datetime.fromisoformat(visit.finished_at)
-    if sending is None:
-        return Waiting(visit.id, visit.person, finished_at)
-    since = None if sending.failing_since is None else datetime.fromisoformat(sending.failing_since)
-    return Waiting(
-        visit.id, visit.person, finished_at, sending.tries, since, sending.error, sending.said, stuck=bool(stuck)
-    )
+    """StoreDamaged if a row cannot be read; also if the finish is not written as this program writes it, for then it
+    would never be found to be sent."""
+    with one_record(visit.id):
+        id, number = reading.text(visit.id), reading.text(visit.person)
+        finished_at = reading.moment(visit.finished_at)
+        reading.one_of(visit.finished_at, schema.utc_text(finished_at))
+        if sending is None:
+            return Waiting(id, number, finished_at)
+        error, said = (None if one is None else reading.text(one) for one in (sending.error, sending.said))
+        since = _since(sending.failing_since)
+        return Waiting(id, number, finished_at, sending.tries, since, error, said, stuck=bool(stuck))
+
+
+def _since(value: object) -> datetime | None:
+    with one_record("since when it could not be sent"):
+        return None if value is None else reading.moment(value)
 
 
 def _row(session: Session, one: Waiting) -> SendingRow:

@@ -21,6 +21,7 @@ from services.records.schema import CounterRow, FieldRow, IdentifierRow, KeyRow,
 from services.records.store import told
 from services.records.visit import Decided, Taken, Visit, decided_after, outcome
 
+PRESS = "press"  # of every press: its eye, visit and slot are in the record of the capture
 REMEMBERED = timedelta(days=30)  # no network repeats a request for longer
 
 
@@ -50,17 +51,25 @@ class People:
         return self.get(self._once(key, f"begin {number}", act))
 
     def get(self, id: str) -> Visit:
-        """One visit; NotKept if there is none."""
+        """One visit; NotKept if there is none, StoreDamaged if it cannot be read."""
         with told(), Session(self.engine) as session:
-            return visits.read(session, self.protocol, [visits.row(session, id)])[0]
+            return visits.read_one(session, self.protocol, visits.row(session, id))
 
     def visits(
         self, limit: int, day: str | None = None, open: bool | None = None, digits: str | None = None
     ) -> list[Visit]:
-        """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number."""
+        """The newest visits, newest first: of a day, unfinished or finished ones, with these digits in the number.
+
+        Without those that `damaged` counts.
+        """
         digits = numbering.whole(digits.upper()) if digits else None
         with told(), Session(self.engine) as session:
             return visits.read(session, self.protocol, visits.found(session, limit, day, open, digits))
+
+    def damaged(self) -> int:
+        """How many visits cannot be read: they are not listed, and asked for alone are refused."""
+        with told(), Session(self.engine) as session:
+            return visits.damaged(session, self.protocol)
 
     def counts(self, day: str | None = None) -> dict[str, int]:
         """How many visits of a day (None: of all) are done, are to be finished, and were referred."""
@@ -127,17 +136,26 @@ class People:
 
         def write(session: Session, capture: Capture) -> None:
             if key is not None:
-                self._remember(session, key, "press", capture.id)
+                self._remember(session, key, PRESS, capture.id)
             if capture.report["visit"] is not None:
                 self._put(session, capture)
 
         return write
 
-    def answered(self, key: str) -> str | None:
-        """What a press with this key was answered: the name of its capture; None if there was none."""
+    def answered(self, key: str, eye: Eye, visit: str | None, slot: str | None) -> str | None:
+        """What a press with this key was answered: the name of its capture; None if there was none.
+
+        InputError if the key was that of another request: of another eye, visit or slot, or no press. The record of
+        the capture says of which, so a key that an earlier release wrote down is bound too.
+        """
         with told(), Session(self.engine) as session:
             row = session.get(KeyRow, key)
-            return row.answer if row is not None and row.request == _digest("press") else None
+            if row is None:
+                return None
+            capture = _same(row, PRESS)
+            if moving.asked_for(session, capture) != (eye, visit, slot):
+                raise other_request()
+            return capture
 
     def keep(self, key: str, capture: str) -> Visit:
         """Make a capture the one that stands for its slot; NotKept if it belongs to no visit."""
@@ -250,7 +268,7 @@ class People:
         return end if self.clock.wall() < end else None
 
     def _read(self, session: Session, row: VisitRow) -> Visit:
-        return visits.read(session, self.protocol, [row])[0]
+        return visits.read_one(session, self.protocol, row)
 
     def _tell_outcome(self, session: Session, row: VisitRow) -> None:
         """Write down how a visit ends by what is known of it now."""
@@ -334,8 +352,13 @@ def _decide(session: Session, visit: str, slot: str, decided: Decided | None) ->
 def _same(before: KeyRow, request: str) -> str:
     """What this very request was answered; InputError if the key was another's."""
     if before.request != _digest(request):
-        raise InputError("key: it belongs to another request", "Reload the page and try again.")
+        raise other_request()
     return before.answer
+
+
+def other_request() -> InputError:
+    """What is said to a key that was used for something else."""
+    return InputError("key: it belongs to another request", "Reload the page and try again.")
 
 
 def _digest(request: str) -> str:

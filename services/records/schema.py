@@ -3,9 +3,10 @@
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from alembic import command
@@ -31,13 +32,14 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
-from device.values import Capture, Eye
+from device.values import Capture
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 
 # WAL with FULL is the fastest pair that lost no acknowledged row in power-cut trials; NORMAL lost the last ones.
+BUSY_MS, CHECKPOINT_BUSY_MS = 5000, 200  # whoever writes waits; a checkpoint gives up and is tried again later
 PRAGMAS = (
-    "PRAGMA busy_timeout = 5000",
+    f"PRAGMA busy_timeout = {BUSY_MS}",
     "PRAGMA journal_mode = WAL",
     "PRAGMA synchronous = FULL",
     "PRAGMA foreign_keys = ON",
@@ -59,7 +61,7 @@ class CaptureRow(Shelf):
     simulated: Mapped[int]
     calibration_id: Mapped[str] = mapped_column(Text)
     report: Mapped[str] = mapped_column(Text)
-    files: Mapped[list["FileRow"]] = relationship(lazy="selectin", order_by="FileRow.name")
+    files: Mapped[list["FileRow"]] = relationship(order_by="FileRow.name")
 
     __table_args__ = (
         CheckConstraint("eye IN ('OD', 'OS')", name="eye_is_an_eye"),
@@ -70,7 +72,7 @@ class CaptureRow(Shelf):
     )
 
 
-KEPT = literal_column("captures.rowid", Integer)  # grows with each capture that is kept, as no date does
+KEPT = literal_column("captures.rowid", Integer).label("kept")  # grows with each one that is kept, as no date does
 
 
 class FileRow(Shelf):
@@ -289,8 +291,14 @@ def open_engine(path: Path) -> Engine:
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
     """Set up one new connection of the driver."""
     connection.isolation_level = None
+    connection.text_factory = _decoded
     for pragma in PRAGMAS:
         connection.execute(pragma).close()
+
+
+def _decoded(content: bytes) -> str:
+    """Text as it is, also where it is no UTF-8: `reading` refuses that for its row, the driver would for all rows."""
+    return content.decode(errors="surrogateescape")
 
 
 def _begin(connection: Connection) -> None:
@@ -302,6 +310,21 @@ def _begin(connection: Connection) -> None:
 def for_writing(engine: Engine) -> Engine:
     """The same connections, for a transaction that writes."""
     return engine.execution_options(writing=True)
+
+
+def checkpoint(engine: Engine) -> bool:
+    """Write the rows of the write-ahead log into the main file, on the disk when this returns, and empty the log.
+
+    False if another connection reads or writes longer than CHECKPOINT_BUSY_MS: then no row has moved, or some have.
+    """
+    with closing(engine.raw_connection()) as pooled:  # a transaction, which `connect` would begin, may not checkpoint
+        connection: Any = pooled.driver_connection
+        connection.execute(f"PRAGMA busy_timeout = {CHECKPOINT_BUSY_MS}").close()
+        try:
+            busy = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]
+        finally:
+            connection.execute(f"PRAGMA busy_timeout = {BUSY_MS}").close()
+    return not busy
 
 
 def migrate(engine: Engine, before: Callable[[str], None]) -> None:
@@ -370,17 +393,4 @@ def row_of(capture: Capture, lengths_bytes: Mapping[str, int]) -> CaptureRow:
         calibration_id=capture.calibration_id,
         report=report_text(capture.report),
         files=[FileRow(name=name, sha256=digest, bytes=lengths_bytes[name]) for name, digest in capture.files.items()],
-    )
-
-
-def capture_of(row: CaptureRow) -> Capture:
-    """The capture that a row describes; its moment is in UTC."""
-    return Capture(
-        id=row.id,
-        eye=cast(Eye, row.eye),  # the table's own check lets nothing else in
-        taken_at=datetime.fromisoformat(row.taken_at),
-        simulated=bool(row.simulated),
-        calibration_id=row.calibration_id,
-        report=json.loads(row.report),
-        files={file.name: file.sha256 for file in row.files},
     )

@@ -1,21 +1,23 @@
 """The shelf: a capture is on it whole or not at all, whatever happens in between.
 
     shelf.sqlite                  what was kept: rows
+    shelf.sqlite-wal              rows that are not in the main file yet (`checkpoint`)
     captures/<id>/<name>          and their files
     captures/.<id>.part/          being written; no row yet
     torn/<id>/                    found half-kept at an opening: never listed, for the technician; gives its room up
     snapshots/                    the tables as they were before each migration (snapshots.py)
 
-The row is the promise: it is written last, when every file it names is on the disk.
+The row is the promise: it is written last, when every file it names is on the disk. A folder that has all files of a
+capture and no row may have lost its row: it is neither moved nor removed, and `orphans` names it.
 """
 
 import hashlib
 import logging
-import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -27,23 +29,26 @@ from sqlalchemy.orm import Session
 from device.clock import Clock, SystemClock
 from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
 from device.values import Capture
-from services.records import disk, schema
+from services.records import captures, disk, schema
 from services.records.errand import Beside
+from services.records.reading import REMEDY, readable
 from services.records.schema import CaptureRow, FileRow, ShotRow, VisitRow
 from services.records.snapshots import Snapshots
 
 log = logging.getLogger(__name__)
 
 RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
+WHOLE = frozenset({"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"})  # of every release's captures
 LATELY = 100  # visits by which the next ones are judged
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+PAGE = 500  # rows that are read at once where all are
 
 
 class Store:
     """Captures kept in one folder; opening it brings the tables up to date and moves half-kept captures aside.
 
     `swept` names what was moved, as found in `torn/`. Any thread may read while one keeps; keepers wait for each other.
+    Opening and closing write the rows of the log into the main file.
     """
 
     swept: tuple[str, ...]
@@ -70,11 +75,36 @@ class Store:
                 self._refuse_to_begin_anew()
                 schema.migrate(self.engine, snapshots.make)
                 self.swept = self._sweep()
+                self._checkpoint_if_possible()
             undo.pop_all()
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Write the log's rows into the main file, if the disk lets it, and let go of the database."""
+        self._checkpoint_if_possible()
         self.engine.dispose()
+
+    def checkpoint(self) -> bool:
+        """Write the log's rows into the main file and empty the log; False if somebody reads or writes meanwhile.
+
+        Until then a row is in the log alone, where one wrong byte loses every row behind it without an error.
+        """
+        if self.log_bytes() == 0:
+            return True
+        with told():
+            return schema.checkpoint(self.engine)
+
+    def _checkpoint_if_possible(self) -> None:
+        try:
+            self.checkpoint()
+        except StoreError as error:  # nothing is lost: the rows stay in the log
+            log.warning("the log of the database stays: %s", error)
+
+    def log_bytes(self) -> int:
+        """The length of the log."""
+        try:
+            return (self.folder / "shelf.sqlite-wal").stat().st_size
+        except FileNotFoundError:
+            return 0
 
     def __enter__(self) -> Self:
         return self
@@ -86,7 +116,7 @@ class Store:
         """Keep a capture and its files by name, and return it with their SHA-256 once no power cut can undo it.
 
         What `beside` writes is kept with it, or not at all.
-        Errors: StoreFull (nothing is left of it), StoreError (what was written goes to `torn/` at the next opening),
+        Errors: StoreFull (nothing is left of it), StoreError (the next opening judges what was written by its row),
         SettingError (a name or report that cannot be kept).
         """
         _refuse_names(capture.id, files)
@@ -112,21 +142,29 @@ class Store:
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
         """The newest captures, newest first; with `before`, those kept before the capture of that name (NotKept).
 
-        In the order in which they were kept, whatever the date was set to meanwhile.
+        In the order in which they were kept, whatever the date was set to meanwhile; without those that `damaged`
+        counts.
         """
         if limit < 1:
             raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
-        query = select(CaptureRow).order_by(schema.KEPT.desc()).limit(limit)
+        out: list[Capture] = []
         with self._reading() as session:
-            if before is not None:
-                known = select(schema.KEPT).where(CaptureRow.id == _row(session, before).id)
-                query = query.where(session.scalars(known).one() > schema.KEPT)
-            return [schema.capture_of(row) for row in session.scalars(query)]
+            for page in _pages(session, limit, None if before is None else _row(session, before).kept):
+                out += page.captures
+                if len(out) >= limit:
+                    break
+        return out[:limit]
+
+    def damaged(self) -> int:
+        """How many captures have an entry that cannot be read: they are not listed, and asked for alone are refused."""
+        with self._reading() as session:
+            return sum(page.damaged for page in _pages(session, PAGE))
 
     def get(self, id: str) -> Capture:
-        """The capture of that name; NotKept if there is none, StoreDamaged if its folder is gone."""
+        """The capture of that name; NotKept if there is none, StoreDamaged if its entry is or its folder is gone."""
         with self._reading() as session:
-            capture = schema.capture_of(_row(session, id))
+            row = _row(session, id)
+            capture = captures.capture_of(row, captures.files_of(session, [row]))
         if not (self._captures / capture.id).is_dir():
             raise StoreDamaged(f"the folder of {capture.id} is gone")
         return capture
@@ -134,16 +172,17 @@ class Store:
     def read(self, id: str, name: str) -> bytes:
         """One file of a capture, exactly as it was kept; NotKept if there is none, StoreDamaged if it changed."""
         with self._reading() as session:
-            files = {file.name: file for file in _row(session, id).files}
+            row = _row(session, id)
+            files = dict(captures.files_of(session, [row]).get(row.id, ()))
         if name not in files:
             raise NotKept(f"{id} has no file named {name!r}")
-        file = files[name]  # the path is built from the row alone: a name from outside never touches the disk
+        # The path is built from the row alone: a name from outside never touches the disk.
         try:
-            content = (self._captures / file.capture_id / file.name).read_bytes()
+            content: bytes = (self._captures / row.id / name).read_bytes()
         except OSError as error:
-            raise StoreDamaged(f"{file.name} of {id} cannot be read: {error}") from error
-        if hashlib.sha256(content).hexdigest() != file.sha256:
-            raise StoreDamaged(f"{file.name} of {id} is not what was kept: its SHA-256 differs")
+            raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error
+        if hashlib.sha256(content).hexdigest() != files[name]:
+            raise StoreDamaged(f"{name} of {id} is not what was kept: its SHA-256 differs")
         return content
 
     def people_left(self, pictures: int) -> int:
@@ -159,8 +198,18 @@ class Store:
         return self._room_bytes() * number // total_bytes if total_bytes else self.space_left() // pictures
 
     def torn(self) -> dict[str, int]:
-        """What lies in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
-        return {place.name: disk.size_bytes(place) for place in sorted(self._torn.iterdir())}
+        """The half-kept in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
+        places = [place for place in sorted(self._torn.iterdir()) if not _is_whole(place)]
+        return {place.name: disk.size_bytes(place) for place in places}
+
+    def orphans(self) -> list[str]:
+        """The captures whose folder has all its files and which have no row: not listed, and never removed.
+
+        Those that an earlier release moved to `torn/` are among them.
+        """
+        with told(), disk.alone(self._lock):  # one that is being kept gets its row
+            folders = [*self._strays(), *self._torn.iterdir()]
+            return sorted(folder.name for folder in folders if _is_whole(folder))
 
     def _room_bytes(self) -> int:
         free_bytes = self._free_bytes(self.folder) + sum(self.torn().values())
@@ -197,12 +246,16 @@ class Store:
         if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
             raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
 
-    def _sweep(self) -> tuple[str, ...]:
-        """Move every folder without a row aside."""
+    def _strays(self) -> list[Path]:
+        """Every folder without a row."""
         with Session(self.engine) as session:
             kept = set(session.scalars(select(CaptureRow.id)))
-        strays = sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
-        swept = tuple(disk.move_aside(stray, self._torn) for stray in strays)
+        return sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
+
+    def _sweep(self) -> tuple[str, ...]:
+        """Move every half-kept folder without a row aside."""
+        half = [stray for stray in self._strays() if stray.name.startswith(".") or not _is_whole(stray)]
+        swept = tuple(disk.move_aside(stray, self._torn) for stray in half)
         if swept:
             disk.settle(self._torn)
             disk.settle(self._captures)
@@ -224,16 +277,46 @@ class Store:
                 raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
 
 
-def _row(session: Session, id: str) -> CaptureRow:
-    row = session.get(CaptureRow, id) if _NAME.fullmatch(id) else None
-    if row is None:
+def _is_whole(folder: Path) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} >= WHOLE
+
+
+@dataclass(frozen=True)
+class _Page:
+    """Some captures, newest first, and how many more there are among them whose entry cannot be read."""
+
+    captures: list[Capture]
+    damaged: int
+
+
+def _pages(session: Session, size: int, before: int | None = None) -> Iterator[_Page]:
+    """All captures, newest first, in pages of `size` rows; `before` is the row number of the one that ends them."""
+    while True:
+        query = captures.CAPTURES.order_by(schema.KEPT.desc()).limit(size)
+        rows = captures.capture_rows(session, query if before is None else query.where(before > schema.KEPT))
+        if not rows:
+            return
+        files = captures.files_of(session, rows)
+        found = readable(rows, lambda row: captures.capture_of(row, files))  # noqa: B023  # called at once
+        yield _Page(found, len(rows) - len(found))
+        before = rows[-1].kept
+
+
+def _row(session: Session, id: str) -> captures.CaptureColumns:
+    """The row of a capture, of CAPTURES; NotKept if there is none, StoreDamaged if the name in it is another."""
+    known = captures.NAME.fullmatch(id) is not None
+    rows = captures.capture_rows(session, captures.CAPTURES.where(CaptureRow.id == id)) if known else []
+    if not rows:
         raise NotKept(f"there is no capture named {id!r}")
+    row = rows[0]
+    if row.id != id:  # found by the index, which still says what the row no longer does
+        raise StoreDamaged(f"the entry of {id!r} has another name", REMEDY)
     return row
 
 
 def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
     for name in (id, *files):
-        if not _NAME.fullmatch(name):
+        if not captures.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
     if not files:
         raise SettingError(f"{id} has no files, so there is nothing to keep")

@@ -36,7 +36,8 @@ class Underway:
         self._folder = store.folder / "underway"
         with told():
             disk.make_folder(self._folder)
-            found = {path.stem: _read(path) for path in sorted(self._folder.glob("*.json"))}
+            paths = sorted(self._folder.glob("*.json"))
+            found, self._keys = {path.stem: _read(path) for path in paths}, {path.stem: _key(path) for path in paths}
         for id in [id for id in found if _is_kept(store, id)]:
             del found[id]
             self.end(id)
@@ -45,16 +46,21 @@ class Underway:
                 found[name] = Lost(name, _eye_in(name))
         self.lost = tuple(found.values())
 
-    def begin(self, press: Lost) -> None:
-        """A press begins; on the disk when this returns. StoreFull or StoreError if it cannot be."""
+    def begin(self, press: Lost, key: str | None = None) -> None:
+        """A press begins, with the key of its request; on the disk when this returns. StoreFull, StoreError."""
         with told():
-            disk.write_file(self._folder / f"{press.id}.json", json.dumps(asdict(press)).encode())
+            disk.write_file(self._folder / f"{press.id}.json", json.dumps(asdict(press) | {"key": key}).encode())
             disk.settle(self._folder)
 
-    def end(self, id: str) -> None:
-        """It was answered; or whoever lost it has heard of it, and has done what was to be done."""
+    def end(self, id: str, key: str | None = None) -> None:
+        """It was answered; or whoever lost it has heard of it, and has done what was to be done.
+
+        With the `key` of a request that has its picture now, what a kill took of that request is over too.
+        """
         with told():
             (self._folder / f"{id}.json").unlink(missing_ok=True)
+        if key is not None:
+            self.forget(lambda one: self._keys.get(one.id) == key)
 
     def forget(self, over: Callable[[Lost], bool]) -> None:
         """Of what was lost, forget what is over."""
@@ -79,6 +85,15 @@ def _read(path: Path) -> Lost:
         return Lost(path.stem, said["eye"], said["visit"], said["slot"], said["tries"])
     except (ValueError, KeyError, TypeError):  # the power went off while it was written
         return Lost(path.stem, _eye_in(path.stem))
+
+
+def _key(path: Path) -> str | None:
+    """The key of the request that a press was; None where none is written down."""
+    try:
+        key = json.loads(path.read_bytes())["key"]
+    except (ValueError, KeyError, TypeError):  # torn, or of a release that did not write it
+        return None
+    return key if isinstance(key, str) else None
 
 
 def _eye_in(name: str) -> Eye | None:

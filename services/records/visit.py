@@ -23,7 +23,7 @@ class Taken:
     @property
     def good(self) -> bool:
         """Whether it was called good."""
-        return self.verdict is not None and self.verdict["word"] == "good"
+        return self.verdict is not None and self.verdict.get("word") == "good"
 
 
 @dataclass(frozen=True)

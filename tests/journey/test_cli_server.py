@@ -46,7 +46,7 @@ class Server:
         return self._log.read_text()
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
-        end = time.monotonic() + 40
+        end = time.monotonic() + 90
         while time.monotonic() < end:
             assert process.poll() is None, self.said()
             try:
@@ -54,14 +54,14 @@ class Server:
                 return
             except OSError:
                 time.sleep(0.05)
-        raise AssertionError(f"no answer in 40 s: {self.said()}")
+        raise AssertionError(f"no answer in 90 s: {self.said()}")
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
         request = urllib.request.Request(
             f"http://127.0.0.1:{self.port}{path}", data, {"Content-Type": "application/json"}, method=method
         )
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        with urllib.request.urlopen(request, timeout=90) as answer:
             content = answer.read()
         return json.loads(content) if answer.headers["content-type"] == "application/json" else content
 
