@@ -37,13 +37,15 @@ from device.recon.resolution import EMPTY_OPEN, working_bin
 from device.values import Calibration, Image, Psf
 
 ANGLES_DEG = np.linspace(30, 150, 8)  # of the certainly wrong PSFs; with 180 degrees more each is its own partner
-ROTATED, MIRRORED = 4.0, 5.0  # sd of `orientation` and `mirrored`; a PSF that is neither reached 3.4 and 4.5
+PROVEN = 5.0  # sd of `orientation` and `mirrored`
 MATCHES, PER_SD = 0.5, 0.035  # the least score of a right PSF, and by how much each sd of `orientation` lowers it
+MOST_SD = 0.1  # of a score that proves a mismatch: 0.06 at 144 electrons, 0.25 for noise alone
 TAPER_SHARES = (0.25, 0.45)  # of the short side; `score` is asked with the first
 MOST_BIN = 4
 LEAST_SAMPLES = 64  # of the short side
 MOST_SAMPLES = 400_000
 RING = 250  # frequencies: as in `witness`
+AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
 PSF_ERROR = 0.02  # of the mean |H|^2: a frequency that the PSF does not pass is not amplified
 SCALES = np.arange(-12, 13) * 0.0025 + 1  # of the PSF: eyes of +-8 dpt, or another depth
 LEAST_SPREAD = 1e-7  # a PSF that equals its own rotation has no orientation
@@ -85,10 +87,12 @@ class Consistency:
         """The verdict: FOREIGN and MIRRORED only where the score is surely too low, ROTATED only where it is not."""
         least = MATCHES - PER_SD * abs(self.orientation)
         if self.score + 2 * self.score_sd >= least:
-            if self.orientation < -ROTATED:
+            if self.orientation < -PROVEN:
                 return Match.ROTATED
             return Match.CONSISTENT if self.score - 2 * self.score_sd > least else Match.UNKNOWN
-        if abs(self.mirrored) > MIRRORED:
+        if self.score_sd > MOST_SD:
+            return Match.UNKNOWN
+        if abs(self.mirrored) > PROVEN:
             return Match.MIRRORED_LEFT_RIGHT if self.mirrored > 0 else Match.MIRRORED_UP_DOWN
         return Match.FOREIGN
 
@@ -107,7 +111,9 @@ class PsfConsistency:
         self._preparer = Preparer(calibration, self._grid)
         self._psf = binned(psf, n)
         rows, cols = self._grid.shape
-        self._frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
+        row_cycles, col_cycles = np.abs(np.fft.fftfreq(rows, 1 / rows)), np.fft.rfftfreq(cols, 1 / cols)
+        self._frequency = np.hypot(row_cycles[:, None] / rows, col_cycles[None] / cols)
+        self._off_axes = (row_cycles > AXIS)[:, None] & (col_cycles > AXIS)[None]
         self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
 
     def __call__(self, counts: Pixels, scale: float = 1.0) -> Consistency | None:
@@ -124,14 +130,17 @@ class PsfConsistency:
             return found
         best = max(SCALES, key=lambda s: self._score(spectra[0], self._otf(stretched(self._psf, s)))[0])
         again = self._ask(spectra, stretched(self._psf, float(best)))
-        return found if again is None or again.match is Match.FOREIGN else again
+        proven = again is not None and again.match is Match.CONSISTENT and again.orientation > PROVEN
+        turned = again is not None and again.match is Match.ROTATED
+        return again if proven or turned else found
 
     def _tapered_spectra(self, frame: Linear) -> list[Spectrum]:
         """The spectrum of the frame about its mean, once for each taper."""
         y, spectra = filled(frame.y, frame.good), []
         for window in self._tapers:
             mean = float((y * window).sum() / window.sum())
-            spectra.append(np.asarray(scipy_fft.rfft2((y - np.float32(mean)) * window), np.complex64))
+            spectrum = scipy_fft.rfft2((y - np.float32(mean)) * window)
+            spectra.append(np.asarray(spectrum * self._off_axes, np.complex64))
         return spectra
 
     def _otf(self, psf: Image) -> Spectrum:
@@ -158,8 +167,8 @@ class PsfConsistency:
         """The slope of |Y|^2 against |H|^2 in narrow rings, and its standard deviation; as `witness` has it."""
         power, seen = _power(otf), _power(spectrum)
         low, high = band(self._frequency, power, max(self._grid.window))
-        noise = _noise(seen, power)
-        inside = np.flatnonzero((self._frequency > low) & (self._frequency < high))
+        noise = self._noise(seen, power)
+        inside = np.flatnonzero((self._frequency > low) & (self._frequency < high) & self._off_axes)
         order = inside[np.argsort(self._frequency.ravel()[inside], kind="stable")]
         starts = np.arange(0, max(order.size - RING // 2, 1), RING)
         if order.size < RING or not noise > 0:
@@ -181,13 +190,18 @@ class PsfConsistency:
         power, seen = _power(otf), _power(spectrum)
         low, high = band(self._frequency, power, max(self._grid.window))
         part = (self._frequency > low) & (self._frequency < high)
-        noise = _noise(seen, power)
+        noise = self._noise(seen, power)
         frequency = np.maximum(self._frequency, low / 5)
         mean_power = float(power[part].mean())
         level = max(float(seen[part].mean()) - noise, 1e-12 * noise) / float((power[part] / frequency[part]).mean())
         kept = spectrum * (np.sqrt(power) / (power + noise / level * frequency + PSF_ERROR * mean_power))
         kept[0, 0] = 0
         return np.asarray(kept, np.complex64)
+
+    def _noise(self, seen: Floats, power: Floats) -> float:
+        """Noise per frequency, from the quarter that the optics passes least: the median of an exponential is ln 2."""
+        silent = self._off_axes & (power <= np.quantile(power, 0.25))
+        return float(np.median(seen[silent])) / float(np.log(2))
 
     def _preferences(self, amplitudes: list[Spectrum], otf: Spectrum) -> list[float]:
         """How much sparser the gradients are with a PSF's phase than with that of the PSF rotated by 180 degrees."""
@@ -242,8 +256,3 @@ def filled(y: Image, good: Image) -> Image:
 
 def _power(spectrum: Spectrum) -> Floats:
     return np.asarray(np.abs(spectrum).astype(np.float64) ** 2)
-
-
-def _noise(seen: Floats, power: Floats) -> float:
-    """Noise per frequency, from the quarter that the optics passes least: the median of an exponential is ln 2."""
-    return float(np.median(seen[power <= np.quantile(power, 0.25)])) / float(np.log(2))
