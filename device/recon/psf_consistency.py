@@ -39,7 +39,7 @@ from device.values import Calibration, Image, Psf
 ANGLES_DEG = np.linspace(30, 150, 8)  # of the certainly wrong PSFs; with 180 degrees more each is its own partner
 PROVEN = 5.0  # sd of `orientation` and `mirrored`
 MATCHES, PER_SD = 0.5, 0.035  # the least score of a right PSF, and by how much each sd of `orientation` lowers it
-MOST_SD = 0.1  # of a score that proves a mismatch: 0.06 at 144 electrons, 0.25 for noise alone
+MOST_SD = 0.1  # of a score that proves a mismatch: 0.07 at 144 electrons, 0.25 for noise alone
 TAPER_SHARES = (0.25, 0.45)  # of the short side; `score` is asked with the first
 MOST_BIN = 4
 LEAST_SAMPLES = 64  # of the short side
@@ -98,7 +98,7 @@ class Consistency:
 
 
 class PsfConsistency:
-    """Asks frames of one sensor shape about one PSF of a calibration; plans nothing, about 0.3 s for 1080 x 1920."""
+    """Asks frames of one sensor shape about one PSF of a calibration; plans nothing; about 0.4 s for 1080 x 1920, three times that in doubt."""
 
     def __init__(self, calibration: Calibration, shape: Pair, index: int = 0) -> None:
         psf = calibration.psfs[index]
