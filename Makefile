@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -99,6 +99,9 @@ bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times,
 
 bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
 	@$(BIN)/python -m tests.bench.sides "$(DATA)"
+
+bench-psf: .venv/ready ## Print what the PSF consistency check finds in recordings and simulated frames; DATA=folder has recordings.
+	@$(BIN)/python -m tests.bench.psf_consistency "$(DATA)"
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"

@@ -6,12 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.evidence import BINS, Evidence, PowerLaw
+from device.recon.psf_consistency import Match
 from device.values import Geometry, Image
 
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
 LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 SURELY = 3.0  # standard errors
 FAINT_DN = 1e-9
+MISMATCHES = {
+    Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
+    Match.ROTATED: "The PSF is rotated by 180 degrees against this frame. Rotate the PSF by 180 degrees; run it again.",
+    Match.MIRRORED_LEFT_RIGHT: "The PSF is mirrored left to right against this frame. Mirror the PSF; run it again.",
+    Match.MIRRORED_UP_DOWN: "The PSF is mirrored top to bottom against this frame. Mirror the PSF; run it again.",
+}
 Series = NDArray[np.float64]
 
 
@@ -66,16 +73,22 @@ def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
     return float((inside > bright).mean())
 
 
-def complaints(quality: dict[str, float | None]) -> tuple[str, ...]:
-    """What is wrong with a picture, in plain words, the most useful first; empty if nothing is."""
+def complaints(quality: dict[str, float | None], match: Match | None = None) -> tuple[str, ...]:
+    """What is wrong with a picture, in plain words, the most useful first; empty if nothing is.
+
+    `match` is the verdict of the PSF consistency check; where it was not asked, `structure_sure` decides.
+    """
     said = []
     if (quality["saturated"] or 0) > 0.001:
         said.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
     through = quality.get("through")
     if through is not None and through < LEAST_THROUGH:
         said.append("No eye was seen: the light came from everywhere. Centre the ring on the pupil.")
-    elif (sure := quality.get("structure_sure")) is not None and sure < -SURELY:
-        said.append("This is not this head's PSF. Calibrate the head, or give the PSF that belongs to the frame.")
+    elif match is None:
+        sure = quality.get("structure_sure")
+        said += [MISMATCHES[Match.FOREIGN]] if sure is not None and sure < -SURELY else []
+    elif match in MISMATCHES:
+        said.append(MISMATCHES[match])
     share = quality.get("coverage")
     if share is not None and share < 0.75:
         said.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")

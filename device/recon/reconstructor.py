@@ -16,6 +16,7 @@ from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner, Spectrum
 from device.recon.prepare import Preparer
+from device.recon.psf_consistency import Match, PsfConsistency
 from device.recon.quality import complaints
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
@@ -124,6 +125,7 @@ class Reconstructor:
     """Plans once for a calibration and a sensor shape; then turns frames into pictures within a deadline.
 
     `recipes` run in order; the last is the wanted picture, those before it are quick looks. One thread at a time.
+    `consistency` is asked about each frame's PSF, outside the deadline: for files, where seconds do not matter.
     With `refract`, where geometry and field are known, the frame tells the eye's refraction after the quick look, and
     what follows is solved with the PSF of that eye.
     """
@@ -131,6 +133,7 @@ class Reconstructor:
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
         recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
+        consistency: PsfConsistency | None = None,
     ) -> None:  # fmt: skip
         recipes = recipes or ladder(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
@@ -143,7 +146,9 @@ class Reconstructor:
             self.refractor = Refractor(calibration, shape, planner, psf_index)
         self._sharp = self.rungs[min(1, len(self.rungs) - 1) :]  # what is solved with the eye's own PSF
         self._find_cost, self._refocus_cost = Cost(), Cost()
+        self._consistency: PsfConsistency | None = None
         self._warm_up()
+        self._consistency = consistency  # noise needs no check
 
     def _warm_up(self) -> None:
         """Run on noise, so that the first press meets compiled code, touched memory and a known cost."""
@@ -221,7 +226,12 @@ class Reconstructor:
         recipe, facts = climb.done.recipe, climb.facts
         dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
         quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
-        warnings = ("There is no signal in this frame.",) if dark else complaints(quality)
+        match = None
+        if self._consistency is not None and not dark:
+            figures = self._consistency(climb.counts, climb.psf_scale, climb.known_defects)
+            quality |= {} if figures is None else figures.facts
+            match = Match.UNKNOWN if figures is None else figures.match
+        warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match)
         eye = climb.refraction
         if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
@@ -279,6 +289,12 @@ class _Climb:
         if c not in self._found:
             self._found[c] = self._defects(counts, dark)
         return counts, dark, self._found[c]
+
+    @property
+    def known_defects(self) -> Mask | None:
+        """The pixels that are defective in any channel that was solved."""
+        masks = [mask for mask in self._found.values() if mask is not None]
+        return np.logical_or.reduce(masks) if masks else None
 
     def up(self, rung: _Rung) -> bool:
         """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""

@@ -17,6 +17,7 @@ from device.recon.geometry import disc
 from device.recon.methods import method_named
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner
+from device.recon.psf_consistency import PsfConsistency
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Geometry, Image, Reconstruction, Sensor
@@ -59,7 +60,8 @@ def reconstruct_file(order: Order) -> Reconstruction:
     if order.sweep is not None:
         _draw_sweep(order.sweep, order, scores)
     shape = (raw.pixels.shape[0], raw.pixels.shape[1])
-    reconstructor = Reconstructor(calibration, shape, planner, clock, _recipes(order, calibration, shape, index), index)
+    recipes, consistency = _recipes(order, calibration, shape, index), PsfConsistency(calibration, shape, index)
+    reconstructor = Reconstructor(calibration, shape, planner, clock, recipes, index, consistency=consistency)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
     made = reconstructor(raw.pixels, simulated=calibration.simulated, deadline=deadline)
     picture = made.picture

@@ -38,7 +38,8 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
     """The person's number and the recorded answer to the question of consent; NotKept if there is no such visit."""
     person = row(session, id).person
     answer = session.get(FieldRow, (id, "consent"))
-    return person, None if answer is None else json.loads(answer.value)
+    with one_record(id):
+        return person, None if answer is None else reading.text(reading.parsed(answer.value))
 
 
 def found(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:

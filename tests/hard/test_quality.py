@@ -82,7 +82,7 @@ def test_what_this_psf_did_not_make_is_said_so(case: str, world: World, calibrat
     report = look(calibration, counts)
     assert report.quality["structure_sure"] < -10
     (words,) = [words for words in report.warnings if "lit" not in words]
-    assert words.startswith("No eye was seen" if case == "noise" else "This is not this head's PSF")
+    assert words.startswith("No eye was seen" if case == "noise" else "The PSF does not match this frame")
 
 
 def test_detail_that_the_frame_does_not_hold_is_not_painted(world: World, calibration: Calibration) -> None:

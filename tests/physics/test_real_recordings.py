@@ -13,8 +13,11 @@ from device.clock import SystemClock
 from device.images import as_raw, read_image, read_psf
 from device.recon.focus import sharpest
 from device.recon.plan import Planner
+from device.recon.psf_consistency import Match, PsfConsistency
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
-from device.values import Calibration, Image, Sensor
+from device.values import Calibration, Image, Psf, Sensor
+from services.instrument.once import Order, reconstruct_file
+from tests.wrong_psfs import orientations, resized, shuffled
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data" / "lensless"
 pytestmark = [
@@ -99,3 +102,50 @@ def test_the_bars_of_the_target_are_apart(tmp_path: Path) -> None:
     dips = inner[(inner < across[:-2]) & (inner <= across[2:])]
     assert len(peaks) == 3
     assert np.sort(dips)[:2].max() < 0.6 * peaks.min()
+
+
+HAND = ("tutorial/rawdata_hand_sample.tif", "tutorial/psf_sample.tif")
+TARGET = ("diffusercam3d/example_raw.png", "diffusercam3d/psf/psf16.tiff")  # the depth that `sharpest` chooses
+BUTTERFLIES = [(f"dlmd/diffuser/{name}.npy", "dlmd/derived_psf_480x270_f32.npy") for name in ("im43", "im326", "im65")]
+RECORDINGS = [HAND, TARGET, *BUTTERFLIES]
+
+
+def match(pixels: np.ndarray, calibration: Calibration, psf: Image) -> Match:
+    found = PsfConsistency(replace(calibration, psfs=(Psf(psf),)), pixels.shape[:2])(pixels)
+    assert found is not None
+    return found.match
+
+
+@pytest.mark.parametrize(("raw", "psf"), RECORDINGS)
+def test_a_psf_is_consistent_with_its_own_recording_and_no_wrong_psf_is(raw: str, psf: str) -> None:
+    pixels, calibration = loaded(raw, psf)
+    right = calibration.psfs[0].pixels
+    assert match(pixels, calibration, right) is Match.CONSISTENT
+    found = {kind: match(pixels, calibration, wrong) for kind, wrong in orientations(right).items()}
+    assert found == {
+        "mirrored left-right": Match.MIRRORED_LEFT_RIGHT, "mirrored up-down": Match.MIRRORED_UP_DOWN,
+        "rotated by 180": Match.ROTATED,
+    }  # fmt: skip
+    assert match(pixels, calibration, shuffled(right)) is Match.FOREIGN
+    for _, other in RECORDINGS:
+        if other != psf:
+            foreign = resized(read_psf(DATA / other).pixels, calibration.psfs[0].shape)
+            assert match(pixels, calibration, foreign) is Match.FOREIGN
+
+
+def test_the_command_is_silent_about_right_psfs_and_names_a_rotation(tmp_path: Path) -> None:
+    depths = tuple(sorted((DATA / "diffusercam3d/psf").glob("psf*.tiff")))
+    assert said(tmp_path, DATA / TARGET[0], *depths) == ()
+    assert said(tmp_path, DATA / HAND[0], DATA / HAND[1]) == ()
+    for raw, psf in BUTTERFLIES[:1]:
+        assert said(tmp_path, DATA / raw, DATA / psf) == ()
+        turned = tmp_path / "turned.npy"
+        np.save(turned, np.load(DATA / psf)[::-1, ::-1])
+        (words,) = said(tmp_path, DATA / raw, turned)
+        assert words.startswith("The PSF is rotated by 180 degrees")
+
+
+def said(folder: Path, raw: Path, *psfs: Path) -> tuple[str, ...]:
+    """The warnings of `diffuscope reconstruct`, but for those about brightness."""
+    order = Order(raw, psfs, folder / "out.npy", None, None, None, None, None, None, False, folder)
+    return tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)

@@ -1,0 +1,258 @@
+"""PSF consistency check: does a frame come through the given PSF, and in the given orientation.
+
+Two independent questions, both on one tapered spectrum Y of the frame:
+
+* amplitude: in narrow rings of frequencies |Y|^2 rises with |H|^2. `score` is the slope, 1 for an exact PSF without
+  noise, 0 for another diffuser's; light past the edge and a rough PSF lower it to 0.2. It cannot see a rotation by 180
+  degrees, which leaves |H| as it is.
+* phase: the frame is deconvolved with conj(H) and with H, the PSF rotated by 180 degrees. Both pictures have the same
+  power spectrum, so only their phases differ: the right one has sparse gradients (edges on smooth ground), the wrong
+  one is noise-like. `orientation` is the difference of their sparsity,
+
+      S(x) = mean log(1 + |D x|^2 / mean |D x|^2),    (S(rotated) - S(given)) / sd
+
+  with the sd from PSFs that are certainly wrong: the given one and its mirror image turned by ANGLES_DEG, and the mean
+  over two widths of the taper: the narrow one keeps more light, the wide one hides the false edge of a field that runs
+  past the sensor. Large
+  positive values prove the PSF, large negative ones prove the rotated one; near 0 nothing is proven. `mirrored` is the
+  same figure for the PSF mirrored left to right: positive for that one, negative for the PSF mirrored up to down.
+
+Figures on recordings and simulated frames, and how the limits were chosen: README.md, 2026-11-22.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft as scipy_fft
+from scipy import ndimage
+
+from device.recon.evidence import band
+from device.recon.geometry import Grid, Pair
+from device.recon.kernels import Pixels
+from device.recon.model import taper
+from device.recon.prepare import Linear, Preparer
+from device.recon.resolution import EMPTY_OPEN, working_bin
+from device.values import Calibration, Image, Mask, Psf
+
+ANGLES_DEG = np.linspace(30, 150, 8)  # of the certainly wrong PSFs; with 180 degrees more each is its own partner
+PROVEN = 5.0  # sd of `orientation` and `mirrored`
+MATCHES, PER_SD = 0.5, 0.035  # the least score of a right PSF, and by how much each sd of `orientation` lowers it
+MOST_SD = 0.1  # of a score that proves a mismatch: 0.07 at 144 electrons, 0.25 for noise alone
+TAPER_SHARES = (0.25, 0.45)  # of the short side; `score` is asked with the first
+MOST_BIN = 4
+LEAST_SAMPLES = 64  # of the short side
+MOST_SAMPLES = 400_000
+RING = 250  # frequencies: as in `witness`
+AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
+PSF_ERROR = 0.02  # of the mean |H|^2: a frequency that the PSF does not pass is not amplified
+SCALES = np.arange(-12, 13) * 0.0025 + 1  # of the PSF: eyes of +-8 dpt, or another depth
+LEAST_SPREAD = 1e-7  # a PSF that equals its own rotation has no orientation
+
+Floats = NDArray[np.float64]
+Spectrum = NDArray[np.complex64]
+
+
+class Match(Enum):
+    """What a frame says about the PSF; UNKNOWN where it cannot tell."""
+
+    CONSISTENT = "consistent"
+    UNKNOWN = "unknown"
+    ROTATED = "rotated by 180 degrees"
+    MIRRORED_LEFT_RIGHT = "mirrored left to right"
+    MIRRORED_UP_DOWN = "mirrored up to down"
+    FOREIGN = "does not match"
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """The figures of one frame: `score` with its sd, `orientation` and `mirrored` in sd."""
+
+    score: float
+    score_sd: float
+    orientation: float
+    mirrored: float
+
+    @property
+    def facts(self) -> dict[str, float | None]:
+        """The figures by their names in a report."""
+        return {
+            "psf_score": self.score, "psf_score_sd": self.score_sd,
+            "psf_orientation": self.orientation, "psf_mirrored": self.mirrored,
+        }  # fmt: skip
+
+    @property
+    def match(self) -> Match:
+        """The verdict: FOREIGN and MIRRORED only where the score is surely too low, ROTATED only where it is not."""
+        least = MATCHES - PER_SD * abs(self.orientation)
+        if self.score + 2 * self.score_sd >= least:
+            if self.orientation < -PROVEN:
+                return Match.ROTATED
+            return Match.CONSISTENT if self.score - 2 * self.score_sd > least else Match.UNKNOWN
+        if self.score_sd > MOST_SD:
+            return Match.UNKNOWN
+        if abs(self.mirrored) > PROVEN:
+            return Match.MIRRORED_LEFT_RIGHT if self.mirrored > 0 else Match.MIRRORED_UP_DOWN
+        return Match.FOREIGN
+
+
+class PsfConsistency:
+    """Asks frames of one sensor shape about one PSF of a calibration; 0.4 s for 1080 x 1920, thrice that in doubt."""
+
+    def __init__(self, calibration: Calibration, shape: Pair, index: int = 0) -> None:
+        psf = calibration.psfs[index]
+        n = min(working_bin(psf, EMPTY_OPEN), MOST_BIN)
+        while shape[0] // n * (shape[1] // n) > MOST_SAMPLES:
+            n += 1
+        while n > 1 and min(shape) // n < LEAST_SAMPLES:
+            n -= 1
+        self._grid = Grid.periodic(shape, n, float("inf"))
+        self._preparer = Preparer(calibration, self._grid)
+        self._psf = binned(psf, n)
+        rows, cols = self._grid.shape
+        row_cycles, col_cycles = np.abs(np.fft.fftfreq(rows, 1 / rows)), np.fft.rfftfreq(cols, 1 / cols)
+        self._frequency = np.hypot(row_cycles[:, None] / rows, col_cycles[None] / cols)
+        self._off_axes = (row_cycles > AXIS)[:, None] & (col_cycles > AXIS)[None]
+        self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
+
+    def __call__(self, counts: Pixels, scale: float = 1.0, defects: Mask | None = None) -> Consistency | None:
+        """The figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF stretched by `scale`.
+
+        `defects` (rows, cols) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF is too small or too even to be asked.
+        """
+        if min(self._grid.shape) < LEAST_SAMPLES // 2:
+            return None
+        plane = counts if counts.ndim == 2 else counts.mean(axis=2).astype(np.float32)
+        spectra = self._tapered_spectra(self._preparer(plane, None, defects))
+        found = self._ask(spectra, stretched(self._psf, scale))
+        if found is None or found.match is not Match.FOREIGN:
+            return found
+        best = max(SCALES, key=lambda s: self._score(spectra[0], self._otf(stretched(self._psf, s)))[0])
+        again = self._ask(spectra, stretched(self._psf, float(best)))
+        proven = again is not None and again.match is Match.CONSISTENT and again.orientation > PROVEN
+        turned = again is not None and again.match is Match.ROTATED
+        return again if proven or turned else found
+
+    def _tapered_spectra(self, frame: Linear) -> list[Spectrum]:
+        """The spectrum of the frame about its mean, once for each taper."""
+        y, spectra = filled(frame.y, frame.good), []
+        for window in self._tapers:
+            mean = float((y * window).sum() / window.sum())
+            spectrum = scipy_fft.rfft2((y - np.float32(mean)) * window)
+            spectra.append(np.asarray(spectrum * self._off_axes, np.complex64))
+        return spectra
+
+    def _otf(self, psf: Image) -> Spectrum:
+        spectrum = scipy_fft.rfft2(np.fft.ifftshift(psf))
+        return np.asarray(spectrum / max(float(spectrum[0, 0].real), 1e-12), np.complex64)
+
+    def _ask(self, spectra: list[Spectrum], psf: Image) -> Consistency | None:
+        otf, mirror = self._otf(psf), psf[:, ::-1]
+        score, sd = self._score(spectra[0], otf)
+        if not np.isfinite(sd):
+            return None
+        images = [psf, mirror]
+        images += [ndimage.rotate(p, angle, reshape=False, order=1) for p in (psf, mirror) for angle in ANGLES_DEG]
+        amplitudes = [self._deconvolved_amplitude(spectrum, otf) for spectrum in spectra]
+        preferred = np.array([self._preferences(amplitudes, self._otf(image)) for image in images])
+        spread = np.sqrt((preferred[2:] ** 2).mean(axis=0))
+        if spread.min() < LEAST_SPREAD:
+            return Consistency(score, sd, 0.0, 0.0)
+        total = (preferred / spread).sum(axis=1)
+        total /= np.sqrt((total[2:] ** 2).mean())
+        return Consistency(score, sd, float(total[0]), float(total[1]))
+
+    def _score(self, spectrum: Spectrum, otf: Spectrum) -> tuple[float, float]:
+        """The slope of |Y|^2 against |H|^2 in narrow rings, and its standard deviation; as `witness` has it."""
+        power, seen = _power(otf), _power(spectrum)
+        low, high = band(self._frequency, power, max(self._grid.window))
+        noise = self._noise(seen, power)
+        inside = np.flatnonzero((self._frequency > low) & (self._frequency < high) & self._off_axes)
+        order = inside[np.argsort(self._frequency.ravel()[inside], kind="stable")]
+        starts = np.arange(0, max(order.size - RING // 2, 1), RING)
+        if order.size < RING or not noise > 0:
+            return 0.0, float("inf")
+        counts = np.diff(np.append(starts, order.size))
+        energy, power = seen.ravel()[order], power.ravel()[order]
+        mean_power = np.add.reduceat(power, starts) / counts
+        mean = np.add.reduceat(energy, starts) / counts
+        speckle = power - np.repeat(mean_power, counts)
+        spread = np.add.reduceat(speckle**2, starts) / mean**2
+        found = float((np.add.reduceat(speckle * energy, starts) / mean**2).sum())
+        expected = float((np.maximum(mean - noise, 0) / mean_power * spread).sum())
+        if expected <= 0:
+            return 0.0, float("inf")
+        return found / expected, float(spread.sum()) ** 0.5 / expected
+
+    def _deconvolved_amplitude(self, spectrum: Spectrum, otf: Spectrum) -> Spectrum:
+        """Y |H| / (|H|^2 + regularisation): a Wiener solution but for the phase of H; prior power ~ 1/f."""
+        power, seen = _power(otf), _power(spectrum)
+        low, high = band(self._frequency, power, max(self._grid.window))
+        part = (self._frequency > low) & (self._frequency < high)
+        noise = self._noise(seen, power)
+        frequency = np.maximum(self._frequency, low / 5)
+        mean_power = float(power[part].mean())
+        level = max(float(seen[part].mean()) - noise, 1e-12 * noise) / float((power[part] / frequency[part]).mean())
+        kept = spectrum * (np.sqrt(power) / (power + noise / level * frequency + PSF_ERROR * mean_power))
+        kept[0, 0] = 0
+        return np.asarray(kept, np.complex64)
+
+    def _noise(self, seen: Floats, power: Floats) -> float:
+        """Noise per frequency, from the quarter that the optics passes least: the median of an exponential is ln 2."""
+        silent = self._off_axes & (power <= np.quantile(power, 0.25))
+        return float(np.median(seen[silent])) / float(np.log(2))
+
+    def _preferences(self, amplitudes: list[Spectrum], otf: Spectrum) -> list[float]:
+        """How much sparser the gradients are with a PSF's phase than with that of the PSF rotated by 180 degrees."""
+        phase = np.conj(otf) / np.maximum(np.abs(otf), np.float32(1e-20))
+        found = []
+        for amplitude in amplitudes:
+            given, turned = (scipy_fft.irfft2(amplitude * p, self._grid.shape) for p in (phase, np.conj(phase)))
+            found.append(sparsity(turned) - sparsity(given))
+        return found
+
+
+def sparsity(image: Image) -> float:
+    """mean log(1 + |D x|^2 / mean |D x|^2): small where few samples hold most of the gradient."""
+    squared = np.diff(image, axis=0)[:, :-1] ** 2 + np.diff(image, axis=1)[:-1] ** 2
+    mean = float(squared.mean())
+    return float(np.log1p(squared / np.float32(mean)).mean()) if mean > 0 else 0.0
+
+
+def binned(psf: Psf, n: int) -> Image:
+    """The PSF as sums of n x n pixels, (rows // n, cols // n); its place does not matter, its orientation does."""
+    rows, cols = (size // n for size in psf.shape)
+    top, left = ((size - count * n) // 2 for size, count in zip(psf.shape, (rows, cols), strict=True))
+    part = psf.pixels[top : top + rows * n, left : left + cols * n]
+    sums: Image = part.reshape(rows, n, cols, n).sum(axis=(1, 3))
+    return sums
+
+
+def stretched(psf: Image, scale: float) -> Image:
+    """The PSF stretched about its middle by linear interpolation; the same samples."""
+    if scale == 1:
+        return psf
+    middle = (np.array(psf.shape) - 1) / 2
+    image: Image = ndimage.affine_transform(psf, np.full(2, 1 / scale), middle * (1 - 1 / scale), order=1)
+    return image
+
+
+def filled(y: Image, good: Image) -> Image:
+    """The frame with every gap made up from the nearest good samples: a gap in bright light is structure of its own."""
+    there = (good > 0.5).astype(np.float32)
+    if there.all() or not there.any():
+        return y
+    image, known = np.where(there > 0, y, np.float32(0)), there
+    width = 2.0
+    while not known.all():
+        weight = ndimage.gaussian_filter(known, width)
+        near = ndimage.gaussian_filter(image * known, width) / np.maximum(weight, 1e-6)
+        found = (known == 0) & (weight > 0.05)
+        image, known = np.where(found, near, image), np.where(found, np.float32(1), known)
+        width *= 2
+    return np.asarray(image, np.float32)
+
+
+def _power(spectrum: Spectrum) -> Floats:
+    return np.asarray(np.abs(spectrum).astype(np.float64) ** 2)
