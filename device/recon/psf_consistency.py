@@ -119,7 +119,8 @@ class PsfConsistency:
     def __call__(self, counts: Pixels, scale: float = 1.0, defects: Mask | None = None) -> Consistency | None:
         """The figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF stretched by `scale`.
 
-        `defects` (rows, cols) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF is too small or too even to be asked.
+        `defects` (rows, cols) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF
+        is too small or too even to be asked.
         """
         if min(self._grid.shape) < LEAST_SAMPLES // 2:
             return None

@@ -39,7 +39,8 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
     person = row(session, id).person
     answer = session.get(FieldRow, (id, "consent"))
     with one_record(id):
-        return person, None if answer is None else reading.text(reading.parsed(answer.value))
+        value = None if answer is None else reading.parsed(answer.value)
+        return person, None if value is None else reading.text(value)
 
 
 def found(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
