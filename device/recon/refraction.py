@@ -189,7 +189,7 @@ class Refractor:
         """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
         self.model.refocus(otf)
         self.shading.refocus()
-        level, _ = self.shading.fit(frame.y, self._smooth)
+        level, _ = self.shading.fit(frame, self._smooth)
         self.model.fft.space[:] = self._smooth
         self._object[:] = self.model.fft.forward()
         return level

@@ -14,12 +14,14 @@ from scipy import fft as scipy_fft
 
 from device.recon.kernels import Box
 from device.recon.model import Model
+from device.recon.prepare import Linear
 from device.values import Image
 
 DEGREE = 8
 BLOCK = 4  # the fit looks at means of 4 x 4 samples: the modes are smooth
 RIDGE = 1e-4
 STRAY_RIDGE = 1e-2  # where the whole sensor is lit a constant is nearly a mode: doubt it until the frame insists
+LEAST_GOOD = 0.5  # share of a block's pixels that hold light; the mean of fewer says little about the block
 
 
 class Shading:
@@ -86,20 +88,41 @@ class Shading:
 
     def _normal_equations(self, seen: Image) -> None:
         """Weighted ridge regression: the weights are those of shot noise under an even field."""
+        self._seen = seen
         weights = 1 / (np.maximum(seen[0], 0) / seen[0].max() + 0.03)
         self._weighted = np.asarray(seen * weights, np.float32)
-        normal = self._weighted @ seen.T
-        self._inverse = np.linalg.inv(normal + np.diag(self._ridge * np.diag(normal)))
+        self._inverse = self._inverted(self._weighted)
 
-    def fit(self, y: Image, out: Image) -> tuple[float, float]:
-        """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN."""
-        coefficients = (self._inverse @ (self._weighted @ blocks(y, self._block).ravel())).astype(np.float32)
+    def _inverted(self, weighted: Image) -> NDArray[np.float64]:
+        """The inverse of the regularised normal matrix, (modes, modes), of modes weighted block by block."""
+        normal = weighted @ self._seen.T
+        return np.asarray(np.linalg.inv(normal + np.diag(self._ridge * np.diag(normal))), np.float64)
+
+    def fit(self, frame: Linear, out: Image) -> tuple[float, float]:
+        """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN.
+
+        Missing pixels have weight 0: fitted to the zeros that stand in a gap, 45 modes would draw the gap.
+        """
+        if frame.missing > 0:
+            coefficients = self._fitted_around_gaps(frame)
+        else:
+            coefficients = self._inverse @ (self._weighted @ blocks(frame.y, self._block).ravel())
+        coefficients = coefficients.astype(np.float32)
         top, bottom, left, right = self.box
         out[:] = 0
         smooth = coefficients[: len(self._modes)] @ self._modes
         out[top:bottom, left:right] = smooth.reshape(bottom - top, right - left)
         stray = float(coefficients[-1]) * self._stray_scale if len(coefficients) > len(self._modes) else 0.0
         return float(coefficients[0]), stray
+
+    def _fitted_around_gaps(self, frame: Linear) -> NDArray[np.float64]:
+        """The coefficients, (modes,), when each block counts by the share of its pixels that hold light."""
+        share = blocks(frame.good, self._block).ravel()
+        share[share < LEAST_GOOD] = 0
+        light = blocks(frame.y * frame.good, self._block).ravel()
+        means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
+        weighted = self._weighted * share
+        return np.asarray(self._inverted(weighted) @ (weighted @ means), np.float64)
 
 
 def blocks(image: Image, n: int) -> Image:

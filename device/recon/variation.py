@@ -27,6 +27,7 @@ KAPPA = 1.8  # of tau: within 0.03 dB of the oracle's over 1 to 120 ke-, bins 2 
 RHO = 5.0  # stiffness of z and w, in units of tau per level
 STIFF = 1.0  # stiffness of v, in units of a typical weight
 TAPER_PX = 60
+FILLS = 2  # of a frame with gaps; see `_fill_gaps`
 
 
 class EvidenceWiener:
@@ -53,33 +54,57 @@ class EvidenceWiener:
 
     def start(self, frame: Linear) -> None:
         """Solve: `x` is the picture on the grid, `facts` what was chosen."""
-        model, grid = self.model, self.model.grid
-        fft, inside = model.fft, grid.slices
-        self.level, self.stray = self.shading.fit(frame.y, self.x)
+        model, fft, inside = self.model, self.model.fft, self.model.grid.slices
+        self.level, self.stray = self.shading.fit(frame, self.x)
         self._blur()
         fft.space[:] = 0
         np.subtract(frame.y, self.blurred[inside], out=fft.space[inside])
         fft.space[inside] -= np.float32(self.stray)
         fft.space[inside] *= frame.good * self.fade
-        spectrum = fft.forward()
-        measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
-        energy = float(np.vdot(self.fade, self.fade))
-        mean = frame.mean_dn
-        self.noise = Noise.of(self.sensor, grid.n, measured / energy, mean)
-        lit = float(np.einsum("ij,ij,ij->", frame.y, self.fade, self.fade))
-        self.noise_dn2 = max(self.noise.per_dn * lit + self.noise.floor_dn2 * energy, 1e-20)
-        fit = self.evidence.fit(spectrum, self.noise_dn2)
-        self.law = fit.law
-        self.reg = self.evidence.regularisation(self.law, self.noise_dn2)
-        sweeps.wiener_with(spectrum, model.otf, self.reg, 1 / grid.size)
-        self.x += fft.inverse()
+        left = fft.space[inside].copy() if frame.missing > 0 else None
+        fit = self._solve_detail(frame)
+        if left is not None:
+            for _ in range(FILLS):
+                self._fill_gaps(left, frame.good)
+                fit = self._solve_detail(frame)
+        self.x += fft.space
         self.x *= model.mask
         np.maximum(self.x, 0, out=self.x)
+        mean = frame.mean_dn
         self.facts = {
             "prior_slope": self.law.slope, "prior_log_power": self.law.log_power, "flat_dn": self.level,
             "background_dn": self.stray, "noise_dn": self.noise.variance_dn2(mean) ** 0.5, "mean_dn": mean,
             "quality": self._quality(fit, mean),
         }  # fmt: skip
+
+    def _solve_detail(self, frame: Linear) -> Fit:
+        """Replace the residual in `fft.space` by its Wiener solution, with the noise and the prior that it supports."""
+        grid, fft = self.model.grid, self.model.fft
+        spectrum = fft.forward()
+        weight = self.fade if frame.missing == 0 else self.fade * np.sqrt(frame.good)
+        energy = float(np.vdot(weight, weight))
+        measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
+        self.noise = Noise.of(self.sensor, grid.n, measured / energy, frame.mean_dn)
+        lit = float(np.einsum("ij,ij,ij->", frame.y, weight, weight))
+        self.noise_dn2 = max(self.noise.per_dn * lit + self.noise.floor_dn2 * energy, 1e-20)
+        fit = self.evidence.fit(spectrum, self.noise_dn2)
+        self.law = fit.law
+        self.reg = self.evidence.regularisation(self.law, self.noise_dn2)
+        sweeps.wiener_with(spectrum, self.model.otf, self.reg, 1 / grid.size)
+        fft.inverse()
+        return fit
+
+    def _fill_gaps(self, left: Image, good: Image) -> None:
+        """Put `left` back into `fft.space`, its gaps filled with what the solution that stands there predicts.
+
+        One step of expectation maximisation for missing data: a gap filled with zeros is an edge that no retina has.
+        """
+        fft, inside = self.model.fft, self.model.grid.slices
+        spectrum = fft.forward()
+        spectrum *= self.model.otf
+        predicted = fft.inverse()[inside] * np.float32(1 / self.model.grid.size)
+        fft.space[:] = 0
+        fft.space[inside] = left + predicted * (1 - good)
 
     def _quality(self, fit: Fit, mean_dn: float) -> dict[str, float | None]:
         limit = quality.cutoff(self.evidence, fit.law, self.noise_dn2, self.model.grid.n, self.geometry)

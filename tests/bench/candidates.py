@@ -48,7 +48,7 @@ class Start:
         solver, model = self.solver, self.solver.model
         solver.start(self.frame)
         self.smooth = np.zeros(model.grid.shape, np.float32)
-        _, stray = solver.shading.fit(self.frame.y, self.smooth)
+        _, stray = solver.shading.fit(self.frame, self.smooth)
         self.left = (self.frame.y - self.through(self.smooth) - np.float32(stray)) * self.frame.good
 
     def through(self, x: Image) -> Image:
