@@ -23,15 +23,6 @@ U32 = 2.0**-24
 Within = Callable[[float, float], None]
 
 
-@pytest.fixture
-def within(record_property: Callable[[str, object], None]) -> Within:
-    def hold(measured: float, bound: float) -> None:
-        record_property("margin", f"{measured:.3g} of {bound:.3g}")
-        assert measured <= bound
-
-    return hold
-
-
 @cache
 def psf(seed: int = 0) -> Image:
     return scenes.speckle(SHAPE, seed)

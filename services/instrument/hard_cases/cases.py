@@ -35,6 +35,7 @@ MISSING = {
 }
 DIM = {"all": "Shot noise: with so few electrons no method has the detail; the resolution figure says so."}
 BLURRED = {"all": "The blur of the motion is in the object: one frame cannot tell it from a smooth eye."}
+BANDS = {"all": "Bands of a rolling shutter look like shading; the sensors of all heads here have a global shutter."}
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
 OTHER_EYE = {
     "tikhonov": "The paper's form uses the stored PSF: the blur circle of the other eye stays.",
@@ -203,7 +204,7 @@ CASES: tuple[Case, ...] = (
         for deg in (0.5, 1.5)
     ),
     _case("flicker 10 %", "light",
-          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1))),
+          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1)), "", BANDS),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),

@@ -17,7 +17,7 @@ ROWS_AT = (0.36, 0.61)  # of the height
 WIDE = 3 / 1080  # of the rows: how wide a group of dead columns or rows is
 BLOB_AT, BLOB_RADIUS = (0.45, 0.56), 0.055  # 60 of 1080 rows
 GLARE_AT, GLARE_SIGMA = (0.42, 0.57), 0.022
-FLICKER_HZ, LINE_S = 100.0, 30e-6  # mains light, and a rolling shutter's time from row to row
+FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
 
 
 def dead_columns(shape: tuple[int, int]) -> Mask:
@@ -81,7 +81,7 @@ def glare(counts: Counts, camera: CameraSpec, share: float) -> Counts:
 
 def flicker(counts: Counts, camera: CameraSpec, share: float) -> Counts:
     """The lamp's light swings by a share with the mains while rows are read one after the other."""
-    swing = 1 + share * np.sin(2 * np.pi * FLICKER_HZ * LINE_S * np.arange(counts.shape[0]))
+    swing = 1 + share * np.sin(2 * np.pi * FLICKER_HZ * READ_S * np.linspace(0, 1, counts.shape[0]))
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from device.clock import Clock
 from device.errors import SettingError
 from services.instrument.once import written
-from services.instrument.paper import caustics, first_order, hard, printed, screen, sensors, trainer
+from services.instrument.paper import caustics, first_order, hard, hard_grid, printed, screen, sensors, trainer
 from services.instrument.paper.bench import Bench
 from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown
 from services.instrument.paper.style import CLAIMED, STYLE
 
-ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12")
-_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard)
+ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13")
+_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }
