@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from device.values import Image
+from device.values import Image, Mask
 
 Single = np.float32
 Series = NDArray[np.float64]
@@ -17,6 +17,7 @@ Axes = tuple[Image, Image]
 Sums = tuple[float, float, float, float, float]
 Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
+Places = NDArray[np.int64]
 
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
 
@@ -214,3 +215,126 @@ def stretch(
                 line[k * n + q - offset[1]] = (
                     va * tall[m] + vb * tall[m + 1] + vc * tall[m + 2] + vd * tall[min(m + 3, cols + 3)]
                 )
+
+
+@_jit
+def mark_suspects(
+    counts: Pixels, dark: Image, slope_dn: float, floor_dn2: float, white_dn: float, least_dn: float, out: Mask
+) -> int:
+    """Mark in `out` (rows, cols) and count pixels that reach `white_dn`, or lie below `least_dn` above dark, or differ
+    from the mean m of their four neighbours by more than sqrt(slope_dn m + floor_dn2).
+
+    A dark of one row holds for all rows. NaN is not marked: `linearise` leaves it out. The border is compared with
+    itself, so that only its value is judged.
+    """
+    rows, cols = counts.shape
+    slope, floor, white, least = np.float32(slope_dn), np.float32(floor_dn2), np.float32(white_dn), np.float32(least_dn)
+    above, here, below = np.zeros(cols, np.float32), np.zeros(cols, np.float32), np.zeros(cols, np.float32)
+    _light(counts[0], dark[0], here)
+    above[:] = here
+    total = 0
+    for i in range(rows):
+        if i + 1 < rows:
+            _light(counts[i + 1], dark[(i + 1) % len(dark)], below)
+        else:
+            below[:] = here
+        _mark_row(counts[i], above, here, below, slope, floor, white, least, out[i])
+        found = 0
+        for j in range(cols):
+            found += out[i, j]
+        total += found
+        above, here, below = here, below, above
+    return total
+
+
+@_jit
+def _light(counts: Pixels, dark: Image, out: Image) -> None:
+    for j in range(out.size):
+        out[j] = np.float32(counts[j]) - dark[j]
+
+
+@_jit
+def _mark_row(
+    counts: Pixels, above: Image, here: Image, below: Image, slope: Single, floor: Single, white: Single, least: Single,
+    out: Mask,
+) -> None:  # fmt: skip
+    quarter, zero = np.float32(0.25), np.float32(0)
+    last = out.size - 1
+    for j in range(1, last):  # selects instead of branches, as in `_add_row`
+        mean = quarter * (here[j - 1] + here[j + 1] + above[j] + below[j])
+        off = here[j] - mean
+        odd = off * off > slope * max(mean, zero) + floor
+        out[j] = odd | (np.float32(counts[j]) >= white) | (here[j] < least)
+    for j in (0, last):
+        out[j] = (np.float32(counts[j]) >= white) | (here[j] < least)
+
+
+@_jit
+def outliers(
+    counts: Pixels,
+    dark: Image,
+    bad: Mask,
+    where: Places,
+    slope_dn: float,
+    floor_dn2: float,
+    ranges: tuple[float, float],
+    out: Mask,
+) -> int:
+    """Mark in `out` those of the pixels `where` (flat indices) that differ from a ring around them; their number.
+
+    A ring is the 8 pixels at distance 1 or the 16 at distance 2, without `bad` ones. A pixel differs when it is off the
+    ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the ring's own
+    range, its 1 + k highest and lowest left out.
+    """
+    rows, cols = counts.shape
+    ring = np.empty(16, np.float32)
+    found = 0
+    for place in where:
+        i, j = place // cols, place % cols
+        if bad[i, j] or out[i, j]:
+            continue
+        odd, light = False, np.float32(counts[i, j]) - dark[i % len(dark), j]
+        for k in range(2):
+            reach, n = k + 1, 0
+            for a in range(max(i - reach, 0), min(i + reach, rows - 1) + 1):
+                for b in range(max(j - reach, 0), min(j + reach, cols - 1) + 1):
+                    if max(abs(a - i), abs(b - j)) == reach and not bad[a, b]:
+                        ring[n] = np.float32(counts[a, b]) - dark[a % len(dark), b]
+                        n += 1
+            if n > 2 * k + 4:
+                known = np.sort(ring[:n])
+                middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
+                spread = known[n - 2 - k] - known[1 + k]
+                noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
+                odd = odd or abs(light - middle) > noise + ranges[k] * spread
+        if odd:
+            out[i, j] = True
+            found += 1
+    return found
+
+
+@_jit
+def ring_excess(image: Image, least: float, slope_dn: float, floor_dn2: float) -> tuple[float, float]:
+    """The largest `ranges` that `outliers` would need to find nothing in an image, among its pixels above `least`."""
+    rows, cols = image.shape
+    ring = np.empty(16, np.float32)
+    worst = np.zeros(2, np.float64)
+    for i in range(2, rows - 2):
+        for j in range(2, cols - 2):
+            if image[i, j] < least:
+                continue
+            for k in range(2):
+                n, reach = 0, k + 1
+                for a in range(i - reach, i + reach + 1):
+                    for b in range(j - reach, j + reach + 1):
+                        if max(abs(a - i), abs(b - j)) == reach:
+                            ring[n] = image[a, b]
+                            n += 1
+                known = np.sort(ring[:n])
+                middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
+                spread = known[n - 2 - k] - known[1 + k]
+                noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
+                excess = abs(image[i, j] - middle) - noise
+                if excess > 0:
+                    worst[k] = max(worst[k], excess / max(spread, np.float32(1e-30)))
+    return worst[0], worst[1]

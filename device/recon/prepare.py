@@ -8,7 +8,7 @@ from device.errors import FrameError
 from device.recon import kernels
 from device.recon.geometry import Grid
 from device.recon.kernels import Pixels
-from device.values import Calibration, Image
+from device.values import Calibration, Image, Mask
 
 MOST_BAD = 0.3  # share of pixels that may be missing (optics.md 5.4: at 30 % a masked fit still finds 0.89 of 0.95)
 
@@ -63,17 +63,19 @@ class Preparer:
         y = np.empty(grid.window, np.float32) if inbox is None else inbox
         self._out = Linear(y, np.empty(grid.window, np.float32), 0.0, 0.0, 0.0)
 
-    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Linear:
+    def __call__(self, counts: Pixels, dark: Pixels | None = None, defects: Mask | None = None) -> Linear:
         """Linear DN of one frame (rows, cols), uint16 or float32; `dark` is this shot's own dark frame.
 
-        NaN counts as missing. The result lives in buffers that the next call overwrites.
+        NaN counts as missing, and so do the pixels of `defects` (rows, cols). The result lives in buffers that the next
+        call overwrites.
         """
         _fitting("frame", counts, self.grid.sensor)
         offset = self.dark if dark is None else _fitting("dark frame", dark, self.grid.sensor)
+        gain = self.gain if defects is None else np.where(defects, np.float32(0), self.gain)
         y, good, grid = self._out.y, self._out.good, self.grid
         first, n = grid.first_px, grid.n
         saturated, believed, light_dn = kernels.linearise(
-            counts, offset, self.bend_per_dn, self.gain, self.white, first, n, y, good
+            counts, offset, self.bend_per_dn, gain, self.white, first, n, y, good
         )
         mean_good = believed / (good.size * n**2)
         if mean_good < 1 - MOST_BAD:

@@ -10,6 +10,7 @@ import numpy as np
 
 from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
+from device.recon.defects import DefectFinder
 from device.recon.kernels import Pixels
 from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
@@ -19,7 +20,7 @@ from device.recon.quality import complaints
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
-from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
+from device.values import Calibration, Image, Mask, Reconstruction, Report, check_image_shape
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Stage:
     last: bool
 
 
+ChannelFrame = tuple[Pixels, Pixels | None, Mask | None]  # counts, dark frame, defective pixels
 Watcher = Callable[[Stage], None]
 Between = Callable[[], None]
 
@@ -135,6 +137,7 @@ class Reconstructor:
             raise SettingError("a sample is made of at least one pixel")
         self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
         self.rungs = [_Rung(recipe, calibration, shape, planner, psf_index) for recipe in recipes]
+        self.defects = DefectFinder(calibration, shape, psf_index)
         self.refractor = None
         if refract and can_refract(calibration):
             self.refractor = Refractor(calibration, shape, planner, psf_index)
@@ -241,6 +244,8 @@ class _Climb:
         between: Between | None,
     ) -> None:  # fmt: skip
         self.clock, self.counts, self.dark = owner.clock, counts, dark
+        self._defects = owner.defects
+        self._found: dict[int, Mask | None] = {}
         self.deadline, self.most, self.between = deadline, most, between
         self.last = owner.rungs[-1]
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
@@ -264,10 +269,16 @@ class _Climb:
         """What a rung takes at the least."""
         return self.channels * (rung.start_cost.seconds + rung.round_cost.seconds) + rung.finish_cost.seconds
 
-    def brightest(self) -> tuple[Pixels, Pixels | None]:
-        """The channel with the most light, and its dark frame."""
-        c = 0 if self.channels == 1 else int(np.argmax(np.nanmean(self.counts, axis=(0, 1))))
-        return plane(self.counts, c), None if self.dark is None else plane(self.dark, c)
+    def brightest(self) -> ChannelFrame:
+        """The channel with the most light."""
+        return self.channel(0 if self.channels == 1 else int(np.argmax(np.nanmean(self.counts, axis=(0, 1)))))
+
+    def channel(self, c: int) -> ChannelFrame:
+        """Counts, dark frame and defective pixels of one channel; the defects are searched once per frame."""
+        counts, dark = plane(self.counts, c), None if self.dark is None else plane(self.dark, c)
+        if c not in self._found:
+            self._found[c] = self._defects(counts, dark)
+        return counts, dark, self._found[c]
 
     def up(self, rung: _Rung) -> bool:
         """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""
@@ -285,7 +296,7 @@ class _Climb:
 
     def _channel(self, rung: _Rung, c: int) -> None:
         begin_s = self.clock.now_s()
-        frame = rung.preparer(plane(self.counts, c), None if self.dark is None else plane(self.dark, c))
+        frame = rung.preparer(*self.channel(c))
         rung.solver.start(frame)
         now_s = self.clock.now_s()
         rung.start_cost.add(now_s - begin_s)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from device.errors import SettingError
 from device.recon import kernels, sweeps
 from device.recon.choose import flat_fit
+from device.recon.defects import DefectFinder
 from device.recon.evidence import band
 from device.recon.geometry import Grid, Pair, support_radius_px
 from device.recon.kernels import Pixels
@@ -28,7 +29,7 @@ from device.recon.plan import Planner, RealFft, Spectrum
 from device.recon.prepare import Linear, Preparer
 from device.recon.shading import Shading
 from device.recon.warp import ElasticOtf, transform
-from device.values import Calibration, Image
+from device.values import Calibration, Image, Mask
 
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
@@ -120,6 +121,7 @@ class Refractor:
         self.grid = self.model.grid
         self.shading = Shading(self.model)
         self.preparer = Preparer(calibration, self.grid)
+        self.defects = DefectFinder(calibration, shape, index)
         self.fft: RealFft = planner.plan(self.grid.window)
         self.taper = taper(self.grid.window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(self.grid.window))))
         self._choose_frequencies()
@@ -143,11 +145,14 @@ class Refractor:
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
 
-    def find(self, counts: Pixels, dark: Pixels | None = None) -> Refraction | None:
-        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span."""
+    def find(self, counts: Pixels, dark: Pixels | None = None, defects: Mask | None = None) -> Refraction | None:
+        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span.
+
+        `defects` (rows, cols) are left out, see `DefectFinder`.
+        """
         if self.band.where.size < LEAST_FREQUENCIES:
             return None
-        frame = self.preparer(counts, dark)
+        frame = self.preparer(counts, dark, defects)
         np.multiply(frame.good, self.taper, out=self.seen)
         if not self.fit_smooth(frame, self.model.stored) > 0:
             return None

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from device.errors import FrameError
+from device.recon.defects import DefectFinder
 from device.recon.kernels import Pixels
 from device.recon.model import Model, field_radius_px, tight_model
 from device.recon.plan import Planner
@@ -20,7 +21,7 @@ from device.recon.prepare import Preparer
 from device.recon.quality import LEAST_THROUGH
 from device.recon.reconstructor import plane
 from device.recon.variation import EvidenceWiener
-from device.values import Calibration, Image
+from device.values import Calibration, Image, Mask
 
 Word = Literal["good", "again"]
 Code = Literal[
@@ -127,6 +128,7 @@ class Gate:
         if isfinite(radius_px):
             n = max(1, int(2 * radius_px // FIELD_SAMPLES))
             self._eye = _Eye(calibration, tight_model(calibration, shape, n, planner, index))
+        self._defects = DefectFinder(calibration, shape, index)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Reading:
         """What a frame tells; `counts` and `dark` as for the Reconstructor."""
@@ -138,7 +140,7 @@ class Gate:
         if self._eye is None or saturated > HOPELESS or light_dn <= 0:
             return plain
         try:
-            return self._eye.read(plain, counts, dark)
+            return self._eye.read(plain, counts, dark, self._defects(counts, dark))
         except FrameError:
             if saturated <= MOST_SATURATED:
                 raise
@@ -186,9 +188,9 @@ class _Eye:
         self._weight = cycles[self._band] ** 3  # a retina's power falls so: every ring has its say
         self._turn = np.exp(2j * np.arctan2(across, along))[self._band]
 
-    def read(self, plain: Reading, counts: Pixels, dark: Pixels | None) -> Reading:
+    def read(self, plain: Reading, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Reading:
         """The reading with what the field tells."""
-        frame, picture, solver = self._prepare(counts, dark), self._picture, self._solver
+        frame, picture, solver = self._prepare(counts, dark, defects), self._picture, self._solver
         if plain.saturated > MOST_SATURATED:
             full = (1 - frame.good) * np.float32(self._span_dn)
             return replace(plain, wide=_rms_radius(frame.y + full) / self._even_radius)

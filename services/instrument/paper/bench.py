@@ -15,6 +15,7 @@ import numpy as np
 from device import sim
 from device.clock import SystemClock
 from device.recon.closed import TIKHONOV, ClosedForm
+from device.recon.defects import DefectFinder
 from device.recon.evenness import even_out
 from device.recon.geometry import disc
 from device.recon.methods import method_named
@@ -61,7 +62,9 @@ class Bench:
         method = method_named(name)
         model = method.model(take.calibration, take.shape, take.samples_px, self.planner, 0)
         solver, out = method.build(model, take.calibration, self.planner), np.zeros(model.grid.shape, np.float32)
-        solver.start(Preparer(take.calibration, model.grid)(take.staged.counts))
+        counts = take.staged.counts
+        defects = DefectFinder(take.calibration, take.shape)(counts)
+        solver.start(Preparer(take.calibration, model.grid)(counts, None, defects))
         if method.round_pairs:
             for _ in range(solver.rounds):
                 solver.step()
@@ -84,7 +87,8 @@ class Bench:
         if self._refractor is None or self._refractor[0] != take.calibration.id:
             found = Refractor(take.calibration, take.shape, self.planner, 0)
             self._refractor = take.calibration.id, found
-        eye = self._refractor[1].find(take.staged.counts)
+        refractor, counts = self._refractor[1], take.staged.counts
+        eye = refractor.find(counts, None, refractor.defects(counts))
         return float("nan") if eye is None else eye.sphere_dpt
 
     def tikhonov(self, take: "Take", mu: float) -> Image:

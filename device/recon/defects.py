@@ -1,0 +1,292 @@
+"""Pixels of one frame that do not hold the light of the eye: saturated, dead, warm, or hit by a reflex.
+
+Calibrated dark frames and bad-pixel masks know the stable ones. This module finds the rest in the frame itself, from
+what the optics cannot do: the PSF is the sharpest picture that the diffuser can make, so a pixel that differs from its
+surroundings by more than the noise and the sharpest edge of the PSF holds something else than light.
+
+* saturated pixels, and SATURATED_REACH_PX around saturated areas, where the clipped noise is biased;
+* values below the black level that no noise explains;
+* single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
+  deviations plus the PSF's own sharpness times the ring's range;
+* gaps without light (dead columns, rows, areas) behind a sharp edge;
+* the halo of a reflex: around a saturated area, light beyond what the blurred smooth field explains.
+
+A frame without a suspect costs one pass over its pixels.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from device.recon import kernels
+from device.recon.kernels import Pixels
+from device.recon.model import field_radius_px, tight_model
+from device.recon.plan import Planner
+from device.recon.prepare import Linear, Preparer
+from device.recon.shading import Shading
+from device.values import Calibration, Image, Mask, Psf
+
+NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250 frames
+SATURATED_REACH_PX = 3
+AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
+MOST_OUTLIERS = 0.05  # share of pixels; more is the structure of the frame, and none of them is called a defect
+NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
+SHADOW = 0.1  # of the light around it: a narrow gap is darker
+EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
+LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
+HALO = 0.01  # of the light that the field explains: more is a reflex. Overexposed eyes have 0.003 and less
+HALO_SD = 3.0  # standard errors of a ring's mean excess
+HALO_MARGIN = 3  # samples beyond the last ring with an excess
+HALO_TURNS = 5  # the halo spoils the first fit of the field that shows it
+HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
+LEAST_AREA = 2  # samples of a saturated area that may have a halo
+PASSES = 3  # an outlier hides its neighbour until it is left out
+SAMPLES, LEVELS = 20_000, 6
+LINE = np.float32(1.25)  # variance of a pixel minus the mean of four, in units of a pixel's variance
+QUANTISATION_DN2 = 1 / 12
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """The variance of a pixel in DN^2: `per_dn` times its light above dark in DN, plus `floor_dn2`."""
+
+    per_dn: float
+    floor_dn2: float
+
+    @classmethod
+    def measured(cls, counts: Pixels, dark: Image) -> "PixelNoise":
+        """The noise of a frame (rows, cols), from what a scatter of pixels differs by from their four neighbours.
+
+        A line is fitted through the trimmed variances of LEVELS groups of equal brightness, so the fine structure that
+        most pixels have counts as noise.
+        """
+        rows, cols = counts.shape
+        if min(rows, cols) < 3:
+            return cls(0.0, float("inf"))
+        stride = max(1, (rows - 2) * (cols - 2) // SAMPLES) | 1
+        place = np.arange(0, (rows - 2) * (cols - 2), stride)
+        i, j = 1 + place // (cols - 2), 1 + place % (cols - 2)
+        light = [_light_at(counts, dark, i + a, j + b) for a, b in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))]
+        mean = (light[1] + light[2] + light[3] + light[4]) / 4
+        off = light[0] - mean
+        known = np.isfinite(off)
+        mean, off = mean[known], off[known]
+        order = np.argsort(mean)
+        groups = [group for group in np.array_split(order, LEVELS) if group.size]
+        level = np.array([max(float(np.median(mean[group])), 0.0) for group in groups])
+        variance = np.array([_trimmed_variance(off[group]) for group in groups]) / float(LINE)
+        variance = np.maximum(variance, QUANTISATION_DN2 if counts.dtype.kind == "u" else 0.0)
+        return cls(*_line(level, variance))
+
+
+def _light_at(counts: Pixels, dark: Image, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.asarray(counts[i, j] - dark[i % len(dark), j], np.float64)
+
+
+def _trimmed_variance(off: NDArray[np.float64]) -> float:
+    """The variance of normal deviations around 0, from the smaller nine tenths of them."""
+    squares = np.sort(off**2)[: max(1, int(0.9 * off.size))]
+    return float(squares.mean()) / 0.623  # of a unit normal within its 90 % interval
+
+
+def _line(level: NDArray[np.float64], variance: NDArray[np.float64]) -> tuple[float, float]:
+    """Slope and offset, neither negative, of variance over level; the offset is at most the darkest group's."""
+    if not level.size:
+        return 0.0, float("inf")
+    floor = float(variance[0])
+    slope = float(np.polyfit(level, variance, 1)[0]) if np.ptp(level) > 0 else 0.0
+    slope = max(slope, 0.0)
+    return slope, max(floor - slope * float(level[0]), 0.1 * floor)
+
+
+class DefectFinder:
+    """The search for defective pixels, planned for one calibration: its black level, white level and PSF."""
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int], index: int = 0) -> None:
+        sensor = calibration.sensor
+        self._white_dn = sensor.white_dn
+        self._dark: Image = np.full((1, shape[1]), sensor.black_dn, np.float32)
+        if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
+            self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
+        self._bad: Mask = np.zeros(shape, np.bool_)
+        if calibration.bad is not None and calibration.bad.shape == shape:
+            self._bad = calibration.bad
+        self._ranges = ring_ranges(calibration.psfs[index])
+        self._calibration, self._shape, self._index = calibration, shape, index
+        self._suspect: Mask = np.zeros(shape, np.bool_)
+
+    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Mask | None:
+        """The defective pixels of a frame (rows, cols), uint16 or float32; None where there are none.
+
+        `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched.
+        """
+        offset = self._dark if dark is None else np.asarray(dark, np.float32)
+        noise = PixelNoise.measured(counts, offset)
+        limit = NOISE_SD**2 * float(LINE)
+        least_dn = self._least_dn(offset, noise)
+        found = kernels.mark_suspects(
+            counts, offset, limit * noise.per_dn, limit * noise.floor_dn2, self._white_dn, least_dn, self._suspect
+        )
+        if not found:
+            return None
+        places = np.flatnonzero(self._suspect)
+        values = counts.ravel()[places]
+        light = _light_at(counts, offset, *np.divmod(places, counts.shape[1]))
+        dark_dn = NOISE_SD * noise.floor_dn2**0.5
+        saturated, low = values >= self._white_dn, light < least_dn
+        defective = np.zeros(counts.shape, np.bool_)
+        if saturated.any() or low.any():
+            defective = around_areas(counts >= self._white_dn)
+            defective.ravel()[places[low]] = True
+        self._add_outliers(counts, offset, noise, places, defective)
+        if np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX:
+            defective |= self._gaps(np.where(defective, np.float32(0), counts - offset), dark_dn)
+        if saturated.any() and self._halo is not None:
+            defective |= self._halo.mask(counts, dark, defective)
+        return defective if defective.any() else None
+
+    @cached_property
+    def _halo(self) -> "HaloFinder | None":
+        """Planned at the first saturated frame; None where no field is known."""
+        if not isfinite(field_radius_px(self._calibration)):
+            return None
+        return HaloFinder(self._calibration, self._shape, self._index)
+
+    def _least_dn(self, offset: Image, noise: PixelNoise) -> float:
+        """The lowest value above dark that a working pixel gives: half the black level below it."""
+        black_dn = float(offset.mean(dtype=np.float64))
+        margin_dn = NOISE_SD * noise.floor_dn2**0.5
+        return -(0.5 * black_dn + margin_dn) if black_dn > 4 * margin_dn else -3e38
+
+    def _add_outliers(
+        self, counts: Pixels, offset: Image, noise: PixelNoise, places: NDArray[np.int64], defective: Mask
+    ) -> None:
+        """Mark the outliers among `places`, unless they are so many that they are the structure of the frame."""
+        limit = NOISE_SD**2
+        slope_dn, floor_dn2 = limit * noise.per_dn, limit * noise.floor_dn2
+        outlying = np.zeros_like(defective)
+        known = defective | self._bad
+        for _ in range(PASSES):
+            if not kernels.outliers(counts, offset, known, places, slope_dn, floor_dn2, self._ranges, outlying):
+                break
+            known |= outlying
+        if outlying.sum() <= MOST_OUTLIERS * outlying.size:
+            defective |= outlying
+
+    def _gaps(self, light: Image, dark_dn: float) -> Mask:
+        """Areas without light behind a sharp edge: what no blur by the PSF can leave dark.
+
+        Narrow ones (NARROW_PX) are far darker than their surroundings; wider ones hold no light at all.
+        """
+        around = ndimage.grey_closing(light, (NARROW_PX, NARROW_PX))
+        narrow = (light < np.maximum(SHADOW * around, dark_dn)) & (around > 4 * dark_dn)
+        return _with_sharp_border(narrow, self._suspect) | _with_sharp_border(
+            (light <= dark_dn) & ~narrow, self._suspect
+        )
+
+
+class HaloFinder:
+    """The search for halos of reflexes on coarse samples, planned for one calibration with a known field."""
+
+    def __init__(self, calibration: Calibration, shape: tuple[int, int], index: int) -> None:
+        n = max(1, round(min(shape) / HALO_SAMPLES))
+        self._model = tight_model(calibration, shape, n, Planner(None, effort="FFTW_ESTIMATE"), index)
+        self._shading, self._prepare = Shading(self._model), Preparer(calibration, self._model.grid)
+        self._smooth: Image = np.zeros(self._model.grid.shape, np.float32)
+
+    def mask(self, counts: Pixels, dark: Pixels | None, defective: Mask) -> Mask:
+        """The pixels of halos, (rows, cols): rings around saturated areas with more light than the field explains.
+
+        The field is fitted outside the halos that are known so far, and their rings measured again, HALO_TURNS times.
+        """
+        frame = self._prepare(counts, dark, defective)
+        lost = frame.good < 0.5
+        labels, count = ndimage.label(lost)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
+        areas = [k for k in range(1, count + 1) if sizes[k] >= LEAST_AREA]
+        distance, nearest = ndimage.distance_transform_edt(~lost, return_indices=True)
+        owner, ring = labels[tuple(nearest)], np.ceil(distance).astype(np.int64)
+        reach = np.zeros(count + 1, np.int64)
+        good = frame.good.copy()
+        for _ in range(HALO_TURNS):
+            excess, noise = self._excess(replace(frame, good=good, missing=1 - float(good.mean())))
+            grown = reach.copy()
+            for k in areas:
+                grown[k] = max(reach[k], _halo_rings(excess, noise, frame.good > 0.5, ring, owner == k))
+            if np.array_equal(grown, reach):
+                break
+            reach = grown
+            good = np.where((reach[owner] > 0) & (ring <= reach[owner] + HALO_MARGIN), np.float32(0), frame.good)
+        return self._on_sensor(good < frame.good, defective.shape)
+
+    def _excess(self, frame: Linear) -> tuple[Image, float]:
+        """The light beyond the blurred smooth field, as a share of it, and the robust sd of that share where it is lit."""
+        _, stray = self._shading.fit(frame, self._smooth)
+        explained = self._model.blur(self._smooth)[self._model.grid.slices] + np.float32(stray)
+        lit = explained > 0.2 * float(explained.max())
+        excess = np.where(lit, frame.y - explained, 0) / np.maximum(explained, 1e-20)
+        usable = lit & (frame.good > 0.5)
+        noise = float(np.median(np.abs(excess[usable]))) / 0.6745 if usable.any() else float("inf")
+        return np.asarray(excess, np.float32), noise
+
+    def _on_sensor(self, samples: Mask, shape: tuple[int, int]) -> Mask:
+        """The pixels of these samples of the window."""
+        grid = self._model.grid
+        pixels = np.zeros(shape, np.bool_)
+        block = np.repeat(np.repeat(samples, grid.n, 0), grid.n, 1)
+        top, left = grid.first_px
+        pixels[top : top + block.shape[0], left : left + block.shape[1]] = block
+        return pixels
+
+
+def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64], own: Mask) -> int:
+    """How many rings around an area, from the first on, have an excess; 0 if there is no halo."""
+    near = own & good & (ring > 0)
+    rings = ring[near]
+    if not rings.size:
+        return 0
+    number = np.bincount(rings)
+    mean = np.bincount(rings, excess[near]) / np.maximum(number, 1)
+    limit = np.maximum(HALO, HALO_SD * noise / np.sqrt(np.maximum(number / 4, 1)))
+    below = np.flatnonzero((mean[1:] <= limit[1:]) & (number[1:] > 0))
+    return int(below[0]) if below.size else int(rings.max())
+
+
+def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:
+    """Those connected areas whose border is `sharp` over EDGE_SHARE of its length."""
+    labels, count = ndimage.label(areas)
+    border = areas & ~ndimage.binary_erosion(areas, border_value=1)
+    length_px = np.bincount(labels[border], minlength=count + 1)
+    sharp_px = np.bincount(labels[border & sharp], minlength=count + 1)
+    kept = sharp_px >= np.maximum(EDGE_SHARE * length_px, 1)
+    kept[0] = False
+    return np.asarray(kept[labels])
+
+
+def around_areas(saturated: Mask) -> Mask:
+    """Saturated areas and the pixels within SATURATED_REACH_PX of them; single hot pixels are not an area."""
+    if not saturated.any():
+        return saturated
+    neighbours = ndimage.convolve(saturated.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
+    areas = saturated & (neighbours > AREA_NEIGHBOURS)
+    size = 2 * SATURATED_REACH_PX + 1
+    return np.asarray(ndimage.maximum_filter(areas, size) | saturated)
+
+
+def ring_ranges(psf: Psf) -> tuple[float, float]:
+    """How far the PSF itself goes beyond the range of its rings, in units of that range, for both rings of `outliers`.
+
+    The PSF is the frame of one point, the sharpest that there is; its own noise is taken off.
+    """
+    pixels = psf.pixels
+    if min(pixels.shape) < 5:
+        return float("inf"), float("inf")
+    nothing = np.zeros((1, pixels.shape[1]), np.float32)
+    noise = PixelNoise.measured(pixels, nothing)
+    return kernels.ring_excess(
+        pixels, 0.1 * float(pixels.max()), NOISE_SD**2 * noise.per_dn, NOISE_SD**2 * noise.floor_dn2
+    )
