@@ -15,7 +15,7 @@ from device.values import Counts, Image, Mask
 COLUMNS_AT = (0.31, 0.44, 0.56, 0.68)  # of the width
 ROWS_AT = (0.36, 0.61)  # of the height
 WIDE = 3 / 1080  # of the rows: how wide a group of dead columns or rows is
-BLOB_AT, BLOB_RADIUS = (0.45, 0.56), 0.055  # 60 of 1080 rows
+BLOB_AT, BLOB_SHARE = (0.45, 0.56), 0.055  # 60 of 1080 rows
 GLARE_AT, GLARE_SIGMA = (0.42, 0.57), 0.022
 FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
 
@@ -42,10 +42,10 @@ def _wide_px(shape: tuple[int, int]) -> int:
     return max(1, round(WIDE * shape[0]))
 
 
-def blob(shape: tuple[int, int], radius: float = BLOB_RADIUS) -> Mask:
-    """A disc near the middle, as a grain of dust on the sensor makes it; the radius is a share of the rows."""
+def blob(shape: tuple[int, int], share: float = BLOB_SHARE) -> Mask:
+    """A disc near the middle, as a grain of dust on the sensor makes it; its radius is a `share` of the rows."""
     rows, cols = (np.arange(n) - at * n for n, at in zip(shape, BLOB_AT, strict=True))
-    return np.asarray(np.hypot(rows[:, None], cols[None]) < radius * shape[0])
+    return np.asarray(np.hypot(rows[:, None], cols[None]) < share * shape[0])
 
 
 def read_as(counts: Counts, where: Mask, value_dn: int) -> Counts:
