@@ -57,7 +57,7 @@ def as_shipped(bench: Bench, take: Take, sphere_dpt: float) -> tuple[float, floa
 
 @dataclass
 class Eyes:
-    """What the solvers have of eyes out of focus, by the eye's M: PCC, and the error of the ladder's refraction in sd."""
+    """PCC of each solver by the mean sphere M of the eye, and the error of the refraction in standard deviations."""
 
     paper: dict[float, float] = field(default_factory=dict)
     flat: dict[float, float] = field(default_factory=dict)
