@@ -224,7 +224,7 @@ class HaloFinder:
         return self._on_sensor(good < frame.good, defective.shape)
 
     def _excess(self, frame: Linear) -> tuple[Image, float]:
-        """The light beyond the blurred smooth field, as a share of it, and the robust sd of that share where it is lit."""
+        """The light beyond the blurred smooth field as a share of it, and the robust sd of that share."""
         _, stray = self._shading.fit(frame, self._smooth)
         explained = self._model.blur(self._smooth)[self._model.grid.slices] + np.float32(stray)
         lit = explained > 0.2 * float(explained.max())

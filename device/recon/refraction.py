@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.errors import SettingError
 from device.recon import kernels, sweeps
@@ -33,6 +34,8 @@ from device.values import Calibration, Image, Mask
 
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
+LEAST_GOOD = 0.5  # share of a sample's pixels; a sample with fewer is filled
+FADE_SAMPLES = 2.0  # over which detail fades into a gap
 SPAN_DPT = 9.0
 RINGS, TURNS = 20, 4
 SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from neighbouring frequencies
@@ -152,8 +155,7 @@ class Refractor:
         """
         if self.band.where.size < LEAST_FREQUENCIES:
             return None
-        frame = self.preparer(counts, dark, defects)
-        np.multiply(frame.good, self.taper, out=self.seen)
+        frame = self.frame(counts, dark, defects)
         if not self.fit_smooth(frame, self.model.stored) > 0:
             return None
         self.residual(frame, 0.0)
@@ -175,6 +177,12 @@ class Refractor:
         apart_dpt = abs(self._found_by_the_upper_half(frame, noise, sphere_dpt) - vertex_dpt)
         return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve, apart_dpt)
 
+    def frame(self, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Linear:
+        """The frame on this model's samples; `seen` becomes the weights of its samples."""
+        frame = self.preparer(counts, dark, defects)
+        np.multiply(frame.good, self.taper, out=self.seen)
+        return frame
+
     def _found_by_the_upper_half(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
         """The minimum downhill from a candidate when only the upper half of the band is asked."""
         upper = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self._upper))
@@ -194,10 +202,23 @@ class Refractor:
         """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
         self.model.refocus(otf)
         self.shading.refocus()
-        level, _ = self.shading.fit(frame, self._smooth)
+        level, stray = self.shading.fit(frame, self._smooth)
         self.model.fft.space[:] = self._smooth
         self._object[:] = self.model.fft.forward()
+        if frame.missing > 0:
+            self._fill_gaps(frame, stray)
         return level
+
+    def _fill_gaps(self, frame: Linear, stray: float) -> None:
+        """Replace the missing samples of a frame by the smooth part, with the detail around them fading into it.
+
+        A gap of zeros has an edge, and an edge has power at every frequency: it would count as the retina's.
+        """
+        smooth = self.model.blur(self._smooth)[self.grid.slices] + np.float32(stray)
+        known = (frame.good >= LEAST_GOOD).astype(np.float32)
+        detail = ndimage.gaussian_filter((frame.y - smooth) * known, FADE_SAMPLES)
+        share = ndimage.gaussian_filter(known, FADE_SAMPLES)
+        np.copyto(frame.y, smooth + detail / np.maximum(share, 0.5), where=known == 0)
 
     def residual(self, frame: Linear, m_dpt: float) -> float:
         """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered.
@@ -210,7 +231,7 @@ class Refractor:
         np.multiply(self._object, self._otf, out=model.fft.spectrum)
         smooth = model.fft.inverse()[grid.slices]
         level, stray = flat_fit(kernels.dots(frame.y, smooth, frame.good))
-        kernels.residual(frame.y, smooth, self.seen, level, stray, (0, 0), self.fft.space)
+        kernels.residual(frame.y, smooth, self.taper, level, stray, (0, 0), self.fft.space)
         self.fft.forward()
         return stray
 

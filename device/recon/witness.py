@@ -67,8 +67,7 @@ class Witness:
         of = self._refractor
         if of.band.where.size < LEAST_FREQUENCIES:
             return None
-        frame = of.preparer(counts, dark, of.defects(counts, dark))
-        np.multiply(frame.good, of.taper, out=of.seen)
+        frame = of.frame(counts, dark, of.defects(counts, dark))
         if not of.fit_smooth(frame, of.model.stored) > 0:
             return None
         of.residual(frame, 0.0)
