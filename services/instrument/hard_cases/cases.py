@@ -31,7 +31,6 @@ NO_GAPS = {"tikhonov": "The paper's form has no model of a gap: a masked pixel r
 MISSING = {
     "tikhonov": NO_GAPS["tikhonov"],
     "gradient": "A linear filter: a masked sample is filled from the smooth fit only.",
-    "evidence": "A linear filter: a masked sample is filled from the smooth fit only.",
 }
 DIM = {"all": "Shot noise: with so few electrons no method has the detail; the resolution figure says so."}
 BLURRED = {"all": "The blur of the motion is in the object: one frame cannot tell it from a smooth eye."}

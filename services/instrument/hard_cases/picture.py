@@ -8,15 +8,15 @@ from services.instrument.hard_cases.cells import Cell
 from services.instrument.hard_cases.judgement import Violation, explanation, lost
 from services.instrument.plot import STYLE, text
 
-LEFT, TOP, WIDE, TALL, GAP, SKIP = 250, 128, 104, 24, 2, 10
+LEFT, TOP, WIDE, TALL, GAP, SKIP = 250, 150, 104, 24, 2, 10
 SHADES = (  # the loss below which a shade holds, its colour, the colour of the words on it
     (0.01, "#1a7f5a", "#ffffff"), (0.05, "#8fd0a8", "#10231a"), (0.15, "#f3dc8c", "#33290a"),
     (0.4, "#e89a5b", "#2e1706"), (float("inf"), "#b8403a", "#ffffff"),
 )  # fmt: skip
 REFUSED = "#8a8f98", "#ffffff"
 LEGEND = (
-    "number: PCC; in brackets what it is below the same method's clean frame   m: a message is given   "
-    "e: explained below   red frame: must not be"
+    "PCC inside the lit field; in brackets its change against the same method's clean frame",
+    "m: a message is given   e: explained below the table   red frame: must not be",
 )
 
 
@@ -47,18 +47,19 @@ def _document(eye: str, columns: Sequence[str], inner: Sequence[str], y: int) ->
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
         f'role="img" aria-label="Hard cases, {escape(eye)}"><style>{STYLE}</style>',
         f'<rect class="ground" width="{wide}" height="{tall}"/>',
-        text(20, 32, f"Hard cases: {eye}", "title"), text(20, 56, LEGEND, "quiet small"),
+        text(20, 32, f"Hard cases: {eye}", "title"),
+        *(text(20, 56 + 18 * k, line, "quiet small") for k, line in enumerate(LEGEND)),
         *_scale(), *heads, *inner, "</svg>\n",
     ])  # fmt: skip
 
 
 def _scale() -> list[str]:
-    out, x, before = [text(20, 82, "PCC lost:", "small")], 90, 0.0
+    out, x, before = [text(20, 106, "PCC lost:", "small")], 90, 0.0
     for limit, colour, ink in SHADES:
         words = f"< {limit:g}" if limit != float("inf") else f"> {before:g}"
-        out += [_box(x, 68, 60, 20, colour), _words(x + 30, 82, words, ink)]
+        out += [_box(x, 92, 60, 20, colour), _words(x + 30, 106, words, ink)]
         x, before = x + 62, limit
-    return [*out, _box(x, 68, 60, 20, REFUSED[0]), _words(x + 30, 82, "refused", REFUSED[1])]
+    return [*out, _box(x, 92, 60, 20, REFUSED[0]), _words(x + 30, 106, "refused", REFUSED[1])]
 
 
 def _cell(cell: Cell, x: int, y: int, broken: bool) -> list[str]:
