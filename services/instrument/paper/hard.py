@@ -142,7 +142,7 @@ def run_hard(bench: Bench) -> Outcome:
     pcc = {name: {said: cases[name].score(x).pcc for said, x in row.items()} for name, row in pictures.items()}
     ours = {name: row["the instrument's ladder"] for name, row in pcc.items()}
     claims += [
-        below(f"PCC lost, the instrument's ladder: {name}", ours["clean"] - ours[name], LIMITS.get(name, 0.02), "", 4)
+        below(f"PCC lost: {name}", ours["clean"] - ours[name], LIMITS.get(name, 0.02), "", 4)
         for name in cases if name not in ("clean", BELIEVED)
     ]  # fmt: skip
     claims += [
