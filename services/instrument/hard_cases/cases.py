@@ -35,8 +35,6 @@ MISSING = {
 DIM = {"all": "Shot noise: with so few electrons no method has the detail; the resolution figure says so."}
 BLURRED = {"all": "The blur of the motion is in the object: one frame cannot tell it from a smooth eye."}
 BANDS = {"all": "Bands along the rows look like shading; the ring is no mains light, and a global shutter has none."}
-    "all": "Bands along the rows look like shading of the object; the ring is no mains light, a global shutter has none."
-}
 PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
 OTHER_EYE = {
     "tikhonov": "The paper's form uses the stored PSF: the blur circle of the other eye stays.",
