@@ -39,7 +39,9 @@ DiffuscopeError
 │   ├── OtherScreen              another screen is taking pictures
 │   ├── Forged                   the request comes from a page that is not ours
 │   ├── WrongHost                the instrument was asked by a name that is not its own
-│   └── VisitFinished            the visit is finished
+│   ├── VisitFinished            the visit is finished
+│   ├── ConsentMissing           the person of this visit has not been asked yet
+│   └── ConsentDeclined          the person of this visit did not agree
 ├── StoreError                   the shelf
 │   ├── StoreFull                no room left
 │   ├── StoreDamaged             a kept file is not what was kept
@@ -367,6 +369,20 @@ class VisitFinished(Refused):
 
     code = "visit.finished"
     default_remedy = "This visit is finished. Begin a new visit for this person."
+
+
+class ConsentMissing(Refused):
+    """No consent is recorded for the visit: no light, neither for a picture nor for aiming."""
+
+    code = "consent.missing"
+    default_remedy = "First ask the person: may we take pictures of the eyes? Then choose the answer."
+
+
+class ConsentDeclined(Refused):
+    """The recorded answer of the visit is no, at first or later: no light, neither for a picture nor for aiming."""
+
+    code = "consent.declined"
+    default_remedy = "This person did not agree. Take no pictures, and finish the visit."
 
 
 class StoreError(DiffuscopeError):

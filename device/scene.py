@@ -92,6 +92,8 @@ class LightFlaws(Table):
     polariser_leak: float = Field(default=0.0, ge=0, le=1)  # of the corneal reflex, through crossed polarisers
     ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
     led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
+    ring_offset_um: float = Field(default=0.0, ge=-50000, le=50000)  # of the ring from the pupil's conjugate plane
+    dead_led: int | None = Field(default=None, ge=0, le=255)  # this LED of the ring stays dark
     falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (optics.md 3.5)
     vignette_deg: float | None = Field(default=None, gt=0, le=180)  # where exp(-1) of the light is left beside that
 

@@ -160,6 +160,7 @@ const ofState = {
     toAim(protocol.slots.find(({ eye, field }) => eye !== now.eye && field === now.field).id);
   },
   finish: () => exam.finish(),
+  ask: () => go({ screen: "person", visit: here().visit }),
   how: () => go(here().visit ? { screen: "film", visit: here().visit } : { screen: "history" }),
   takeNow({ visit, slot }) {
     lower("power.lost");

@@ -75,12 +75,13 @@ function controllerKey() {
   return ownKey;
 }
 
-/** The next preview frame of an eye after number `after`, or null when none came; throws when the link is broken. */
-export async function getPreview(after, eye, signal) {
+/** The next preview frame for an eye of a visit after number `after`, or null when none came; a Refusal when there is no light. */
+export async function getPreview(after, eye, visit, signal) {
   const headers = { "X-Controller": controllerKey() }; // the lamp shines for no stranger
-  const answer = await fetch(`/api/preview?after=${after}&eye=${eye}`, { cache: "no-store", headers, signal });
+  const query = new URLSearchParams({ after, eye, visit });
+  const answer = await fetch(`/api/preview?${query}`, { cache: "no-store", headers, signal });
   if (answer.status === 204) return null;
-  if (!answer.ok) throw new Error(`preview ${answer.status}`);
+  if (!answer.ok) throw new Refusal((await answer.json().catch(() => null)) ?? { code: `http.${answer.status}` });
   return {
     number: Number(answer.headers.get("X-Frame")),
     ageMs: Number(answer.headers.get("X-Age-Ms")),

@@ -231,6 +231,8 @@ function heardAim(aim) {
 addEventListener("pagehide", letControlsGo);
 
 act.heardAim = ({ detail }) => heardAim(detail);
+// Another screen changed the visit since it was loaded: loaded anew it tells why there is no light.
+act.heardRefused = ({ detail: { code } }) => code.startsWith("consent.") && refreshVisit(get().route.visit);
 act.heardLate = ({ detail: seconds }) => {
   if (seconds && get().prompt) set({ prompt: null }); // nobody is ready by an old picture
   if (seconds >= LATE_S && get().link === "live") {

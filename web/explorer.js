@@ -159,7 +159,7 @@ function points({ explored, all, capture, captures }, act) {
     ${capture ? html`<label>${t("explore.capture")}
       <select @change=${act.pick}>${captures.map((one) => html`
         <option value=${one.id} ?selected=${one === capture}>
-          ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}
+          ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}${one.test ? ` · ${t("explore.test")}` : ""}
         </option>`)}
       </select></label>` : html`<p class="muted">${t("explore.nothing")}</p>`}
     <table>

@@ -1,7 +1,7 @@
 // <eye-live>: the live preview. It asks for the next frame only when it has drawn the last one, so a slow link makes
 // fewer frames and never an old picture (MJPEG was 3 s behind on the same link; knowledge/page.md 3.1).
 
-import { getPreview } from "./api.js";
+import { getPreview, Refusal } from "./api.js";
 import { fitCanvas, homeBox } from "./field.js";
 import { number, t } from "./words.js";
 
@@ -17,6 +17,7 @@ export class EyeLive extends HTMLElement {
   #running = false;
   #head = null;
   #eye = "OD"; // whose light it is
+  #visit = null; // for which light is allowed
   #link = "opening";
   #bitmap = null;
   #number = 0;
@@ -34,7 +35,7 @@ export class EyeLive extends HTMLElement {
     this.#canvas.setAttribute("aria-label", t("aim.live"));
     this.#age.className = "age";
     this.#empty.className = "empty";
-    this.#empty.textContent = t("aim.waiting");
+    this.#empty.textContent = this.#visit ? t("aim.waiting") : "";
     this.append(this.#canvas, this.#empty, this.#age);
     new ResizeObserver(() => this.#draw()).observe(this);
     document.addEventListener("visibilitychange", () => this.#run());
@@ -60,6 +61,15 @@ export class EyeLive extends HTMLElement {
 
   set eye(eye) {
     this.#eye = eye;
+  }
+
+  /** The visit for which light is allowed, or null: nothing that was seen for another one, or before that, stays. */
+  set visit(visit) {
+    if (visit === this.#visit) return;
+    this.#visit = visit;
+    this.#empty.textContent = visit ? t("aim.waiting") : "";
+    this.#forget();
+    this.#draw();
   }
 
   set hint(hint) {
@@ -97,7 +107,7 @@ export class EyeLive extends HTMLElement {
     const patience = setTimeout(() => abort.abort(), ANSWER_MS);
     this.#abort = abort;
     try {
-      const frame = await getPreview(this.#number, this.#eye, abort.signal);
+      const frame = await getPreview(this.#number, this.#eye, this.#visit, abort.signal);
       if (!frame) this.#number = 0; // perhaps the server started anew while nobody looked, with small numbers
       if (!frame || !this.#active) return;
       this.#bitmap?.close();
@@ -109,8 +119,9 @@ export class EyeLive extends HTMLElement {
       this.#draw();
       this.#tellAge();
       this.dispatchEvent(new CustomEvent("aim", { detail: frame.aim }));
-    } catch {
+    } catch (problem) {
       this.#number = 0;
+      if (problem instanceof Refusal) this.dispatchEvent(new CustomEvent("refused", { detail: problem }));
       if (!abort.signal.aborted) await pause(RETRY_MS);
     } finally {
       clearTimeout(patience);

@@ -91,5 +91,11 @@ export function lostShots({ shots, visit }) {
   );
 }
 
+/** What is recorded of the person's consent: "agreed", "declined", "missing"; "saving" while an answer is on its way. */
+export const consentOf = ({ fields, waiting }) => (waiting?.includes("consent") ? "saving" : (fields.consent ?? "missing"));
+
+/** Whether light is allowed for the visit of this screen; the instrument refuses it for every other. */
+export const allowsLight = ({ route, visit }) => Boolean(visit) && visit.id === route.visit && consentOf(visit) === "agreed";
+
 export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slot.id === id) ?? null;
 export const eyeOf = (state, slot) => slotPlan(state, slot)?.eye ?? "OD";

@@ -2,7 +2,7 @@
 // A shot: {key, visit, slot, eye, id, stage, verdict, quick, capture, over}; `id` is the instrument's, `key` is ours and stays.
 
 import { freshKey, getCapture, Refusal, send } from "./api.js";
-import { eyeOf, FRESH_PICTURE, get, set, shotOf } from "./memory.js";
+import { allowsLight, eyeOf, FRESH_PICTURE, get, set, shotOf } from "./memory.js";
 import { go } from "./routes.js";
 import { lower, raise, shownStates } from "./states.js";
 import { politely, refreshVisit } from "./visit.js";
@@ -42,9 +42,9 @@ const byId = (id) => get().shots.find((shot) => shot.id === id);
 
 export function take() {
   if (!unlocked()) return;
-  const { route, visit } = get();
+  const { route } = get();
   if (route.screen === "picture") sayAlready();
-  if (route.screen !== "aim" || visit?.fields.consent !== "agreed") return;
+  if (route.screen !== "aim" || !allowsLight(get())) return;
   // A press into a dead link could arrive later, and light nobody expects would go on: it is not sent. Everything else
   // that may forbid a press the instrument has told, and would refuse.
   if (shownStates(get()).stop) return;
@@ -168,7 +168,8 @@ export async function openPicture(route) {
   const id = route.capture ?? slot?.capture ?? slot?.captures?.at(-1);
   if (id) {
     const capture = await politely(() => getCapture(id));
-    if (capture) put([...get().shots, shotFrom(capture, route)]);
+    if (capture && capture.visit !== route.visit) notHere(route, capture);
+    else if (capture) put([...get().shots, shotFrom(capture, route)]);
   } else if (["making", "busy"].includes(get().doing)) {
     const eye = eyeOf(get(), route.slot);
     const shot = { key: freshKey(), ...route, eye, id: null, stage: START, verdict: null, reloaded: true };
@@ -176,6 +177,12 @@ export async function openPicture(route) {
   } else {
     go({ screen: "aim", visit: route.visit, slot: route.slot }, { replace: true });
   }
+}
+
+// An address that somebody typed: no picture is shown as one of a visit to which it does not belong.
+function notHere({ visit }, { test }) {
+  go({ screen: "person", visit }, { replace: true });
+  raise({ code: "capture.elsewhere", message: t(test ? "fault.test" : "fault.elsewhere"), remedy: "", from: "press" });
 }
 
 function shotFrom(capture, { visit, slot }) {

@@ -1,7 +1,7 @@
 // Every state that the page can tell, as data: one table, one way to show it. The words stand in english.js under
 // "state.CODE" (English master); what stops stands in the prompt bar and in the shutter ("stop.CODE"), what only tells is a chip.
 
-import { get, lostShots, set } from "./memory.js";
+import { consentOf, get, lostShots, set } from "./memory.js";
 import { calendarDay, has, t } from "./words.js";
 
 const SAID_ALOUD = /^(link\.lost|light\.|heat\.)/;
@@ -16,6 +16,8 @@ const TABLE = [
   ["camera.missing", "stop", ["retry", "technician"]],
   ["heat.hot", "stop", [], { wait_s: 300 }],
   ["batt.empty", "stop", []],
+  ["consent.declined", "stop", ["finish"]],
+  ["consent.missing", "stop", ["ask"]],
   ["light.day", "stop", ["finish"]],
   ["light.limit", "stop", ["otherEye"], { wait_s: "n" }],
   ["store.full", "stop", ["how"]],
@@ -133,12 +135,19 @@ export function lower(test) {
 
 const worstFirst = (one, other) => one.rank - other.rank;
 
+/** The stop of a visit whose person has not agreed: it stands for as long as the visit says so. */
+function ofConsent({ route, visit }) {
+  if (route.screen !== "aim" || visit?.id !== route.visit) return [];
+  const known = STATES[`consent.${consentOf(visit)}`];
+  return known ? [{ ...known, from: "visit" }] : [];
+}
+
 /** At most one stop and two chips, worst first; and every picture that was lost. */
 export function shownStates(state) {
   const { states } = state;
   const lost = lostShots(state).map((shot) => ({ ...shot, ...STATES["shot.lost"], aloud: true }));
   return {
-    stop: states.find(({ level }) => level === "stop") ?? null,
+    stop: [...ofConsent(state), ...states].sort(worstFirst).find(({ level }) => level === "stop") ?? null,
     chips: [...lost, ...states.filter(({ level }) => level === "tell").slice(0, 2)],
   };
 }

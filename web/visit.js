@@ -207,7 +207,8 @@ export async function reopen() {
   if (visit) resume(visit);
 }
 
-export async function copyTo({ folder, name }) {
+/** Copy the visit to a USB stick; `folder` is the stick's `id` among those that the instrument listed. */
+export async function copyTo({ id: folder, name }) {
   const done = await politely(() => send("POST", at(get().route.visit, "export"), { folder }));
   if (done) set({ copied: name });
 }

@@ -139,6 +139,7 @@ export const TECHNICIAN = {
   "explore.kept": "As it was kept",
   "explore.kept.alt": "The picture as it was kept",
   "explore.again": "{method}, bin {bin}, {rounds} rounds",
+  "explore.test": "Test picture",
   "explore.again.alt": "The same capture by the other method",
   "explore.making": "Making the picture again…",
 

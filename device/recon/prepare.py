@@ -10,6 +10,7 @@ from device.recon.geometry import Grid
 from device.recon.kernels import Pixels
 from device.values import Calibration, Image, Mask
 
+LEAST_GOOD = 0.5  # share of a sample's pixels that hold light; with fewer it is a gap
 MOST_BAD = 0.3  # share of pixels that may be missing (optics.md 5.4: at 30 % a masked fit still finds 0.89 of 0.95)
 
 
@@ -25,6 +26,11 @@ class Linear:
     mean_dn: float
     saturated: float
     missing: float
+
+    @property
+    def has_gaps(self) -> bool:
+        """Whether a sample has lost more than half of its pixels; what is left of the others stands for the whole."""
+        return self.missing > 0 and bool(self.good.min() < LEAST_GOOD)
 
 
 class Preparer:

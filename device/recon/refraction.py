@@ -27,14 +27,13 @@ from device.recon.kernels import Pixels
 from device.recon.model import dirichlet, field_radius_px, taper, tight_model
 from device.recon.noise import Noise
 from device.recon.plan import Planner, RealFft, Spectrum
-from device.recon.prepare import Linear, Preparer
+from device.recon.prepare import LEAST_GOOD, Linear, Preparer
 from device.recon.shading import Shading
 from device.recon.warp import ElasticOtf, transform
 from device.values import Calibration, Image, Mask
 
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
-LEAST_GOOD = 0.5  # share of a sample's pixels; a sample with fewer is filled
 FADE_SAMPLES = 2.0  # over which detail fades into a gap
 SPAN_DPT = 9.0
 RINGS, TURNS = 20, 4
@@ -205,7 +204,7 @@ class Refractor:
         level, stray = self.shading.fit(frame, self._smooth)
         self.model.fft.space[:] = self._smooth
         self._object[:] = self.model.fft.forward()
-        if frame.missing > 0:
+        if frame.has_gaps:
             self._fill_gaps(frame, stray)
         return level
 

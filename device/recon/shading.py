@@ -14,14 +14,13 @@ from scipy import fft as scipy_fft
 
 from device.recon.kernels import Box
 from device.recon.model import Model
-from device.recon.prepare import Linear
+from device.recon.prepare import LEAST_GOOD, Linear
 from device.values import Image
 
 DEGREE = 8
 BLOCK = 4  # the fit looks at means of 4 x 4 samples: the modes are smooth
 RIDGE = 1e-4
 STRAY_RIDGE = 1e-2  # where the whole sensor is lit a constant is nearly a mode: doubt it until the frame insists
-LEAST_GOOD = 0.5  # share of a block's pixels that hold light; the mean of fewer says little about the block
 
 
 class Shading:
@@ -103,7 +102,7 @@ class Shading:
 
         Missing pixels have weight 0: fitted to the zeros that stand in a gap, 45 modes would draw the gap.
         """
-        if frame.missing > 0:
+        if frame.has_gaps:
             coefficients = self._fitted_around_gaps(frame)
         else:
             coefficients = self._inverse @ (self._weighted @ blocks(frame.y, self._block).ravel())

@@ -61,12 +61,13 @@ class EvidenceWiener:
         np.subtract(frame.y, self.blurred[inside], out=fft.space[inside])
         fft.space[inside] -= np.float32(self.stray)
         fft.space[inside] *= frame.good * self.fade
-        left = fft.space[inside].copy() if frame.missing > 0 else None
-        fit = self._solve_detail(frame)
-        if left is not None:
-            for _ in range(FILLS):
-                self._fill_gaps(left, frame.good)
-                fit = self._solve_detail(frame)
+        has_gaps = frame.has_gaps
+        left = fft.space[inside].copy() if has_gaps else self.fade
+        weight = self.fade * np.sqrt(frame.good) if has_gaps else self.fade
+        fit = self._solve_detail(frame, weight)
+        for _ in range(FILLS if has_gaps else 0):
+            self._fill_gaps(left, frame.good)
+            fit = self._solve_detail(frame, weight)
         self.x += fft.space
         self.x *= model.mask
         np.maximum(self.x, 0, out=self.x)
@@ -77,11 +78,13 @@ class EvidenceWiener:
             "quality": self._quality(fit, mean),
         }  # fmt: skip
 
-    def _solve_detail(self, frame: Linear) -> Fit:
-        """Replace the residual in `fft.space` by its Wiener solution, with the noise and the prior that it supports."""
+    def _solve_detail(self, frame: Linear, weight: Image) -> Fit:
+        """Replace the residual in `fft.space` by its Wiener solution, with the noise and the prior that it supports.
+
+        `weight` (the window's shape) is what each sample of the residual was multiplied by, the gaps' with 0.
+        """
         grid, fft = self.model.grid, self.model.fft
         spectrum = fft.forward()
-        weight = self.fade if frame.missing == 0 else self.fade * np.sqrt(frame.good)
         energy = float(np.vdot(weight, weight))
         measured = self.sample.noise_variance(self.sample.energies(spectrum), grid.size) * grid.size
         self.noise = Noise.of(self.sensor, grid.n, measured / energy, frame.mean_dn)

@@ -190,10 +190,12 @@ class _Eye:
 
     def read(self, plain: Reading, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Reading:
         """The reading with what the field tells."""
-        frame, picture, solver = self._prepare(counts, dark, defects), self._picture, self._solver
+        picture, solver = self._picture, self._solver
         if plain.saturated > MOST_SATURATED:
+            frame = self._prepare(counts, dark)  # with all the light that is there, halos too
             full = (1 - frame.good) * np.float32(self._span_dn)
             return replace(plain, wide=_rms_radius(frame.y + full) / self._even_radius)
+        frame = self._prepare(counts, dark, defects)
         solver.start(frame)
         solver.finish(picture)
         shown = self.shown

@@ -195,7 +195,7 @@ def create_app(
     app.include_router(exports_router(people, store, sticks or Sticks()), dependencies=[only_one])
     app.include_router(outbox_router(sender), dependencies=[only_one])
     _state(app, owner, people, notices)
-    live_routes(app, owner, shown)
+    live_routes(app, owner, people, shown)
     technician_routes(app, owner, door, rooms)
     page(app)
     return app
@@ -311,6 +311,7 @@ def shown(capture: Capture) -> dict[str, Any]:
         "id": capture.id, "eye": capture.eye, "taken_at": capture.taken_at.isoformat(),
         "simulated": capture.simulated, "calibration_id": capture.calibration_id, "report": capture.report,
         "visit": capture.report.get("visit"), "slot": capture.report.get("slot"),
+        "test": capture.report.get("visit") is None,
         "verdict": capture.report.get("verdict"),
         "files": capture.files,
         "links": {
@@ -325,7 +326,7 @@ def _captures(app: FastAPI, owner: Owner, people: People, promised: Promised, on
 
     @app.post("/api/captures", status_code=201, dependencies=[only_one])
     async def press(press: Press) -> dict[str, Any]:
-        """Take one picture and keep it; of a slot of a visit, if they are given."""
+        """Take one picture and keep it: of a slot of a visit with consent, or, without both, a test picture."""
         kept = people.answered(press.key) if press.key else None
         if kept is not None:  # by an instrument that was started anew since then
             return shown(store.get(kept))

@@ -15,21 +15,20 @@ from pathlib import Path
 from threading import Condition, Event, Thread
 
 from device.clock import Clock, Deadline
-from device.errors import Busy, DiffuscopeError, FrameError, LightFault, StoreError
+from device.errors import Busy, DiffuscopeError, FrameError, LightFault, Refused, StoreError
 from device.head import Head
 from device.recon.focus import sharpest
 from device.recon.plan import Planner
 from device.recon.reconstructor import Reconstructor, Stage, ladder
-from device.sequence import lit
-from device.values import EYES, Calibration, Capture, Eye, Glow, Image, Reconstruction, Shot
+from device.values import EYES, Calibration, Capture, Eye, Image, Reconstruction
 from services.instrument.aside import aside
 from services.instrument.bulletin import Bulletin
-from services.instrument.exposing import before, expose, eye_in
+from services.instrument.exposing import expose, expose_live, eye_in
 from services.instrument.filing import QUICK_PX, capture_files, report_of, unmade
 from services.instrument.fitness import Fitness
 from services.instrument.judging import NOWHERE, Watch
 from services.instrument.pace import BUDGET_S, LAST_S, SEATS
-from services.instrument.press import Exposed, Keys, Press, Preview
+from services.instrument.press import NO_VISIT, Exposed, Keys, LiveRequest, Press, Preview
 from services.instrument.progress import Progress
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records import picture
@@ -69,7 +68,7 @@ class Exam:
         self._exposed: deque[Exposed] = deque()
         self._in_the_making = 0
         self._wanted_until_s = self._alive_s = 0.0
-        self._aimed: tuple[Eye, ...] = EYES
+        self._wanted = NO_VISIT
         self._preview = Preview(0, b"", 0.0, NOWHERE)
         self._told = "starting"
         self._pressed = Keys()
@@ -116,13 +115,13 @@ class Exam:
             self._turn.notify_all()
         return future
 
-    def preview(self, after: int, wait_s: float = 2.0, eyes: tuple[Eye, ...] = EYES) -> Preview | None:
-        """The next live picture after number `after`, whose light counts for `eyes`; None when none comes in `wait_s`.
+    def preview(self, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
+        """The next live picture after number `after` as it is `wanted`; None when none comes in `wait_s`.
 
-        For both while nobody knows which eye looks.
+        Its light counts for both eyes while nobody knows which one looks.
         """
         with self._turn:
-            self._aimed = eyes
+            self._wanted = wanted
             self._wanted_until_s = self.clock.now_s() + WANTED_S
             self._turn.notify_all()
             self._turn.wait_for(lambda: self._preview.number > after or self._closing, wait_s)
@@ -220,6 +219,7 @@ class Exam:
         taken_at = self.clock.wall()
         id = Capture.named(taken_at, press.eye, secrets.token_hex(3))
         with self._answering(press, id):
+            press.errand.permit()  # again: it may have been withdrawn while the press waited
             self.underway.begin(Lost(id, press.eye, press.errand.visit, press.errand.slot, press.errand.tries))
             self._tell_stage(press, id, "expose")
             begin_s = self.clock.now_s()
@@ -364,16 +364,15 @@ class Exam:
 
     def _live_picture(self) -> tuple[Preview, float] | None:
         """The next one, and when its light (for aiming, not the picture's) went off; None if somebody pressed."""
-        spec = self.head.spec
-        before(self.head, self._aimed)
-        self.head.camera.prepare(Shot(spec.camera.preview_exposure_s))
+        wanted = self._wanted
         try:
-            with self.head.light.on(Glow(spec.light.preview_colour), self._aimed):
-                exposed_s = self.clock.now_s()
-                frame = lit(self.head.camera.expose(Shot(spec.camera.preview_exposure_s)))
-        finally:
-            self.head.light.off()
-            dark_s = self.clock.now_s()
+            wanted.permit()
+        except Refused:  # the consent was withdrawn since it was asked for
+            with self._turn:
+                if self._wanted is wanted:  # a newer request goes on
+                    self._wanted_until_s = 0.0
+            return None
+        frame, exposed_s, dark_s = expose_live(self.head, wanted.eyes, self.clock)
         if self._press is not None:
             return None
         deadline = Deadline.after(self.clock, PREVIEW_BUDGET_S)

@@ -1,5 +1,6 @@
 """What the head gives for a picture, and which part of a picture is the eye."""
 
+from device.clock import Clock
 from device.head import Head
 from device.recon.model import field_box
 from device.sequence import lit
@@ -18,6 +19,20 @@ def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
         return frame, head.camera.expose(shot)
     finally:
         head.light.off()
+
+
+def expose_live(head: Head, eyes: tuple[Eye, ...], clock: Clock) -> tuple[Frame, float, float]:
+    """A frame in the light for aiming, which counts for these eyes; when it was exposed, and when it was dark again."""
+    shot = Shot(head.spec.camera.preview_exposure_s)
+    before(head, eyes)
+    head.camera.prepare(shot)
+    try:
+        with head.light.on(Glow(head.spec.light.preview_colour), eyes):
+            exposed_s = clock.now_s()
+            frame = lit(head.camera.expose(shot))
+    finally:
+        head.light.off()
+    return frame, exposed_s, clock.now_s()
 
 
 def before(head: Head, eyes: tuple[Eye, ...]) -> None:

@@ -42,7 +42,8 @@ def report_of(
 ) -> dict[str, Any]:
     """The report of a picture that was made within `budget_s`, as it will be read back: lists for tuples, no numpy."""
     judged = {"verdict": asdict(verdict), "laterality": laterality, "budget_s": budget_s}
-    report = asdict(made) | shot.light | shot.press.errand.facts | judged
+    errand = shot.press.errand
+    report = asdict(made) | shot.light | errand.facts | {"test": errand.is_test} | judged
     plain: dict[str, Any] = json.loads(as_json(report | {"seconds": {"expose": shot.expose_s, **made.seconds}}))
     return plain
 

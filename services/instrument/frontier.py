@@ -29,6 +29,7 @@ from device.recon.reconstructor import Recipe, Reconstructor, ladder
 from device.sim.staged import staged
 from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Image, Mask, Reconstruction
+from services.instrument.frontier_oracle import best_mus
 from services.instrument.frontier_plot import drawn
 from services.instrument.once import Order, calibrated, refuse_place, written
 
@@ -122,6 +123,7 @@ def measured(case: Case, plans: Path, budget_s: float, repeats: int, say: Say) -
         "timing": f"counts in memory to picture on the sensor grid, plans made; {repeats} interleaved repeats",
         "edge": "seconds_median against psnr_db",
         "points": [asdict(point) for point in points],
+        "best_mu": bench.best_mus(),
         "budget_s": budget_s,
         "choice": choice,
         "dominated": [method for method in METHODS if method not in kept],
@@ -157,6 +159,9 @@ def table(found: dict[str, Any]) -> str:
             f"{p['seconds_median'] * 1e3:>8.1f} {p['seconds_p95'] * 1e3:>8.1f} {p['psnr_db']:>6.2f} {p['pcc']:>6.3f} "
             f"{p['ssim']:>6.3f} {p['highpass_pcc']:>6.3f} {vessel:>6}"
         )
+    for p in found["best_mu"]:
+        lines.append(f"  tikhonov with the best mu, {p['mu']:.0e}, chosen by the truth: bin {p['bin']}, "
+                     f"{p['psnr_db']:.2f} dB, PCC {p['pcc']:.3f}")  # fmt: skip
     choice = found["choice"]
     lines.append(
         f"within {found['budget_s']:g} s the instrument chooses {choice['method']}, bin {choice['bin']}, "
@@ -170,11 +175,11 @@ class _Bench:
     """All reconstructors of one case, planned, and the judge of what they make."""
 
     def __init__(self, case: Case, planner: Planner, clock: Clock, say: Say) -> None:
-        self.case, self.clock, self.say = case, clock, say
+        self.case, self.planner, self.clock, self.say = case, planner, clock, say
         geometry = case.calibration.geometry
         self.detail_px = HIGHPASS_DEG * geometry.px_per_deg if geometry else HIGHPASS_PX
-        inside, self.where = _region(case)
-        self.judge = Judge(case.truth, inside, self.detail_px, case.vessels)
+        self.inside, self.where = _region(case)
+        self.judge = Judge(case.truth, self.inside, self.detail_px, case.vessels)
         steps = ladder(case.calibration, case.shape)
         say(f"{case.name}: planning the instrument's own ladder")
         self.instrument = Reconstructor(case.calibration, case.shape, planner, clock, steps)
@@ -195,7 +200,20 @@ class _Bench:
 
     def score(self, made: Reconstruction) -> Scores:
         """What a picture scores, after the one shift that all pictures of this case share."""
-        return self.judge(np.roll(_grey(made.picture), (-self.shift[0], -self.shift[1]), axis=(0, 1)))
+        return self.judge(self.moved(_grey(made.picture)))
+
+    def moved(self, picture: Image) -> Image:
+        """A picture moved by the one shift that all pictures of this case share."""
+        return np.roll(picture, (-self.shift[0], -self.shift[1]), axis=(0, 1))
+
+    def best_mus(self) -> list[dict[str, Any]]:
+        """The paper's closed form at the best mu of its range, for each bin; an oracle, not a way to make a picture."""
+        self.say("tikhonov at the best mu of its range")
+        case = self.case
+        bins = sorted({recipe.bin for recipe in self.recipes if recipe.method == "tikhonov"})
+        return best_mus(
+            case.counts, case.calibration, self.planner, case.truth, self.inside, bins, self.judge, self.moved
+        )
 
     def measure(self, budget_s: float, repeats: int) -> tuple[list[Point], dict[str, Any]]:
         """Every point and the instrument's choice."""

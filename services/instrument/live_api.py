@@ -11,26 +11,42 @@ from fastapi.responses import StreamingResponse
 from device.errors import StoreError
 from device.values import EYES, Capture, Eye
 from services.instrument.owner import Owner
+from services.instrument.press import LiveRequest
+from services.instrument.visits_api import NAME
+from services.records.people import People
 from services.records.store import Store
 
 
-def live_routes(app: FastAPI, owner: Owner, shown: Callable[[Capture], dict[str, Any]]) -> None:
+def live_routes(app: FastAPI, owner: Owner, people: People, shown: Callable[[Capture], dict[str, Any]]) -> None:
     """What goes on while a page is open; `shown` is a capture as JSON."""
+    _preview(app, owner, people)
+    _events(app, owner, shown)
 
+
+def _preview(app: FastAPI, owner: Owner, people: People) -> None:
     @app.get("/api/preview")
-    def preview(after: int = Query(0, ge=0), eye: Eye | None = None) -> Response:
+    def preview(
+        after: int = Query(0, ge=0), eye: Eye | None = None, visit: str | None = Query(None, pattern=NAME)
+    ) -> Response:
         """The next live picture after number `after`, of that eye if it is known; 204 when none comes in 2 s.
+
+        For a visit only while its consent is `agreed`: else 409, and the lamp stays dark. Without one, for a test
+        picture.
 
         It makes the lamp shine, so no page but the instrument's own may ask: browsers say so themselves
         (`Sec-Fetch-Site`), and everybody else gives any `X-Controller`, which no foreign page can.
         """
-        live = owner.preview(after, EYES if eye is None else (eye,))
+        wanted = LiveRequest(EYES if eye is None else (eye,), people.permission(visit))
+        wanted.permit()
+        live = owner.preview(after, wanted)
         if live is None:
             return Response(status_code=204)
         age_ms = max(0, round((owner.house.clock.now_s() - live.exposed_s) * 1000))
         told = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
         return Response(live.jpeg, media_type="image/jpeg", headers=told)
 
+
+def _events(app: FastAPI, owner: Owner, shown: Callable[[Capture], dict[str, Any]]) -> None:
     @app.get("/api/events")
     async def events(last_event_id: int | None = Header(None, ge=0)) -> StreamingResponse:
         """What happens, as server-sent events, with a heartbeat (`beat`) every second.

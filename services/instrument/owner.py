@@ -13,11 +13,10 @@ from device.clock import Clock
 from device.errors import Busy, CalibrationError, DiffuscopeError, HeadMismatch
 from device.head import Bench, Head, refuse_recording
 from device.spec import CalibrationTable, InstrumentSpec
-from device.values import EYES, Eye
 from services.instrument.bulletin import Bulletin
 from services.instrument.calibrating import Wish
 from services.instrument.exam import Exam
-from services.instrument.press import Preview
+from services.instrument.press import NO_VISIT, LiveRequest, Preview
 from services.instrument.watchdog import Watchdog
 from services.instrument.wizard import Back, Wizard
 from services.records.store import Store
@@ -112,13 +111,13 @@ class Owner:
         """The head as the exam has it; None while it does not."""
         return self._exam.head if self._exam is not None else None
 
-    def preview(self, after: int, eyes: tuple[Eye, ...] = EYES) -> Preview | None:
+    def preview(self, after: int, wanted: LiveRequest = NO_VISIT) -> Preview | None:
         """The exam's next live picture; while it does not have the head, none ever comes."""
         exam, self._aimed_s = self._exam, self.house.clock.now_s()
         if exam is None:
             self.house.clock.sleep(NO_PREVIEW_S)
             return None
-        return exam.preview(after, eyes=eyes)
+        return exam.preview(after, wanted=wanted)
 
     def quick(self, id: str) -> bytes | None:
         """The quick look of a press under way."""

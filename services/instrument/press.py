@@ -7,8 +7,8 @@ from datetime import datetime
 
 from device.recon.aim import Aim
 from device.recon.verdict import Verdict
-from device.values import Capture, Eye, Frame
-from services.records.errand import Errand
+from device.values import EYES, Capture, Eye, Frame
+from services.records.errand import Errand, Permit, permit_test_picture
 
 REMEMBERED = 32  # presses whose key is known, so that a request which the network repeats makes one picture
 
@@ -21,6 +21,17 @@ class Preview:
     jpeg: bytes
     exposed_s: float
     aim: Aim
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """A request for live pictures: the eyes that their light counts for, and `permit` as in `Errand`."""
+
+    eyes: tuple[Eye, ...] = EYES
+    permit: Permit = permit_test_picture
+
+
+NO_VISIT = LiveRequest()
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,20 @@ from sqlalchemy.orm import Session
 from device.values import Capture
 
 Beside = Callable[[Session, Capture], None]
+Permit = Callable[[], None]
+
+
+def permit_test_picture() -> None:
+    """Allow light that belongs to no visit: a test picture, or aiming for one."""
 
 
 @dataclass(frozen=True)
 class Errand:
-    """A slot of a visit and its part, how often it was tried and may be tried, and what `beside` writes with it."""
+    """A slot of a visit and its part, how often it was tried and may be tried, and what `beside` writes with it.
+
+    `permit` is called right before the light: it raises ConsentMissing or ConsentDeclined where the visit does not
+    allow any. Without a visit the picture is a test picture.
+    """
 
     visit: str | None = None
     slot: str | None = None
@@ -21,11 +30,17 @@ class Errand:
     retakes: int = 2
     field: str | None = None
     beside: Beside | None = None
+    permit: Permit = permit_test_picture
 
     @property
     def facts(self) -> dict[str, Any]:
         """What the report of the capture says of it."""
         return {"visit": self.visit, "slot": self.slot}
+
+    @property
+    def is_test(self) -> bool:
+        """Whether the picture belongs to no visit, and never will."""
+        return self.visit is None
 
 
 NO_ERRAND = Errand()

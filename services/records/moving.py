@@ -49,11 +49,13 @@ def question(session: Session) -> Question | None:
 
 
 def place_of(session: Session, capture: str) -> ShotRow:
-    """Where a capture stands; NotKept if it belongs to no visit."""
+    """Where a capture stands; NotKept if there is none of that name, or if it is a test picture, which stays one."""
     shot = session.get(ShotRow, capture)
-    if shot is None:
-        raise NotKept("this picture belongs to no person")
-    return shot
+    if shot is not None:
+        return shot
+    if session.get(CaptureRow, capture) is None:
+        raise NotKept(f"there is no capture named {capture!r}")
+    raise NotKept("this is a test picture: it belongs to no person", "Take the picture again for this person.")
 
 
 def same_field(protocol: Protocol, slot: str, eye: Eye) -> Slot:

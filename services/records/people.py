@@ -12,10 +12,10 @@ from sqlalchemy import Engine, delete
 from sqlalchemy.orm import Session
 
 from device.clock import Clock
-from device.errors import InputError, NotKept, VisitFinished
+from device.errors import ConsentDeclined, ConsentMissing, InputError, NotKept, VisitFinished
 from device.values import Capture, Eye
 from services.records import answers, moving, numbering, schema, visits
-from services.records.errand import Beside, Errand
+from services.records.errand import Beside, Errand, Permit, permit_test_picture
 from services.records.protocol import CHOOSE, Protocol
 from services.records.schema import CounterRow, FieldRow, IdentifierRow, KeyRow, PersonRow, ShotRow, SlotRow, VisitRow
 from services.records.store import told
@@ -87,7 +87,10 @@ class People:
         return self.get(self._once(key, f"answer {id} {name} {json.dumps(value)}", act))
 
     def errand(self, eye: Eye, key: str | None, id: str | None, slot: str | None) -> Errand:
-        """What is to be done with a picture of that eye; InputError if the slot is of the other one."""
+        """What is to be done with a picture of that eye; without a visit it is a test picture.
+
+        Errors: InputError (the slot is of the other eye), VisitFinished, ConsentMissing, ConsentDeclined.
+        """
         if id is None or slot is None:
             return Errand(beside=self._beside(key))
         visit, wanted = self.get(id), self.protocol.slot(slot)
@@ -95,8 +98,29 @@ class People:
             raise InputError(f"{slot} is a picture of {wanted.eye}, not of {eye}", CHOOSE)
         if visit.finished_at is not None:
             raise VisitFinished(f"{visit.number} is finished")
+        permit = self.permission(id)
+        permit()
         tries = len(visit.slots[slot].taken)
-        return Errand(id, slot, tries, self.protocol.retakes, wanted.field, self._beside(key))
+        return Errand(id, slot, tries, self.protocol.retakes, wanted.field, self._beside(key), permit)
+
+    def permission(self, id: str | None) -> Permit:
+        """A check of the consent of a visit, to be called before each light; without a visit it allows test pictures.
+
+        It reads the recorded answer at each call. Errors: ConsentMissing or ConsentDeclined unless it is `agreed` now,
+        NotKept if there is no such visit.
+        """
+        if id is None:
+            return permit_test_picture
+
+        def permit() -> None:
+            with told(), Session(self.engine) as session:
+                number, consent = visits.consent(session, id)
+            if consent == "declined":
+                raise ConsentDeclined(f"{number} did not agree to pictures")
+            if consent != "agreed":
+                raise ConsentMissing(f"{number} has not agreed to pictures yet")
+
+        return permit
 
     def _beside(self, key: str | None) -> Beside:
         """What is kept with a capture: the key of the press that made it, and its place."""
@@ -160,9 +184,10 @@ class People:
 
         def act(session: Session) -> str:
             self._open(session, id)
-            shot = session.get(ShotRow, capture) if capture is not None else None
-            if capture is not None and (shot is None or (shot.visit, shot.slot) != (id, slot)):
-                raise NotKept(f"this is not a picture of {slot} of this person")
+            if capture is not None:
+                shot = moving.place_of(session, capture)
+                if (shot.visit, shot.slot) != (id, slot):
+                    raise NotKept(f"this is not a picture of {slot} of this person")
             _decide(session, id, slot, Decided(capture))
             return id
 

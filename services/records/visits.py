@@ -27,6 +27,13 @@ def row(session: Session, id: str) -> VisitRow:
     return found
 
 
+def consent(session: Session, id: str) -> tuple[str, str | None]:
+    """The person's number and the recorded answer to the question of consent; NotKept if there is no such visit."""
+    person = row(session, id).person
+    answer = session.get(FieldRow, (id, "consent"))
+    return person, None if answer is None else json.loads(answer.value)
+
+
 def found(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
     """The newest rows, newest first, that fit all that is asked."""
     query = select(VisitRow).order_by(VisitRow.begun_at.desc(), VisitRow.id.desc()).limit(limit)

@@ -1,7 +1,8 @@
 """A simulation of the HTTP API, for states that the real server shows only when something breaks.
 
 The journeys run against the real server; this stand-in holds the page's error and waiting states still, so that they
-can be looked at. It keeps nothing, and every picture in it is drawn.
+can be looked at. It keeps nothing, and every picture in it is drawn. It reads requests by the real server's own models;
+that its answers have the real server's shapes is tested in `tests/journey/test_stub.py`.
 """
 
 import asyncio
@@ -17,12 +18,16 @@ from typing import Any
 
 import numpy as np
 import uvicorn
-from fastapi import FastAPI, Header
+from fastapi import FastAPI, Header, Query, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from PIL import Image
 
-from services.instrument.api import SafeHeaders
+from device.errors import InputError
+from services.instrument.api import Press, SafeHeaders, refusal
+from services.instrument.outbox_api import TryNow
 from services.instrument.page import page
+from services.instrument.visits_api import Answered, Asking, Away, Begin, Chosen, CouldNot, OfEye, Order
 from tests.browser.stub_visits import PROTOCOL, Visits
 
 ROWS, COLS, FIELD_PX = 540, 960, 260
@@ -30,6 +35,10 @@ OTHER = {"code": "link.other", "message": "Another screen is taking pictures.", 
 UNKNOWN = {"code": "store.unknown", "message": "This is not kept here.", "remedy": "Choose from the list."}
 BUSY = {"code": "busy", "message": "A picture is being taken.", "remedy": "Wait until it is done, then press again."}
 CUT = {"code": "light.cut", "message": "The light went out.", "remedy": "Take it again."}
+NO_CONSENT = {
+    None: {"code": "consent.missing", "message": "A0142 has not agreed yet.", "remedy": "First ask the person."},
+    "declined": {"code": "consent.declined", "message": "A0142 did not agree.", "remedy": "Take no pictures."},
+}
 FULL = {"code": "store.full", "message": "No room.", "remedy": "Make room."}
 
 
@@ -100,6 +109,11 @@ class Stub:
         """As new, for the next test."""
         vars(self).update(vars(Stub()))
 
+    def without_consent(self, visit: str | None) -> JSONResponse | None:
+        """The refusal of light for a visit without consent."""
+        consent = self.visits.kept[visit]["fields"].get("consent") if visit else "agreed"
+        return None if consent == "agreed" else JSONResponse(NO_CONSENT[consent], 409)
+
     def tell(self, kind: str, data: dict[str, Any]) -> None:
         if kind == "notice" and data.get("over"):
             self.standing.pop(data["code"], None)
@@ -169,6 +183,7 @@ class Stub:
             "eye": wish["eye"],
             "visit": wish.get("visit"),
             "slot": wish.get("slot"),
+            "test": wish.get("visit") is None,
             "verdict": verdict,
             "taken_at": datetime.now(UTC).isoformat(),
             "simulated": True,
@@ -191,7 +206,12 @@ def build(stub: Stub) -> FastAPI:
     _status(app, stub)
     _captures(app, stub)
     _visits(app, stub)
+    _decisions(app, stub)
     _live(app, stub)
+
+    @app.exception_handler(RequestValidationError)
+    async def _(_: Request, error: RequestValidationError) -> JSONResponse:
+        return refusal(InputError(str(error.errors()[0]["msg"]), "Reload the page and try again."))
 
     page(app)
     app.add_middleware(SafeHeaders)
@@ -204,7 +224,7 @@ def _status(app: FastAPI, stub: Stub) -> None:
         told = [data["state"] for kind, data in stub.events if kind == "state"]
         state = "busy" if stub.busy else ["aim", *told][-1]
         return {"name": "Stub head", "kind": stub.kind, "state": state, "shape": [ROWS, COLS], "field_px": FIELD_PX,
-                "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356,
+                "version": "0.0", "swept": stub.swept, "problem": stub.problem, "people_left": 356, "space_left": 1424,
                 "sending": {"sent": 20, "waiting": len(stub.unsent)} if stub.sending else None,
                 "controller": stub.controller and "a public name", "notices": stub.notices,
                 "standing": list(stub.standing.values())}  # fmt: skip
@@ -215,18 +235,18 @@ def _status(app: FastAPI, stub: Stub) -> None:
         return known | {"next_try_s": 0 if stub.tried else 700, "visits": stub.unsent}
 
     @app.post("/api/outbox/try")
-    def try_now(wish: dict[str, Any]) -> dict[str, Any]:
-        stub.tried.append(wish.get("visit"))
+    def try_now(wish: TryNow) -> dict[str, Any]:
+        stub.tried.append(wish.visit)
         return outbox()
 
     @app.post("/api/controller")
-    def controller(wish: dict[str, Any]) -> dict[str, Any]:
-        if wish.get("release") and stub.controller == wish["key"]:
+    def controller(wish: Asking) -> dict[str, Any]:
+        if wish.release and stub.controller == wish.key:
             stub.controller = None
             return {"lease": "a public name", "mine": False}
-        if stub.controller is None or wish.get("take"):
-            stub.controller = wish["key"]
-        return {"lease": "a public name", "mine": stub.controller == wish["key"]}
+        if stub.controller is None or wish.take:
+            stub.controller = wish.key
+        return {"lease": "a public name", "mine": stub.controller == wish.key}
 
 
 def _captures(app: FastAPI, stub: Stub) -> None:
@@ -235,13 +255,15 @@ def _captures(app: FastAPI, stub: Stub) -> None:
         return {"captures": stub.captures[:limit]}
 
     @app.post("/api/captures", status_code=201)
-    async def press(wish: dict[str, str], x_controller: str | None = Header(None)) -> Any:
+    async def press(wish: Press, x_controller: str | None = Header(None)) -> Any:
         stub.presses += 1
         if stub.refuse:
             return JSONResponse(stub.refuse[1], stub.refuse[0])
         if stub.controller not in (None, x_controller):
             return JSONResponse(OTHER, 409)
-        return JSONResponse(BUSY, 409) if stub.making >= stub.seats else await stub.seated(wish)
+        if (refused := stub.without_consent(wish.visit)) is not None:
+            return refused
+        return JSONResponse(BUSY, 409) if stub.making >= stub.seats else await stub.seated(wish.model_dump())
 
     @app.get("/api/captures/{name}")
     def one(name: str) -> Any:
@@ -249,16 +271,16 @@ def _captures(app: FastAPI, stub: Stub) -> None:
         return found[0] if found else JSONResponse(UNKNOWN, 404)
 
     @app.post("/api/captures/{name}/eye")
-    def move(name: str, wish: dict[str, str]) -> Any:
+    def move(name: str, wish: OfEye) -> Any:
         capture = next(capture for capture in stub.captures if capture["id"] == name)
-        return stub.visits.move(capture, wish["eye"])
+        return stub.visits.move(capture, wish.eye)
 
     @app.post("/api/captures/{name}/keep")
-    def keep(name: str, wish: dict[str, str]) -> Any:
+    def keep(name: str, _: Order) -> Any:
         capture = next(capture for capture in stub.captures if capture["id"] == name)
-        slot = stub.visits.kept[capture["visit"]]["slots"][capture["slot"]]
-        slot |= {"state": "taken", "capture": name, "verdict": capture["verdict"]}
-        return capture
+        visit = stub.visits.kept[capture["visit"]]
+        visit["slots"][capture["slot"]] |= {"state": "taken", "capture": name, "verdict": capture["verdict"]}
+        return stub.visits.seen(visit)
 
     @app.get("/api/captures/{name}/{file}")
     def kept(name: str, file: str) -> Response:
@@ -276,11 +298,11 @@ def _visits(app: FastAPI, stub: Stub) -> None:
         return stub.visits.listed(day, open, q)
 
     @app.post("/api/visits", status_code=201)
-    def begin(wish: dict[str, str]) -> dict[str, Any]:
+    def begin(wish: Begin) -> dict[str, Any]:
         known = stub.visits.keys
-        if wish["key"] not in known:
-            known[wish["key"]] = stub.visits.begin(wish.get("number"))
-        return stub.visits.seen(known[wish["key"]])
+        if wish.key not in known:
+            known[wish.key] = stub.visits.begin(wish.number)
+        return stub.visits.seen(known[wish.key])
 
     @app.get("/api/visits/{name}")
     def visit(name: str) -> Any:
@@ -288,28 +310,47 @@ def _visits(app: FastAPI, stub: Stub) -> None:
         return stub.visits.seen(found) if found else JSONResponse(UNKNOWN, 404)
 
     @app.patch("/api/visits/{name}")
-    def patch(name: str, wish: dict[str, Any]) -> dict[str, Any]:
-        stub.patched.append((wish["field"], wish["value"]))
-        stub.visits.kept[name]["fields"][wish["field"]] = wish["value"]
+    def patch(name: str, wish: Answered) -> dict[str, Any]:
+        stub.patched.append((wish.field, wish.value))
+        stub.visits.kept[name]["fields"][wish.field] = wish.value
         return stub.visits.seen(stub.visits.kept[name])
 
     @app.post("/api/visits/{name}/export")
-    def export(name: str, wish: dict[str, Any]) -> dict[str, Any]:
-        return {"folder": wish["folder"], "files": 9}
-
-    @app.post("/api/visits/{name}/{what}")
-    def change(name: str, what: str, wish: dict[str, Any]) -> dict[str, Any]:
-        verdicts = {capture["id"]: capture["verdict"] for capture in stub.captures}
-        return stub.visits.change(stub.visits.kept[name], what, wish, verdicts)
+    def export(name: str, wish: Away) -> dict[str, Any]:
+        return {"folder": f"{wish.folder}/{name}"}
 
     @app.get("/api/exports")
     def exports() -> dict[str, Any]:
-        return {"folders": [{"folder": "/media/usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
+        return {"folders": [{"id": "/media/usb-1", "name": "USB stick BLUE", "free_bytes": 7_900_000_000}]}
+
+
+def _decisions(app: FastAPI, stub: Stub) -> None:
+    def change(name: str, what: str, wish: Order) -> dict[str, Any]:
+        verdicts = {capture["id"]: capture["verdict"] for capture in stub.captures}
+        return stub.visits.change(stub.visits.kept[name], what, wish.model_dump(), verdicts)
+
+    @app.post("/api/visits/{name}/could-not")
+    def could_not(name: str, wish: CouldNot) -> dict[str, Any]:
+        return change(name, "could-not", wish)
+
+    @app.post("/api/visits/{name}/slots")
+    def choose(name: str, wish: Chosen) -> dict[str, Any]:
+        return change(name, "slots", wish)
+
+    @app.post("/api/visits/{name}/finish")
+    def finish(name: str, wish: Order) -> dict[str, Any]:
+        return change(name, "finish", wish)
+
+    @app.post("/api/visits/{name}/reopen")
+    def reopen(name: str, wish: Order) -> dict[str, Any]:
+        return change(name, "reopen", wish)
 
 
 def _live(app: FastAPI, stub: Stub) -> None:
     @app.get("/api/preview")
-    async def preview(after: int) -> Response:
+    async def preview(after: int = Query(0, ge=0), visit: str | None = None) -> Response:
+        if (refused := stub.without_consent(visit)) is not None:
+            return refused
         await asyncio.sleep(0.25)  # four a second: drawing in software is what these tests wait for
         headers = {"X-Frame": str(after + 1), "X-Age-Ms": str(stub.preview_age_ms)}
         headers |= {"X-Aim": json.dumps(stub.aim)} if stub.aim else {}

@@ -23,7 +23,7 @@ SPECIFIED = set(
         light.cut shot.lost shot.crossed
         shot.saturated shot.dark shot.pupil shot.moved shot.blink shot.noeye shot.edge shot.halo shot.poor
         make.slow make.failed store.low store.full batt.low batt.empty heat.warm heat.hot power.lost link.lost
-        link.slow link.other clock.wrong send.waiting send.stuck lock.idle eye.side
+        link.slow link.other clock.wrong send.waiting send.stuck lock.idle eye.side consent.missing consent.declined
         """,
     )
 )
@@ -41,6 +41,8 @@ STOPS = {
     "heat.hot": "Too hot – 5:00",
     "link.other": "Other screen",
     "lock.idle": "Locked",
+    "consent.missing": "First ask: may we?",
+    "consent.declined": "Did not agree",
 }
 TELLS = ["camera.stalled", "power.lost", "batt.low", "store.low", "clock.wrong", "send.stuck", "make.slow", "heat.warm",
          "send.waiting", "cal.old"]  # fmt: skip
@@ -67,7 +69,9 @@ def test_the_table_holds_every_state_of_the_specification_with_words_and_nothing
     table = (WEB / "states.js").read_text().split("const TABLE = [")[1].split("const SAME")[0]
     english = (WEB / "english.js").read_text()
     coded = set(
-        re.findall(r'"((?:camera|light|cal|shot|make|store|batt|heat|power|link|clock|send|lock|eye)\.\w+)"', table)
+        re.findall(
+            r'"((?:camera|light|cal|shot|make|store|batt|heat|power|link|clock|send|lock|eye|consent)\.\w+)"', table
+        )
     )
     assert coded == SPECIFIED
     assert set(re.findall(r'"state\.([\w.]+)":', english)) == SPECIFIED

@@ -121,10 +121,12 @@ def test_an_urgent_complaint_is_told_at_once(open_page: Open, stub: Stubbed) -> 
 def test_without_consent_there_is_no_shutter_and_a_visit_still_ends(open_page: Open, stub: Stubbed) -> None:
     visit = stub.stub.visits.begin()
     page = open_page(f"{stub.url}/#/visit/{visit['id']}/aim/R-centre")
-    live(page)
+    expect(page.locator(".state-bar[data-code='consent.missing']")).to_contain_text("First ask: may we take pictures?")
     settled(page).locator(SHUTTER).tap(force=True)
     expect(page.locator(SHUTTER)).to_contain_text("First ask")
-    tap(page, "#who")
+    expect(page.locator("eye-live[data-frame]")).to_have_count(0)
+    assert look_for_faults(page) == []
+    tap(page, "[data-do=ask]")
     page.locator("[data-value=declined]").tap()
     tap(page, "#finish")
     expect(page.locator(".outcome")).to_be_visible()

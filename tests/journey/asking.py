@@ -1,5 +1,6 @@
 """An instrument that can be asked what stands: equipped with what may fail, and what its server says of it."""
 
+import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
@@ -63,6 +64,20 @@ def equipped(head: Head, now: datetime | None = None) -> Head:
         head, spec=head.spec.model_copy(update={"bus": BUS}), chips=Chips(SimThermometer(world), SimBattery(world)),
         provenance=Provenance("D-1", made_at, "a technician", "0.1.0"),
     )  # fmt: skip
+
+
+def agreed_visit(rig: Rig, key: str | None = None) -> dict[str, Any]:
+    """A new visit whose person agreed to pictures."""
+    begun = rig.request("POST", "/api/visits", json={"key": key or secrets.token_hex(8)}).json()
+    return answered(rig, begun["id"], "consent", "agreed")
+
+
+def answered(rig: Rig, visit: str, field: str, value: Any) -> dict[str, Any]:
+    """The visit after one answer was recorded."""
+    order = {"key": secrets.token_hex(8), "field": field, "value": value}
+    answer = rig.request("PATCH", f"/api/visits/{visit}", json=order)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
 
 
 def pressed(rig: Rig, eye: str = "OD", **more: Any) -> Said:

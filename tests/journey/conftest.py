@@ -35,6 +35,7 @@ from services.instrument.api import create_app
 from services.instrument.bulletin import Bulletin
 from services.instrument.carrier import Carrier
 from services.instrument.exam import Exam
+from services.instrument.exporting import Sticks
 from services.instrument.owner import House, Owner
 from services.instrument.technician import Door
 from services.instrument.watchdog import Watchdog
@@ -192,6 +193,7 @@ def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., R
         head: Callable[[Head], Head] = lambda head: head,
         clock: GateClock | None = None,
         carrier: Carrier | None = None,
+        sticks: Sticks | None = None,
     ) -> Rig:
         clock, died = clock or GateClock(), Event()
         scene = copy(dark_world)
@@ -213,7 +215,8 @@ def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., R
         house = House(scene.spec, Archive(folder / "archive"), shelf, bulletin, clock, Watchdog(watchdog), died.set)
         owner = Owner(house, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = Door(folder / "technician.json", clock)
-        return Rig(scene, clock, shelf, bulletin, exam, owner, door, create_app(owner, door, carrier=carrier), died)
+        app = create_app(owner, door, carrier=carrier, sticks=sticks)
+        return Rig(scene, clock, shelf, bulletin, exam, owner, door, app, died)
 
     return built
 

@@ -16,7 +16,19 @@ from typing import Any
 
 from device.sim.world import World
 from device.values import Charge
-from tests.journey.asking import MAKE_WEEKS, MOST_BYTES, Attentive, Said, Shelf, aimed, live, pressed, stands
+from tests.journey.asking import (
+    MAKE_WEEKS,
+    MOST_BYTES,
+    Attentive,
+    Said,
+    Shelf,
+    agreed_visit,
+    aimed,
+    answered,
+    live,
+    pressed,
+    stands,
+)
 from tests.journey.conftest import Rig, until
 from tests.simulated import having
 
@@ -180,7 +192,7 @@ def unmade(rig: Rig, shelf: Shelf) -> Said:
 
 
 def poor(rig: Rig, shelf: Shelf) -> Said:
-    visit = rig.request("POST", "/api/visits", json={"key": "b" * 16}).json()["id"]
+    visit = agreed_visit(rig, "b" * 16)["id"]
     with seen(rig, 0.003):
         told = [pressed(rig, visit=visit, slot="R-centre").code for _ in range(3)]
     assert told[:2] == ["shot.dark"] * 2
@@ -197,6 +209,21 @@ def other_screen(rig: Rig, shelf: Shelf) -> Said:
     return Said(str(answer.status_code), answer.json()["code"], {}, answer.json()["remedy"])
 
 
+def without_consent(value: str | None) -> Callable[[Rig, Shelf], Said]:
+    """A consent is withdrawn after the first picture of a visit: the next press gets no light."""
+
+    def scenario(rig: Rig, shelf: Shelf) -> Said:
+        visit = agreed_visit(rig)["id"]
+        assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"
+        answered(rig, visit, "consent", value)
+        frames = rig.world.frames
+        said = pressed(rig, visit=visit, slot="R-nerve")
+        assert (said.way, rig.world.frames) == ("409", frames)
+        return said
+
+    return scenario
+
+
 def locked(rig: Rig, shelf: Shelf) -> Said:
     rig.door.set_pin("2468", None)
     answer = rig.request("GET", "/api/calibration")
@@ -210,7 +237,7 @@ def wrong_date(rig: Rig, shelf: Shelf) -> Said:
 
 def other_eye(rig: Rig, shelf: Shelf) -> Said:
     rig.world.faults.add("eye.other")
-    visit = rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
+    visit = agreed_visit(rig)["id"]
     assert pressed(rig, visit=visit, slot="R-centre").code == "good"
     return stands(rig, "eye.side")
 
@@ -225,7 +252,7 @@ def old(rig: Rig, shelf: Shelf) -> Said:
 
 def cut_off(rig: Rig, again: Callable[[], Rig], folder: Path) -> Said:
     """The power goes while the second picture of a visit is in the making: the shelf as it is then is opened anew."""
-    visit = rig.request("POST", "/api/visits", json={"key": "c" * 16}).json()["id"]
+    visit = agreed_visit(rig, "c" * 16)["id"]
     assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"
     rig.hang()
     errand = {"eye": "OS", "visit": visit, "slot": "L-nerve"}
@@ -247,7 +274,7 @@ def unsent(rig: Rig, shelf: Shelf, answers: dict[str, int]) -> dict[str, Any]:
     """One more visit is finished, and the receiver says no: what the Send screen lists of it."""
     number = rig.app.state.notices.sender.outbox.trouble().waiting + len(shelf.receiver.kept)
     key = f"{number + 256:016x}"
-    visit = rig.request("POST", "/api/visits", json={"key": key}).json()["id"]
+    visit = agreed_visit(rig, key)["id"]
     assert pressed(rig, visit=visit, slot="R-centre").way == "verdict"
     rig.request("POST", f"/api/visits/{visit}/finish", json={"key": key[::-1]})
     shelf.receiver.answers = answers
@@ -335,6 +362,8 @@ SCENARIOS: dict[str, Callable[[Rig, Shelf], Said]] = {
     "heat.hot": warm(61.0, "heat.hot"),
     "link.other": other_screen,
     "lock.idle": locked,
+    "consent.missing": without_consent(None),
+    "consent.declined": without_consent("declined"),
     "send.waiting": waits_for_the_link,
     "send.stuck": is_stuck,
     "clock.wrong": wrong_date,

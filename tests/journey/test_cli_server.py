@@ -77,6 +77,9 @@ class Server:
             yield stream
 
 
+ANSWERS = {"age": 54, "consent": "agreed"}
+
+
 def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_told(
     head_file: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
 ) -> None:
@@ -84,6 +87,7 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
         server.ask("PATCH", f"/api/visits/{visit}", {"key": "1" * 16, "field": "age", "value": 54})
+        server.ask("PATCH", f"/api/visits/{visit}", {"key": "3" * 16, "field": "consent", "value": "agreed"})
         where = {"visit": visit, "key": "2" * 16}
         kept = [server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"]]
         kept.append(server.ask("POST", "/api/captures", {"eye": "OS"})["id"])
@@ -107,7 +111,7 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
         listed = server.listed()
         assert listed[-2:] == kept[::-1]
         (unfinished,) = server.ask("GET", "/api/visits?open=true")["visits"]  # where it was, to go on
-        assert (unfinished["id"], unfinished["fields"], unfinished["next_slot"]) == (visit, {"age": 54}, "R-nerve")
+        assert (unfinished["id"], unfinished["fields"], unfinished["next_slot"]) == (visit, ANSWERS, "R-nerve")
         assert unfinished["slots"]["R-centre"]["capture"] == kept[0]
         assert server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"] == kept[0]
         for id in listed:  # also a third, if it was killed after it had been kept

@@ -42,7 +42,8 @@ def visit(rig: Any, tmp_path: Path, stick: Path) -> Any:
     rig.app = create_app(rig.owner, rig.door, sticks=Sticks((tmp_path / "media",), tmp_path / "mounts"))
     begun = rig.request("POST", "/api/visits", json={"key": next(keys)}).json()
     at = f"/api/visits/{begun['id']}"
-    for field, value in {"name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}.items():
+    said = {"consent": "agreed", "name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}
+    for field, value in said.items():
         rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
     for _ in range(2):
         press = {"key": next(keys), "eye": "OD", "visit": begun["id"], "slot": "R-centre"}
@@ -70,7 +71,7 @@ def test_the_zip_holds_pictures_reports_and_sums_that_hold_and_no_name(rig: Any,
     for number, capture in enumerate(visit["slots"]["R-centre"]["captures"], 1):
         assert (folder / f"R-centre-{number}.png").read_bytes() == rig.store.read(capture, "picture.png")
     told = json.loads((folder / "visit.json").read_text())
-    assert told["fields"] == {"age": 54}
+    assert told["fields"] == {"age": 54, "consent": "agreed"}
     assert told["slots"] == visit["slots"]
     for secret in (b"Meena", b"Nowhere", b"12345"):
         assert secret not in answer.content

@@ -35,7 +35,7 @@ SPOKEN = r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"'
 WORDS = dict(re.findall(SPOKEN, (WEB / "english.js").read_text()))
 REFUSALS = {
     "camera.missing", "light.fault", "light.limit", "light.day", "store.full", "batt.empty", "heat.hot", "link.other",
-    "lock.idle",
+    "lock.idle", "consent.missing", "consent.declined",
 }  # fmt: skip
 
 
@@ -214,7 +214,7 @@ def test_who_took_the_other_eye_is_asked_until_somebody_says_which_it_is(rig: Ri
 
 @pytest.mark.parametrize(("slot", "said"), [("R-centre", "OD"), ("L-centre", "OS"), ("R-nerve", None)])
 def test_the_eye_that_was_asked_for_comes_and_nobody_is_asked(rig: Rig, slot: str, said: str | None) -> None:
-    visit = rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
+    visit = asking.agreed_visit(rig)["id"]
     eye = "OD" if slot[0] == "R" else "OS"
     assert asking.pressed(rig, eye, visit=visit, slot=slot).code == "good"
     report = rig.store.captures(1)[0].report

@@ -62,6 +62,12 @@ def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: P
     assert {"what", "intensity_fit", "psnr_range"} <= set(facts["region"])
     assert all(set(point) == POINT for point in facts["points"])
     assert {point["method"] for point in facts["points"]} == set(METHODS)
+    validated = {point["bin"]: point for point in facts["points"] if point["method"] == "tikhonov"}
+    assert {one["bin"] for one in facts["best_mu"]} == set(validated)
+    for one in facts["best_mu"]:  # the best of eight weights, against the one that the frame alone suggests
+        assert 1e-6 <= one["mu"] <= 3.2e-3
+        assert one["pcc"] > validated[one["bin"]]["pcc"] - 0.01
+    assert done.stdout.count("tikhonov with the best mu") == len(validated)
     assert {p["rounds"] for p in facts["points"] if p["method"] == "variation"} == {0, 1, 2, 4, 8, 12, 20}
     edge = sorted((p["seconds_median"], p["psnr_db"]) for p in facts["points"] if p["pareto"])
     assert edge == sorted(edge, key=lambda place: place[1])

@@ -29,11 +29,12 @@ def receiver(tmp_path: Path) -> Iterator[Receiver]:
 
 def finished(server: Server, first: int) -> str:
     """One more visit of one picture, finished."""
-    key = [f"{number:016x}" for number in range(first, first + 4)]
+    key = [f"{number:016x}" for number in range(first, first + 5)]
     visit: str = server.ask("POST", "/api/visits", {"key": key[0]})["id"]
     server.ask("PATCH", f"/api/visits/{visit}", {"key": key[1], "field": "name", "value": "Lakshmi Narayanan"})
-    server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", "visit": visit, "key": key[2]})
-    server.ask("POST", f"/api/visits/{visit}/finish", {"key": key[3]})
+    server.ask("PATCH", f"/api/visits/{visit}", {"key": key[2], "field": "consent", "value": "agreed"})
+    server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", "visit": visit, "key": key[3]})
+    server.ask("POST", f"/api/visits/{visit}/finish", {"key": key[4]})
     return visit
 
 

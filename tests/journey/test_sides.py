@@ -14,6 +14,7 @@ from PIL import Image
 
 from device.errors import LightCut
 from services.records.picture import noted, to_png
+from tests.journey.asking import agreed_visit
 
 keys = (f"{number:016x}" for number in count(1))
 
@@ -31,7 +32,7 @@ def shoot(rig: Any, visit: str, slot: str) -> str:
 
 def test_a_finish_waits_for_the_picture_that_is_still_being_made(make_rig: Any) -> None:
     rig = make_rig()
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     shoot(rig, visit, "R-centre")
     press = {"key": next(keys), "eye": "OS", "visit": visit, "slot": "L-centre"}
 
@@ -54,7 +55,7 @@ def test_a_finish_waits_for_the_picture_that_is_still_being_made(make_rig: Any) 
 
 def test_a_light_that_was_cut_has_its_own_word_and_does_not_hold_up_a_finish(make_rig: Any, wait_until: Any) -> None:
     rig = make_rig(max_on_s=0.15)
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     press = {"key": next(keys), "eye": "OD", "visit": visit, "slot": "R-centre"}
 
     async def story(client: httpx.AsyncClient) -> tuple[httpx.Response, httpx.Response]:
@@ -90,7 +91,7 @@ def test_a_finished_visit_is_named_by_its_number_and_never_by_its_id(rig: Any) -
 
 @pytest.mark.parametrize("reason", ["lids", "other"])
 def test_a_picture_that_could_not_be_taken_can_be_taken_after_all(rig: Any, reason: str) -> None:
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     crossed = post(rig, f"/api/visits/{visit}/could-not", slot="R-nerve", reason=reason)
     assert crossed["slots"]["R-nerve"]["state"] == "could_not"
     back = post(rig, f"/api/visits/{visit}/slots", slot="R-nerve", capture=None)
@@ -102,7 +103,7 @@ def test_a_picture_that_could_not_be_taken_can_be_taken_after_all(rig: Any, reas
 
 
 def test_a_picture_of_the_other_eye_goes_to_that_eye_and_says_so(rig: Any) -> None:
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     first, wrong = shoot(rig, visit, "R-centre"), shoot(rig, visit, "R-centre")
     before = rig.request("GET", f"/api/captures/{wrong}").json()
     headers, order = {"X-Controller": "b" * 16}, {"key": next(keys), "eye": "OS"}
@@ -129,7 +130,7 @@ def test_a_picture_of_the_other_eye_goes_to_that_eye_and_says_so(rig: Any) -> No
 
 
 def test_a_picture_that_was_chosen_takes_its_choice_along(rig: Any) -> None:
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     wrong = shoot(rig, visit, "R-centre")
     post(rig, f"/api/captures/{wrong}/keep")
     moved = post(rig, f"/api/captures/{wrong}/eye", eye="OS")
@@ -142,7 +143,7 @@ def test_a_picture_that_was_chosen_takes_its_choice_along(rig: Any) -> None:
 
 
 def test_what_is_taken_away_follows_the_move(rig: Any) -> None:
-    visit = post(rig, "/api/visits")["id"]
+    visit = agreed_visit(rig)["id"]
     wrong = shoot(rig, visit, "R-nerve")
     post(rig, f"/api/captures/{wrong}/eye", eye="OS")
     answer = rig.request("GET", f"/api/visits/{visit}/export.zip")

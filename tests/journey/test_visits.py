@@ -46,6 +46,11 @@ def patch(rig: Any, visit: Any, field: str, value: Any) -> httpx.Response:
     return answer
 
 
+def agreed(rig: Any) -> Any:
+    """A new visit whose person agreed to pictures."""
+    return patch(rig, begin(rig), "consent", "agreed").json()
+
+
 def shoot(rig: Any, visit: Any, slot: str) -> Any:
     return post(rig, "/api/captures", eye=EYES[slot], visit=visit["id"], slot=slot)
 
@@ -74,7 +79,7 @@ def test_a_whole_visit_from_a_number_to_the_reader(old_rig: Any) -> None:
 
 
 def test_a_retake_keeps_the_old_picture_and_the_operator_chooses(old_rig: Any) -> None:
-    visit = begin(old_rig)
+    visit = agreed(old_rig)
     first, second = shoot(old_rig, visit, "R-centre"), shoot(old_rig, visit, "R-centre")
     slot = old_rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
     assert slot["captures"] == [first["id"], second["id"]]
@@ -98,7 +103,7 @@ def live(rig: Any, after: int) -> Any:
 
 def test_a_wall_instead_of_an_eye_is_told_at_once_and_after_the_retakes_it_is_not_clear(make_rig: Any) -> None:
     rig = make_rig()
-    visit = begin(rig)
+    visit = agreed(rig)
     aim = json.loads(rig.request("GET", "/api/preview").headers["x-aim"])
     assert aim == {"code": "ready", "fill": pytest.approx(0.98, abs=0.03)}
     rig.clock.elapsed_s += 60  # so that nobody takes the wall for the lid of the eye that was there
@@ -179,6 +184,7 @@ def test_a_repeated_request_changes_nothing_even_after_a_restart(make_rig: Any) 
     rig = make_rig()
     key, pressed = next(keys), next(keys)
     visit = rig.request("POST", "/api/visits", json={"key": key}).json()
+    patch(rig, visit, "consent", "agreed")
     press = {"key": pressed, "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
     made = rig.request("POST", "/api/captures", json=press).json()
     rig.exam.close()
@@ -251,7 +257,7 @@ def test_a_number_that_is_none_is_422(old_rig: Any, number: str) -> None:
 
 
 def test_what_does_not_belong_together_is_refused(old_rig: Any) -> None:
-    visit, other = begin(old_rig), begin(old_rig)
+    visit, other = agreed(old_rig), begin(old_rig)
     made = shoot(old_rig, visit, "R-centre")
     alone = post(old_rig, "/api/captures", eye="OD")
     assert alone["visit"] is alone["slot"] is None
@@ -370,7 +376,7 @@ def test_many_tabs_at_once_get_different_numbers(old_rig: Any) -> None:
 def test_the_room_left_is_told_in_people(make_rig: Any) -> None:
     rig = make_rig(store={"free_bytes": lambda _: 40_000_000 * 12})
     assert rig.request("GET", "/api/status").json()["people_left"] == 12  # four pictures each, of ten million bytes
-    visit = begin(rig)
+    visit = agreed(rig)
     used = sum(len(rig.store.read(made["id"], name)) for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
                for name in made["files"])  # fmt: skip
     half = rig.request("GET", "/api/status").json()["people_left"]

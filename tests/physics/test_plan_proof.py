@@ -152,6 +152,7 @@ NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.
     "shutter": {"eye": {"drift_deg_per_s": 1.0}, "sensor": {"line_s": 2e-5}},
     "stray": {"light": {"stray": 4e-4}},
     "ambient": {"light": {"ambient": 4e-4}},
+    "leds": {"light": {"ring_offset_um": 1350.0, "dead_led": 3}},
     "reflex": {"eye": {"shown_by": "human eye"}, "light": {"polariser_leak": 1e-4, "ring_um": 4000.0}},
     "pupil": {"eye": {"pupil_um": 4000.0, "decentred_um": 801.0}},
     "prnu": {"sensor": {"prnu": 4e-4}},

@@ -89,6 +89,8 @@ def test_a_visit_is_sent_by_a_process_that_has_no_network(machine: Machine) -> N
     machine.until(lambda: machine.show(UNIT, "ActiveState") == ["active"], 240)
     key = [f"{number:016x}" for number in range(4)]
     visit = str(ask(machine, "POST", "/api/visits", {"key": key[0]})["id"])
+    consent = {"key": key[3], "field": "consent", "value": "agreed"}
+    ask(machine, "PATCH", f"/api/visits/{visit}", consent)
     ask(machine, "POST", "/api/captures", {"eye": "OD", "slot": "R-centre", "visit": visit, "key": key[1]})
     ask(machine, "POST", f"/api/visits/{visit}/finish", {"key": key[2]})
     machine.until(lambda: visit in machine.run("cat", "/run/receiver/kept"), 90)

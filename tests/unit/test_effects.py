@@ -6,7 +6,7 @@ from math import asin, degrees, pi
 import numpy as np
 import pytest
 
-from device.errors import SettingError
+from device.errors import SettingError, SpecError
 from device.optics.diffuser import Refraction
 from device.recon.geometry import Grid
 from device.recon.prepare import Preparer
@@ -14,13 +14,14 @@ from device.sim.calibrate import simulated_calibration
 from device.sim.effects import EFFECTS
 from device.sim.effects.curvature import curvature_dpt
 from device.sim.effects.hot import hot_pixels
+from device.sim.effects.leds import EMITTER_MM, leds_mm, lit_share
 from device.sim.effects.reflex import reflex_deg, spots
 from device.sim.fundus import Fundus
 from device.sim.plan import Decision, decide, prepared, table
 from device.sim.render import electrons_per_s, psf
 from device.sim.setup import Scene, Setup, Size
 from device.sim.world import World
-from device.spec import InstrumentSpec, load_head
+from device.spec import ChainSpec, InstrumentSpec, load_head
 from tests.simulated import SCENES, coarse, expected, exposed, having, world
 
 PLAIN = having(coarse(load_head(SCENES / "healthy.toml"), 4), peak_e=15000.0)
@@ -31,6 +32,8 @@ CORNEA = {"eye": {"shown_by": "human eye"}, "light": {"ring_um": 4500.0}}
 KEYS = [  # effect, table, key, growing values, what else the scene needs for it
     ("falloff", "light", "falloff", (False, True), {}),
     ("reflex", "light", "polariser_leak", (0.0, 1e-4, 1e-3), CORNEA),
+    ("leds", "light", "ring_offset_um", (0.0, 1500.0, 3000.0), {}),
+    ("leds", "light", "ring_offset_um", (0.0, -1500.0, -3000.0), {"light": {"dead_led": 3}}),
     ("stray", "light", "stray", (0.0, 1e-3, 0.1), {}),
     ("ambient", "light", "ambient", (0.0, 1e-3, 0.1), {}),
     ("refraction", "eye", "m_dpt", (0.0, 0.1, 1.0, 5.0), {}),
@@ -320,11 +323,86 @@ def test_a_calibration_through_a_dot_is_blurred_by_it() -> None:
     assert wider == pytest.approx((dot_px**2 / 16, dot_px**2 / 16), rel=0.25)  # the variance of a disc along one axis
 
 
-def test_bandwidth_is_three_lines_and_leds_are_a_gain() -> None:
+def test_bandwidth_is_three_lines() -> None:
     assert alone(PLAIN, "bandwidth").setup("green").lines == 3
-    spec = having(PLAIN, light={"led_spread": 0.5})
+
+
+@pytest.mark.parametrize("light", [
+    {"led_spread": 0.5}, {"led_spread": 0.5, "dead_led": 3}, {"ring_offset_um": 1000.0, "dead_led": 3},
+])  # fmt: skip
+def test_leds_are_a_common_gain_while_the_pupil_cuts_no_ray(light: dict[str, float]) -> None:
+    spec = having(PLAIN, light=light)
     assert effect_named("leds").size(scene(spec)).eta == 0
-    assert np.array_equal(expected(alone(spec, "leds")), expected(alone(spec)))
+    assert np.array_equal(expected(alone(spec, "leds")), expected(alone(spec, "shot")))
+
+
+def test_a_screen_is_not_lit_by_the_leds() -> None:
+    spec = having(PLAIN, eye={"shown_by": "screen"}, light={"ring_offset_um": 5000.0})
+    assert effect_named("leds").size(scene(spec)).eta == 0
+    assert np.array_equal(expected(alone(spec, "leds")), expected(alone(spec, "shot")))
+
+
+F1_MM, F2_MM = 37.5, 50.0  # the paper's relay
+
+
+def ray_at_the_pupil(led_mm: float, slope: float, offset_mm: float) -> tuple[float, float]:
+    """Height and slope at the eye's pupil of a ray that leaves an LED: free flights and thin lenses in turn."""
+    height = led_mm + slope * (F2_MM + offset_mm)
+    slope -= height / F2_MM
+    height += slope * (F1_MM + F2_MM)
+    slope -= height / F1_MM
+    return height + slope * F1_MM, slope
+
+
+@pytest.mark.parametrize("offset_mm", [-12.0, 2.0, 5.0])
+@pytest.mark.parametrize("decentred_mm", [0.0, 0.3])
+def test_the_light_on_the_retina_is_that_of_the_rays_that_enter_the_pupil(offset_mm, decentred_mm) -> None:
+    spec = having(PLAIN, light={"ring_offset_um": 1000 * offset_mm, "dead_led": 5},
+                  eye={"decentred_um": 1000 * decentred_mm})  # fmt: skip
+    here, soft_mm = scene(spec), 0.75 * EMITTER_MM / 2
+    leds = [(4.75 * np.cos(pi * k / 6), 4.75 * np.sin(pi * k / 6)) for k in range(12) if k != 5]
+    compared = 0
+    for at_deg in ((0.0, 0.0), (7.0, 3.0), (-9.0, 9.0), (2.0, -16.0), (-16.0, 0.0)):
+        slopes = [-0.75 * np.radians(x) for x in at_deg]  # of the LED's ray, by the angular magnification
+        entered, certain = 0, True
+        for led in leds:
+            right, down = (ray_at_the_pupil(x, psi, offset_mm) for x, psi in zip(led, slopes, strict=True))
+            assert (right[1], down[1]) == pytest.approx(np.radians(at_deg), abs=1e-12)
+            away_mm = np.hypot(right[0] + decentred_mm, down[0])  # the image is turned: the pupil's shift counts back
+            entered += away_mm < 3.85
+            certain &= abs(away_mm - 3.85) > soft_mm
+        if certain:
+            compared += 1
+            lit = lit_share(here, *(np.array(x) for x in at_deg))
+            assert lit == pytest.approx(entered / len(leds), abs=1e-9)
+    assert compared
+
+
+def test_a_dead_led_darkens_the_side_that_it_lights() -> None:
+    spec = having(PLAIN, light={"ring_offset_um": 5000.0})
+    edge = np.array([16.0, -16.0]), np.zeros(2)
+    whole, broken = (lit_share(scene(having(spec, light={"dead_led": dead})), *edge) for dead in (None, 0))  # 0: right
+    assert whole[0] == pytest.approx(whole[1], rel=1e-9)
+    assert broken[0] < 0.95 * broken[1]
+
+
+def test_a_ring_whose_light_never_enters_the_pupil_is_refused() -> None:
+    spec = having(PLAIN, eye={"pupil_um": 4000.0}, light={"ring_offset_um": 500.0})
+    with pytest.raises(SpecError, match="no LED's light enters the pupil"):
+        effect_named("leds").size(scene(spec))
+
+
+def test_a_dead_led_that_the_ring_does_not_have_is_refused() -> None:
+    with pytest.raises(SpecError, match="the ring has the LEDs 0 to 11"):
+        effect_named("leds").size(scene(having(PLAIN, light={"ring_offset_um": 3000.0, "dead_led": 12})))
+
+
+def test_the_leds_stand_where_the_heads_matrix_has_its_ring() -> None:
+    light = PLAIN.light.model_copy(update={"chain": ChainSpec()})
+    spec = PLAIN.model_copy(update={"light": light})
+    at = leds_mm(scene(spec))
+    assert len(at) == 8
+    assert np.hypot(*np.transpose(at)) == pytest.approx(np.full(8, 10.04 / 2), abs=0.1)
 
 
 class Dust:

@@ -51,7 +51,7 @@ class Shelf:
 
     def begin(self) -> str:
         self.clock.sleep(60)
-        return self.people.begin(next(keys)).id
+        return self.people.answer(next(keys), self.people.begin(next(keys)).id, "consent", "agreed").id
 
     def finish(self, visit: str) -> str:
         self.clock.sleep(1)

@@ -12,7 +12,7 @@ from device.errors import SettingError, SpecError, StoreError
 from device.sim.world import World
 from services.cli import app
 from services.instrument.paper.bench import Bench, changed
-from services.instrument.paper.outcome import Experiment, Outcome, Shown, above, below, within
+from services.instrument.paper.outcome import Experiment, Outcome, Shown, above, attempted, below, within
 from services.instrument.paper.pictures import plane, trend
 from services.instrument.paper.report import EXPERIMENTS, ORDER, Ran, all_hold, html, rerun, table
 
@@ -40,6 +40,21 @@ def test_a_claim_can_fail_and_a_missing_number_fails_it(claim, holds) -> None:
     assert all_hold(ran(claim)) is holds
     assert ("does not hold" in html(ran(claim), 1)) is not holds
     assert ("NO" in table(ran(claim))) is not holds
+
+
+def test_what_is_not_reproduced_is_seen_and_is_not_counted_as_held() -> None:
+    missed = attempted("SSIM", 0.977, 0.49, 0.69, "SSIM .59")
+    both = ran(above("a", 0.9, 0.88), missed)
+    page = html(both, 1)
+    assert missed.status == "not reproduced"
+    assert not missed.holds
+    assert "1 of 1 assertions hold; numbers of the paper that are not reproduced: 1. These are marked." in page
+    assert '<a href="#X1">X1</a> A &lt;made up&gt; title <b class=open>not reproduced</b>' in page
+    assert "<td>not reproduced</td><td>SSIM .59</td>" in page
+    assert "NR" in table(both)
+    assert all_hold(both), "it is known, so the command does not fail"
+    assert attempted("SSIM", 0.6, 0.49, 0.69, "SSIM .59").status == "holds"
+    assert attempted("SSIM", float("nan"), 0.49, 0.69, "SSIM .59").status == "not reproduced"
 
 
 def test_the_page_is_self_contained_and_escapes_what_it_is_told() -> None:

@@ -93,6 +93,11 @@ def people(store: Store) -> People:
     return People(store.engine, load_protocol(), VirtualClock())
 
 
+def agreed(people: People) -> str:
+    """A new visit whose person agreed to pictures."""
+    return people.answer(next(keys), people.begin(next(keys)).id, "consent", "agreed").id
+
+
 def shoot(store: Store, people: People, visit: str, slot: str, id: str, word: str = "good") -> None:
     errand = people.errand("OD", None, visit, slot)
     verdict = {"verdict": {"word": word, "code": None, "numbers": {}}}
@@ -102,7 +107,7 @@ def shoot(store: Store, people: People, visit: str, slot: str, id: str, word: st
 
 def test_the_release_before_works_on_these_tables(store: Store, people: People) -> None:
     """An update may be rolled back after people were seen: the old words still work, and nothing of theirs is lost."""
-    visit = people.begin(next(keys))
+    visit = people.get(agreed(people))
     shoot(store, people, visit.id, "R-centre", "a")
     with sqlite3.connect(store.folder / "shelf.sqlite", isolation_level=None) as old:
         old.execute("PRAGMA foreign_keys = ON")
@@ -119,7 +124,7 @@ def test_the_release_before_works_on_these_tables(store: Store, people: People) 
 
 
 def test_the_best_picture_stands_for_a_slot_until_somebody_chooses(store: Store, people: People) -> None:
-    visit = people.begin(next(keys)).id
+    visit = agreed(people)
 
     def chosen() -> str | None:
         one = people.get(visit).slots["R-centre"].chosen
@@ -145,7 +150,7 @@ def test_the_best_picture_stands_for_a_slot_until_somebody_chooses(store: Store,
 
 
 def test_a_picture_that_was_pressed_before_the_finish_is_not_lost(store: Store, people: People) -> None:
-    visit = people.begin(next(keys)).id
+    visit = agreed(people)
     errand = people.errand("OD", None, visit, "R-centre")
     people.finish(next(keys), visit)
     report = errand.facts | {"verdict": None}
@@ -159,7 +164,7 @@ def test_a_picture_that_was_pressed_before_the_finish_is_not_lost(store: Store, 
 
 
 def test_a_picture_whose_visit_is_unknown_is_not_half_kept(store: Store, people: People) -> None:
-    errand = people.errand("OD", None, people.begin(next(keys)).id, "R-centre")
+    errand = people.errand("OD", None, agreed(people), "R-centre")
     capture = Capture("b", "OD", people.clock.wall(), True, "00ff", {"visit": "nobody", "slot": "R-centre"}, {})
     with pytest.raises(NotKept):
         store.keep(capture, FILES, errand.beside)

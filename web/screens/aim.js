@@ -1,6 +1,7 @@
 // Aim: four tiles that drive the exam, and one big button that says in itself why it cannot be pressed.
 
 import { icon } from "../icons.js";
+import { allowsLight } from "../memory.js";
 import { chips, reasons, slotWords, tiles } from "../parts.js";
 import { shownStates, timeLeft } from "../states.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -47,5 +48,5 @@ function face(state) {
     return [stop.code === "link.lost" ? "nolink" : "warn", t(has(key) ? key : "stop.other") + (left ? ` – ${left}` : "")];
   }
   if (state.doing === "busy") return ["wait", t("take.making")]; // two are in the making: a third would be refused
-  return state.visit?.fields.consent === "agreed" ? ["camera", t("take")] : ["wait", t("take.consent")];
+  return allowsLight(state) ? ["camera", t("take")] : ["wait", t("take.making")];
 }

@@ -108,7 +108,7 @@ function away({ visit, folders, copied, zipped }, act) {
       <a class="button" href=${zipOf(visit.id)} download @click=${act.zipped}>${t("film.zip")}</a>
       <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
-        (stick) => html`<button type="button" data-folder=${stick.folder} @click=${() => act.copyTo(stick)}>
+        (stick) => html`<button type="button" data-folder=${stick.id} @click=${() => act.copyTo(stick)}>
           ${stick.name}
         </button>`,
       )}

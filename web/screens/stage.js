@@ -1,7 +1,7 @@
 // The stage: the live picture and the taken one in the same place, so that nothing jumps; and the one line under it.
 
 import { icon } from "../icons.js";
-import { eyeOf, shotOf } from "../memory.js";
+import { allowsLight, consentOf, eyeOf, shotOf } from "../memory.js";
 import { slotWords, standing, stateBar } from "../parts.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../words.js";
@@ -19,8 +19,10 @@ export function stage(state, act) {
           .head=${state.status}
           .link=${state.link}
           .eye=${eyeOf(state, state.route.slot)}
+          .visit=${allowsLight(state) ? state.route.visit : null}
           .hint=${standing(state) ? null : state.prompt}
-          .active=${state.route.screen === "aim"}
+          .active=${state.route.screen === "aim" && allowsLight(state)}
+          @refused=${act.heardRefused}
           @aim=${act.heardAim}
           @late=${act.heardLate}
         ></eye-live>
@@ -81,6 +83,7 @@ function promptOf(state) {
   const { route, note, doing, prompt: hint } = state;
   if (note) return ["wait", "wait", note];
   if (route.screen === "picture") return markOf(state);
+  if (state.visit && consentOf(state.visit) === "saving") return ["wait", "wait", t("save.waiting")];
   if (doing === "starting") return ["wait", "wait", t("aim.starting")];
   if (doing !== "aim" && doing !== "making") return ["wait", "wait", t("aim.busy")];
   if (!hint || !has(`aim.${hint.code}`)) return ["plain", "ring", t("aim.prompt")];

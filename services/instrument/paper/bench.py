@@ -29,12 +29,12 @@ from device.recon.upsample import to_sensor
 from device.sim.staged import Staged, staged
 from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Image, Mask, Report
+from services.instrument.frontier_oracle import MUS
 
 SCENES = Path(sim.__file__).parent / "scenes"
 SAMPLE_UM = 10.08  # of the scores: two of the paper's pixels
 RIM_PX = 2.0  # the field's soft rim belongs to neither side
 EVEN_DEG, DETAIL_DEG = 4.0, 2.0
-MUS = tuple(float(mu) for mu in 10.0 ** np.arange(-6, -2.4, 0.5))  # the paper's "predefined small range"
 
 Say = Callable[[str], None]
 

@@ -1,7 +1,7 @@
 """Arrays as pictures for the report: grey planes and cutlines, self-contained."""
 
-from base64 import b64encode
-from collections.abc import Mapping
+from base64 import b64decode, b64encode
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 
 import numpy as np
@@ -16,6 +16,7 @@ from services.instrument.plot import Mark, Plot, Series, svg, value_axis
 DARKEST, BRIGHTEST = 0.5, 99.7  # percentiles of the field that become black and white
 LEAST_SIDE_PX = 420
 MARGIN_PX = 6
+TILE_PX = 480
 
 
 def plane(caption: str, image: Image, inside: Mask | None = None, box: Mask | None = None) -> Shown:
@@ -82,6 +83,17 @@ def _lines(title: str, under: str, across: str, up: str, x: np.ndarray, lines: M
     plot = Plot(title, under, title, value_axis(x.tolist(), across, 0.0), value_axis(every.tolist(), up), series,
                 height=340)  # fmt: skip
     return _svg(title, plot)
+
+
+def side_by_side(caption: str, file: str, pictures: Sequence[tuple[Image, Mask]]) -> Shown:
+    """Pictures with their fields, cut to these and brought to one height, in one row that is also written to a file."""
+    tiles = []
+    for image, inside in pictures:
+        content = b64decode(plane("", np.where(inside, image, 0), inside).address.split(",", 1)[1])
+        tile = Pictures.open(BytesIO(content))
+        tiles.append(tile.resize((round(tile.width * TILE_PX / tile.height), TILE_PX), Pictures.Resampling.LANCZOS))
+    row = np.hstack([np.pad(np.asarray(tile), ((0, 0), (0, MARGIN_PX))) for tile in tiles])
+    return Shown(caption, _png(row), wide=True, file=file)
 
 
 def _svg(caption: str, plot: Plot) -> Shown:

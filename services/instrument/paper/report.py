@@ -1,20 +1,35 @@
 """All experiments, one after the other, and the page that shows them: `diffuscope paper`."""
 
+from base64 import b64decode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 
 from device.clock import Clock
 from device.errors import SettingError
 from services.instrument.once import written
-from services.instrument.paper import caustics, first_order, hard, hard_grid, printed, screen, sensors, trainer
+from services.instrument.paper import (
+    caustics,
+    first_order,
+    hard,
+    hard_grid,
+    light,
+    printed,
+    rules,
+    screen,
+    sensors,
+    trainer,
+)  # fmt: skip
 from services.instrument.paper.bench import Bench
-from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown
+from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown, Status
 from services.instrument.paper.style import CLAIMED, STYLE
 
-ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13")
-_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid)
+ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L")
+MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
+CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
+_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }
@@ -49,16 +64,33 @@ def rerun(
         begin_s = clock.now_s()
         outcome = experiment.run(bench)
         ran.append(Ran(experiment, outcome, clock.now_s() - begin_s))
-        broken = [claim for claim in outcome.claims if not claim.holds]
-        say(f"{experiment.key}: {len(outcome.claims) - len(broken)} of {len(outcome.claims)} assertions hold")
+        _write_pictures(folder, outcome)
+        say(f"{experiment.key}: {summary(outcome.claims)}")
     page = folder / "report.html"
     written(page, lambda: page.write_text(html(ran, merged), encoding="utf-8"))
     return ran
 
 
+def _write_pictures(folder: Path, outcome: Outcome) -> None:
+    for shown in outcome.shown:
+        if shown.file:
+            path, content = folder / shown.file, b64decode(shown.address.split(",", 1)[1])
+            written(path, partial(path.write_bytes, content))
+
+
 def all_hold(ran: Sequence[Ran]) -> bool:
-    """Whether every assertion of every experiment holds."""
-    return all(claim.holds for one in ran for claim in one.outcome.claims)
+    """Whether every assertion of every experiment holds; a number of the paper that is not reproduced is none."""
+    return all(claim.status != "does not hold" for one in ran for claim in one.outcome.claims)
+
+
+def summary(claims: Sequence[Claim]) -> str:
+    """How many assertions hold, of how many; and how many numbers of the paper are not reproduced."""
+    states = [claim.status for claim in claims]
+    if not states:
+        return "shown, nothing is asserted"
+    missed = states.count("not reproduced")
+    words = f"{states.count('holds')} of {len(states) - missed} assertions hold"
+    return words + (f"; numbers of the paper that are not reproduced: {missed}" if missed else "")
 
 
 def table(ran: Sequence[Ran]) -> str:
@@ -66,7 +98,7 @@ def table(ran: Sequence[Ran]) -> str:
     lines = [f"{'':5}{'':4}{'assertion':<62}{'value':>10}  {'limit':<18}paper"]
     for one in ran:
         for claim in one.outcome.claims:
-            mark = "" if claim.holds else "NO"
+            mark = MARKS[claim.status]
             lines.append(f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
                          f"{claim.paper}".rstrip())  # fmt: skip
     return "\n".join(lines)
@@ -74,13 +106,12 @@ def table(ran: Sequence[Ran]) -> str:
 
 def html(ran: Sequence[Ran], merged: int) -> str:
     """The whole page, self-contained."""
-    every = [claim for one in ran for claim in one.outcome.claims]
-    hold, total_s = sum(claim.holds for claim in every), sum(one.seconds for one in ran)
+    every, total_s = [claim for one in ran for claim in one.outcome.claims], sum(one.seconds for one in ran)
     size = "Full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
-    verdict = f"{hold} of {len(every)} assertions hold" + ("." if hold == len(every) else ": the others are marked.")
+    verdict = summary(every) + ("." if all(claim.holds for claim in every) else ". These are marked.")
     toc = "".join(
         f'<li><a href="#{one.experiment.key}">{one.experiment.key}</a> {escape(one.experiment.title)}'
-        f"{'' if all(c.holds for c in one.outcome.claims) else ' <b class=no>does not hold</b>'}</li>"
+        f"{_flags(one.outcome.claims)}</li>"
         for one in ran
     )
     return "\n".join(
@@ -118,10 +149,16 @@ def _section(one: Ran) -> str:
     )
 
 
+def _flags(claims: Sequence[Claim]) -> str:
+    """What the list of contents says behind an experiment's title."""
+    states = {claim.status for claim in claims}
+    return "".join(f" <b class={CLASSES[state]}>{state}</b>" for state in CLASSES if state in states - {"holds"})
+
+
 def _claims(claims: Sequence[Claim]) -> str:
     rows = "".join(
-        f"<tr class={'yes' if claim.holds else 'no'}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
-        f"<td>{escape(claim.limit)}</td><td>{'holds' if claim.holds else 'does not hold'}</td>"
+        f"<tr class={CLASSES[claim.status]}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
+        f"<td>{escape(claim.limit)}</td><td>{claim.status}</td>"
         f"<td>{escape(claim.paper) or '&ndash;'}</td></tr>"
         for claim in claims
     )
