@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -40,6 +40,9 @@ test-browser: .venv/ready browser ## Try the page in every state, size and langu
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics
+
+test-hard: .venv/ready ## Run the whole grid of hard cases and write it to out/hard; it fails on a violation.
+	@$(BIN)/diffuscope hard -o out/hard --check
 
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
 	@tests/systemd/install

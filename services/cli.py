@@ -3,7 +3,7 @@
 import json
 import os
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -285,7 +285,7 @@ def frontier(
 def paper(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for report.html.")],
     only: Annotated[
-        list[str] | None, typer.Option(help="Just this experiment (N, S0 ... S12, M, L); may be repeated.")
+        list[str] | None, typer.Option(help="Just this experiment (N, S0 ... S13, M, L); may be repeated.")
     ] = None,
     merged: Annotated[int, typer.Option(min=1, max=3, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
 ) -> None:
@@ -296,6 +296,29 @@ def paper(
     typer.echo(report.table(ran))
     typer.echo(f"{output / 'report.html'}: {sum(one.seconds for one in ran):.0f} s")
     if not report.all_hold(ran):
+        raise typer.Exit(1)
+
+
+@app.command()
+def hard(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for hard-cases.json, .md and pictures.")],
+    case: Annotated[list[str] | None, typer.Option(help="Just this row; may be repeated.")] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Just this column: ladder (as shipped) or a method; may be repeated.")
+    ] = None,
+    merged: Annotated[int, typer.Option(min=1, max=4, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
+    check: Annotated[bool, typer.Option("--check", help="The exit status is 1 if there is a violation.")] = False,
+) -> None:
+    """Run the grid of hard cases: every kind of bad frame through every method and the ladder as shipped."""
+    from services.instrument.hard_cases import grid  # the simulator, which a picture does not need
+    from services.instrument.hard_cases.cells import COLUMNS
+
+    eyes = tuple(replace(eye, merged=merged) for eye in grid.EYES)
+    found = grid.run(eyes, case or (), tuple(method or COLUMNS), lambda line: typer.echo(line, err=True))
+    grid.write(output, found)
+    typer.echo(grid.summary(found))
+    typer.echo(f"{output}: hard-cases.json, hard-cases.md and a picture of each eye")
+    if check and found.violations:
         raise typer.Exit(1)
 
 

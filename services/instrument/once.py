@@ -60,8 +60,8 @@ def reconstruct_file(order: Order) -> Reconstruction:
     if order.sweep is not None:
         _draw_sweep(order.sweep, order, scores)
     shape = (raw.pixels.shape[0], raw.pixels.shape[1])
-    recipes, consistency = _recipes(order, calibration, shape, index), PsfConsistency(calibration, shape, index)
-    reconstructor = Reconstructor(calibration, shape, planner, clock, recipes, index, consistency=consistency)
+    wanted, consistency = recipes(order, calibration, shape, index), PsfConsistency(calibration, shape, index)
+    reconstructor = Reconstructor(calibration, shape, planner, clock, wanted, index, consistency=consistency)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
     made = reconstructor(raw.pixels, simulated=calibration.simulated, deadline=deadline)
     picture = made.picture
@@ -105,7 +105,7 @@ def written(path: Path, write: Callable[[], object]) -> None:
         raise full(f"{path} cannot be written: {error.strerror or error}", "Choose another folder.") from error
 
 
-def _recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
+def recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
     """The wanted method at the resolution that the optics gives; before it, where time is short, a quick look."""
     quick, full = ladder(calibration, shape, index)
     name = order.method or full.method

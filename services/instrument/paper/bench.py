@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from device import sim
+from device.clock import SystemClock
 from device.recon.closed import TIKHONOV, ClosedForm
 from device.recon.defects import DefectFinder
 from device.recon.evenness import even_out
@@ -22,11 +23,12 @@ from device.recon.metrics import Judge, Scores
 from device.recon.model import field_radius_px, periodic_model
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
+from device.recon.reconstructor import Reconstructor
 from device.recon.refraction import Refractor
 from device.recon.upsample import to_sensor
 from device.sim.staged import Staged, staged
 from device.spec import InstrumentSpec, load_head
-from device.values import Calibration, Image, Mask
+from device.values import Calibration, Image, Mask, Report
 from services.instrument.frontier_oracle import MUS
 
 SCENES = Path(sim.__file__).parent / "scenes"
@@ -44,6 +46,7 @@ class Bench:
         self.merged, self.say = merged, say
         self.planner = Planner(folder=None, effort="FFTW_ESTIMATE")
         self._refractor: tuple[str, Refractor] | None = None
+        self._ladder: tuple[Calibration, Reconstructor] | None = None
 
     def scene(self, name: str, changes: Mapping[str, Any] | None = None) -> InstrumentSpec:
         """A shipped scene with changes like {"sim.eye.m_dpt": 4.0}, its pixels merged; ValueError if one is wrong."""
@@ -67,6 +70,17 @@ class Bench:
                 solver.step()
         solver.finish(out)
         return take.sampled(to_sensor(out, model.grid))
+
+    def shipped(self, take: "Take") -> tuple[Image, Report]:
+        """The picture of the default ladder, as the instrument and `diffuscope reconstruct` climb it, on the samples.
+
+        Quick look, refraction of the eye, then `variation` with the PSF of that eye; no deadline. FrameError for a
+        frame that the instrument refuses.
+        """
+        if self._ladder is None or self._ladder[0] is not take.calibration:
+            self._ladder = take.calibration, Reconstructor(take.calibration, take.shape, self.planner, SystemClock())
+        made = self._ladder[1](take.staged.counts, simulated=True)
+        return take.sampled(made.picture), made.report
 
     def refraction(self, take: "Take") -> float:
         """The mean sphere that the frame tells, as wavefront in dpt; not a number where it tells none."""

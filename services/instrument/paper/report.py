@@ -10,15 +10,26 @@ from pathlib import Path
 from device.clock import Clock
 from device.errors import SettingError
 from services.instrument.once import written
-from services.instrument.paper import caustics, first_order, hard, light, printed, rules, screen, sensors, trainer
+from services.instrument.paper import (
+    caustics,
+    first_order,
+    hard,
+    hard_grid,
+    light,
+    printed,
+    rules,
+    screen,
+    sensors,
+    trainer,
+)  # fmt: skip
 from services.instrument.paper.bench import Bench
 from services.instrument.paper.outcome import Claim, Experiment, Outcome, Sheet, Shown, Status
 from services.instrument.paper.style import CLAIMED, STYLE
 
-ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "M", "L")
+ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L")
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
 CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
-_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, rules, light)
+_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }

@@ -1,0 +1,216 @@
+"""The rows of the grid: what is wrong with a frame, which messages are true of it, and which losses are explained."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from device.values import Mask
+from services.instrument.hard_cases import defects
+from services.instrument.hard_cases.frames import Eye, HardFrame, above_dark, crescent_dark
+
+Build = Callable[[Eye], HardFrame]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row: its key, how its frame is made, and what may be said of it.
+
+    `true` holds the kinds of messages that are true of the frame (`judgement.KINDS`); `explained` says, by method or
+    for "all", why a picture may be worse without a message; `group` is the heading that it stands under.
+    """
+
+    key: str
+    group: str
+    build: Build
+    true: frozenset[str] = frozenset()
+    explained: Mapping[str, str] = field(default_factory=dict)
+
+
+NO_GAPS = {"tikhonov": "The paper's form has no model of a gap: a masked pixel reads zero, and rings."}
+MISSING = {
+    "tikhonov": NO_GAPS["tikhonov"],
+    "gradient": "A linear filter: a masked sample is filled from the smooth fit only.",
+}
+DIM = {"all": "Shot noise: with so few electrons no method has the detail; the resolution figure says so."}
+BLURRED = {"all": "The blur of the motion is in the object: one frame cannot tell it from a smooth eye."}
+BANDS = {"all": "Bands along the rows look like shading; the ring is no mains light, and a global shutter has none."}
+PEDESTAL = {"tikhonov": "The paper's form has no constant for light from everywhere: it becomes structure."}
+OTHER_EYE = {
+    "tikhonov": "The paper's form uses the stored PSF: the blur circle of the other eye stays.",
+}
+
+
+def saturated(share: float) -> Build:
+    """The scene's light raised until that share of the pixels is full."""
+
+    def build(eye: Eye) -> HardFrame:
+        full = float(np.quantile(eye.expected_e, 1 - share))
+        return eye.frame({"sim.peak_e": eye.peak_e * eye.spec.camera.full_well_e / full})
+
+    return build
+
+
+def undeclared(where: Callable[[tuple[int, int]], Mask]) -> Build:
+    """Dead pixels that read 0, which nothing but their value tells."""
+    return lambda eye: eye.clean.with_raw(defects.read_as(eye.clean.raw, where(_shape(eye)), 0))
+
+
+def declared(where: Callable[[tuple[int, int]], Mask]) -> Build:
+    """Dead pixels that read 0, with a flat frame that says which."""
+
+    def build(eye: Eye) -> HardFrame:
+        mask = where(_shape(eye))
+        return eye.clean.with_raw(defects.read_as(eye.clean.raw, mask, 0), flat=defects.declared(mask))
+
+    return build
+
+
+def warm(share: float, more: float) -> Build:
+    """Warm pixels that no dark frame shows."""
+    return lambda eye: eye.clean.with_raw(defects.warm(eye.clean.raw, eye.spec.camera, share, more))
+
+
+def offset(more_dn: float) -> Build:
+    """A black level that is not the head file's; in counts of 12 bits."""
+
+    def build(eye: Eye) -> HardFrame:
+        camera = eye.spec.camera
+        return eye.clean.with_raw(defects.offset(eye.clean.raw, camera, more_dn * 2.0 ** (camera.bit_depth - 12)))
+
+    return build
+
+
+def gain(factor: float) -> Build:
+    """A camera that collects `factor` times the electrons per count that the head file says, in as many counts."""
+
+    def build(eye: Eye) -> HardFrame:
+        well_e = eye.spec.camera.full_well_e * factor
+        return eye.frame({"camera.full_well_e": well_e, "sim.peak_e": eye.peak_e * factor})
+
+    return build
+
+
+def of_eye(more_dpt: float) -> Build:
+    """The eye is so far from the one of the PSF, which is this head's."""
+
+    def build(eye: Eye) -> HardFrame:
+        sim = eye.spec.sim
+        assert sim is not None
+        return eye.frame({"sim.eye.m_dpt": sim.eye.m_dpt + more_dpt})
+
+    return build
+
+
+def psf_of_eye(more_dpt: float) -> Build:
+    """The PSF was taken with an eye so far from the model eye's rest."""
+    return lambda eye: eye.frame({"sim.calibration.m_dpt": more_dpt})
+
+
+def peak(peak_e: float) -> Build:
+    """The brightest pixel of an unmerged sensor collects so many electrons."""
+    return lambda eye: eye.frame({"sim.peak_e": peak_e * eye.merged**2})
+
+
+def stray(share: float) -> Build:
+    """Even light that comes with the lamp, as a share of the mean signal."""
+    return lambda eye: eye.frame({"sim.light.stray": share})
+
+
+def motion(way_deg: float) -> Build:
+    """The eye drifts so far within one exposure."""
+    return lambda eye: eye.frame({"sim.eye.drift_deg_per_s": way_deg / eye.spec.camera.exposure_s})
+
+
+def foreign_psf(eye: Eye) -> HardFrame:
+    """The PSF of another diffuser of the same kind."""
+    sim = eye.spec.sim
+    assert sim is not None
+    other = replace(eye, changes=dict(eye.changes) | {"sim.seed": sim.seed + 100}).clean
+    return replace(eye.clean, psf=other.psf, sphere_dpt=None)
+
+
+def turned_psf(eye: Eye) -> HardFrame:
+    """The head's PSF, turned by half a turn."""
+    return replace(eye.clean, psf=np.ascontiguousarray(eye.clean.psf[::-1, ::-1]), sphere_dpt=None)
+
+
+def no_light(eye: Eye) -> HardFrame:
+    """Counts of zero."""
+    return eye.clean.with_raw(np.zeros_like(eye.clean.raw), sphere_dpt=None)
+
+
+def constant(eye: Eye) -> HardFrame:
+    """One count everywhere, a third of the converter's span."""
+    raw = np.full_like(eye.clean.raw, eye.spec.camera.white_dn // 3)
+    return eye.clean.with_raw(raw, sphere_dpt=None)
+
+
+def not_numbers(share: float) -> Build:
+    """A float frame that holds no number in a share of its pixels."""
+    return lambda eye: eye.clean.with_raw(defects.missing(eye.clean.raw, share))
+
+
+def _shape(eye: Eye) -> tuple[int, int]:
+    return eye.spec.camera.rows, eye.spec.camera.cols
+
+
+def _case(key: str, group: str, build: Build, true: str = "", explained: Mapping[str, str] | None = None) -> Case:
+    return Case(key, group, build, frozenset(true.split()), explained or {})
+
+
+CLEAN = _case("clean", "clean", lambda eye: eye.clean)
+CASES: tuple[Case, ...] = (
+    CLEAN,
+    *(
+        _case(f"{share:.1%} saturated", "too bright", saturated(share), "bright pixels", MISSING)
+        for share in (0.001, 0.01, 0.04, 0.1)
+    ),
+    _case("glare, 0.3 % clipped", "too bright",
+          lambda eye: eye.clean.with_raw(defects.glare(eye.clean.raw, eye.spec.camera, 0.003)), "bright pixels",
+          MISSING),
+    *(
+        _case(f"{name}, {kind}", "dead pixels", build(where), "pixels", MISSING)
+        for name, where in (("dead columns", defects.dead_columns), ("dead rows", defects.dead_rows),
+                            ("dead blob", defects.blob))
+        for kind, build in (("declared", declared), ("0 DN", undeclared))
+    ),
+    *(
+        _case(f"warm, {share:.2%} + {more_dn} DN", "unknown warm pixels", warm(share, more_dn / 4095), "pixels",
+              MISSING)
+        for share, more_dn in ((0.0001, 1500), (0.001, 1500), (0.01, 300))
+    ),
+    *(
+        _case(f"{peak_e} e- peak", "little light", peak(peak_e), "", DIM)
+        for peak_e in (50, 100, 250, 500)
+    ),
+    *(
+        _case(f"eye off by {more_dpt:+g} dpt", "wrong PSF", of_eye(more_dpt), "", OTHER_EYE)
+        for more_dpt in (0.5, -1, 2, -4)
+    ),
+    _case("PSF off by 2 dpt", "wrong PSF", psf_of_eye(2.0), "", OTHER_EYE),
+    _case("PSF of another head", "wrong PSF", foreign_psf, "psf"),
+    _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf"),
+    _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit"),
+    _case("half a lid", "parts of the field",
+          lambda eye: eye.frame({"sim.light.stray": 0.5}, above_dark(0.0)), "lit eye", PEDESTAL),
+    *(
+        _case(f"stray light {share:.0%}", "light", stray(share), "eye", PEDESTAL)
+        for share in (0.2, 1.0)
+    ),
+    *(
+        _case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED)
+        for deg in (0.5, 1.5)
+    ),
+    _case("flicker 10 %", "light",
+          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1)), "", BANDS),
+    _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
+    _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
+    _case("all zeros", "what is no frame", no_light, "signal eye"),
+    _case("constant", "what is no frame", constant, "eye lit psf"),
+    _case("8 bit", "wrong counts",
+          lambda eye: eye.clean.with_raw(defects.eight_bits(eye.clean.raw, eye.spec.camera)), "counts"),
+    *(_case(f"black level off by {dn} DN", "wrong counts", offset(dn), "counts") for dn in (1, 5, 20)),
+    *(_case(f"gain off by {factor:g}", "wrong counts", gain(factor), "counts") for factor in (2.0, 0.5)),
+)  # fmt: skip
+NAMED = {case.key: case for case in CASES}

@@ -1,0 +1,117 @@
+"""What must hold of every cell: a loss is reported or explained, and nothing that is said is wrong. The rules:
+
+crash       an exception that is no refusal
+hidden      a picture more than LOST below clean, no message, no refusal, no explanation
+refraction  a number more than SIGMAS standard deviations off, or one of a frame that holds none, without a message
+message     words that are not true of the frame
+quality     a quality figure better than the clean frame's where the picture is LOST below it
+coverage    over the grid: fewer than COVERED of the refractions within two standard deviations
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from services.instrument.hard_cases.cases import CLEAN, NAMED, Case
+from services.instrument.hard_cases.cells import LADDER, Cell
+
+LOST = 0.05
+SIGMAS = 3.0
+COVERED, COVERED_SIGMAS = 0.9, 2.0
+SLACK = 0.02  # of a figure: what another draw of the noise changes in it
+BETTER: Mapping[str, int] = {  # 1: larger is better, -1: smaller
+    "structure_nats": 1, "structure_sure": 1, "through": 1, "coverage": 1, "cutoff_per_px": 1, "resolution_um": -1,
+}  # fmt: skip
+KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first that fits
+    ("refraction", ("refraction",)),
+    ("signal", ("no signal",)),
+    ("eye", ("no eye",)),
+    ("psf", ("psf",)),
+    ("bright", ("too bright",)),
+    ("lit", ("is lit", "of the field")),
+    ("counts", ("black level", "gain", "bits", "counts")),
+    ("pixels", ("pixel",)),
+)
+ALWAYS = frozenset({"refraction"})  # that a refraction is uncertain is no claim about the picture
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One thing that must not be: its rule, where, and the figures in words."""
+
+    rule: str
+    eye: str
+    case: str
+    method: str
+    words: str
+
+
+def kind(message: str) -> str:
+    """What a message is about, a key of KINDS; "other" for words that no rule knows yet."""
+    said = message.lower()
+    return next((name for name, words in KINDS if any(word in said for word in words)), "other")
+
+
+def violations(cells: Sequence[Cell], cases: Mapping[str, Case] = NAMED) -> list[Violation]:
+    """Everything in a grid that must not be, in the order of the cells; at the end the coverage of the refractions."""
+    clean = {(cell.eye, cell.method): cell for cell in cells if cell.case == CLEAN.key}
+    found = []
+    for cell in cells:
+        case = cases[cell.case]
+        words = {
+            "crash": cell.refused if cell.crashed else "", "hidden": _hidden(cell, case),
+            "refraction": _refraction(cell), "message": _message(cell, case),
+            "quality": _quality(cell, clean[cell.eye, cell.method]),
+        }  # fmt: skip
+        found += [Violation(rule, cell.eye, cell.case, cell.method, said) for rule, said in words.items() if said]
+    share, count = covered(cells)
+    if count and share < COVERED:
+        found.append(Violation("coverage", "all", "all", LADDER, f"{share:.0%} of {count} refractions within 2 sd"))
+    return found
+
+
+def covered(cells: Sequence[Cell]) -> tuple[float, int]:
+    """The share of the ladder's refractions within two standard deviations, and how many there are."""
+    off = [abs(cell.off_sd) for cell in cells if cell.method == LADDER and cell.off_sd is not None]
+    return sum(one <= COVERED_SIGMAS for one in off) / max(len(off), 1), len(off)
+
+
+def lost(cell: Cell) -> bool:
+    """Whether the picture is clearly worse than the clean one."""
+    return cell.lost is not None and not cell.lost <= LOST
+
+
+def explanation(cell: Cell, case: Case) -> str:
+    """Why a picture may be worse without a message; empty where nothing explains it."""
+    return case.explained.get(cell.method) or case.explained.get("all", "")
+
+
+def _hidden(cell: Cell, case: Case) -> str:
+    if not lost(cell) or cell.refused or cell.warnings or explanation(cell, case):
+        return ""
+    return f"PCC {cell.pcc:.3f}, {cell.lost:.3f} below clean, and nothing is said"
+
+
+def _refraction(cell: Cell) -> str:
+    """Judged on the ladder, which has the same refraction as every other column."""
+    if cell.method != LADDER or cell.sphere_dpt is None or cell.sd_dpt is None:
+        return ""
+    given = f"{cell.sphere_dpt:+.2f} +- {cell.sd_dpt:.2f} dpt"
+    if cell.off_sd is None:
+        return "" if cell.warnings else f"{given} of a frame that holds no refraction"
+    return "" if abs(cell.off_sd) <= SIGMAS else f"{given}, in truth {cell.true_dpt:+.2f}: {cell.off_sd:+.1f} sd"
+
+
+def _message(cell: Cell, case: Case) -> str:
+    false = [words for words in cell.warnings if kind(words) not in case.true | ALWAYS]
+    return " / ".join(f"false: {words}" for words in false)
+
+
+def _quality(cell: Cell, clean: Cell) -> str:
+    if not lost(cell):
+        return ""
+    better = []
+    for name, sign in BETTER.items():
+        here, there = cell.quality.get(name), clean.quality.get(name)
+        if here is not None and there is not None and sign * (here - there) > SLACK * abs(there):
+            better.append(f"{name} {here:.3g} (clean {there:.3g})")
+    return f"{cell.lost:.3f} below clean, and better: {', '.join(better)}" if better else ""

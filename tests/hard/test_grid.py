@@ -1,0 +1,102 @@
+"""A reduced grid of hard cases through the ladder as shipped; and the judge, which must find each kind of violation.
+
+The whole grid is `make test-hard`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.instrument.hard_cases.cases import CASES, CLEAN, NAMED
+from services.instrument.hard_cases.cells import LADDER, Cell, Grid
+from services.instrument.hard_cases.frames import Eye
+from services.instrument.hard_cases.grid import run
+from services.instrument.hard_cases.judgement import KINDS, covered, kind, violations
+from services.instrument.once import reconstruct_file
+
+EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
+REDUCED = (
+    "1.0% saturated", "glare, 0.3 % clipped", "dead columns, declared", "dead columns, 0 DN", "dead blob, declared",
+    "dead blob, 0 DN", "warm, 0.10% + 1500 DN", "100 e- peak", "eye off by +2 dpt", "PSF of another head", "half a lid",
+    "1 % NaN", "all zeros", "constant", "black level off by 20 DN",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory: pytest.TempPathFactory) -> Grid:
+    return Grid(EYE, tmp_path_factory.mktemp("grid"), (LADDER,))
+
+
+@pytest.fixture(scope="module")
+def clean(grid: Grid) -> list[Cell]:
+    return grid.cells(CLEAN)
+
+
+@pytest.mark.parametrize("key", REDUCED)
+def test_a_hard_case_is_held_or_reported(
+    key: str, grid: Grid, clean: list[Cell], record_property: Callable[[str, object], None]
+) -> None:
+    cells = clean + grid.cells(NAMED[key])
+    record_property("lost", cells[-1].lost)
+    assert not [f"{one.rule}: {one.words}" for one in violations(cells) if one.rule != "coverage"]
+
+
+def test_the_clean_frame_is_as_good_as_the_command_makes_it(grid: Grid, clean: list[Cell]) -> None:
+    """The grid keeps planned solvers; the command plans each time: both give the same picture and words."""
+    order, _ = grid.files(EYE.clean, LADDER)
+    made = reconstruct_file(order)
+    assert clean[0].pcc == pytest.approx(_pcc(np.load(order.output)), abs=1e-4)
+    assert made.report.warnings == clean[0].warnings
+    assert clean[0].pcc > 0.95
+
+
+def _pcc(picture: np.ndarray) -> float:
+    take = EYE.clean.take
+    return take.likeness(take.sampled(picture))
+
+
+GOOD = Cell("eye", CLEAN.key, LADDER, 0.95, 0.0, "", (), -1.0, 0.1, -1.0, {"coverage": 0.9, "resolution_um": 150.0})
+OTHER = replace(GOOD, case="motion 0.5 deg")
+
+
+@pytest.mark.parametrize(
+    ("rule", "cell"),
+    [
+        ("crash", replace(OTHER, pcc=None, lost=None, refused="ZeroDivisionError", crashed=True)),
+        ("hidden", replace(OTHER, case="rim cut", pcc=0.8, lost=0.15)),
+        ("hidden", replace(OTHER, case="rim cut", pcc=float("nan"), lost=float("nan"))),
+        ("refraction", replace(OTHER, sphere_dpt=-1.4)),
+        ("refraction", replace(OTHER, true_dpt=None)),
+        ("message", replace(OTHER, warnings=("This is not this head's PSF. Calibrate the head.",))),
+        ("message", replace(OTHER, warnings=("Words that no rule knows.",))),
+        ("quality", replace(OTHER, lost=0.06, quality={"coverage": 0.9, "resolution_um": 120.0})),
+        ("coverage", replace(OTHER, sphere_dpt=-1.25)),
+    ],
+)
+def test_the_judge_finds_each_violation(rule: str, cell: Cell) -> None:
+    assert not violations([GOOD, OTHER])
+    assert rule in [one.rule for one in violations([GOOD, cell])]
+
+
+def test_a_refusal_and_an_explained_loss_are_no_violations() -> None:
+    refused = replace(OTHER, pcc=None, lost=None, refused="Too bright", sphere_dpt=None, sd_dpt=None)
+    explained = replace(OTHER, lost=0.2, quality={})
+    assert not violations([GOOD, refused, explained])
+    assert covered([GOOD, refused, explained]) == (1.0, 2)
+
+
+def test_every_case_says_what_it_is_with_kinds_that_exist() -> None:
+    kinds = {name for name, _ in KINDS}
+    assert len(NAMED) == len(CASES)
+    assert all(case.true <= kinds for case in CASES)
+    assert kind("The refraction of +1.0 dpt (sd 0.9) is uncertain.") == "refraction"
+
+
+@pytest.mark.parametrize(("keys", "columns"), [(("no such case",), (LADDER,)), ((), ("no such method",))])
+def test_what_does_not_exist_is_refused_with_what_does(keys: tuple[str, ...], columns: tuple[str, ...]) -> None:
+    from device.errors import SettingError
+
+    with pytest.raises(SettingError, match="no such"):
+        run((EYE,), keys, columns)
