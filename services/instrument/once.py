@@ -60,8 +60,7 @@ def reconstruct_file(order: Order) -> Reconstruction:
     if order.sweep is not None:
         _draw_sweep(order.sweep, order, scores)
     shape = (raw.pixels.shape[0], raw.pixels.shape[1])
-    wanted, consistency = recipes(order, calibration, shape, index), PsfConsistency(calibration, shape, index)
-    reconstructor = Reconstructor(calibration, shape, planner, clock, wanted, index, consistency=consistency)
+    reconstructor = planned(order, calibration, shape, planner, index)
     deadline = None if order.budget_s is None else Deadline.after(clock, order.budget_s)
     made = reconstructor(raw.pixels, simulated=calibration.simulated, deadline=deadline)
     picture = made.picture
@@ -69,6 +68,15 @@ def reconstruct_file(order: Order) -> Reconstruction:
         picture = even_out(picture, field_mask(calibration, shape), evenness_px(calibration, shape))
     written(order.output, lambda: _write(order.output, picture, made.simulated))
     return made
+
+
+def planned(
+    order: Order, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int
+) -> Reconstructor:
+    """The solver that an order asks for, planned for its calibration and frames of a shape; `index` is the PSF's."""
+    consistency = PsfConsistency(calibration, shape, index)
+    recipes = _recipes(order, calibration, shape, index)
+    return Reconstructor(calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency)
 
 
 def _refuse_places(order: Order) -> None:
@@ -105,7 +113,7 @@ def written(path: Path, write: Callable[[], object]) -> None:
         raise full(f"{path} cannot be written: {error.strerror or error}", "Choose another folder.") from error
 
 
-def recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
+def _recipes(order: Order, calibration: Calibration, shape: tuple[int, int], index: int) -> tuple[Recipe, ...]:
     """The wanted method at the resolution that the optics gives; before it, where time is short, a quick look."""
     quick, full = ladder(calibration, shape, index)
     name = order.method or full.method

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from device.clock import Deadline, SystemClock
+from device.clock import Deadline
 from device.errors import DiffuscopeError
 from device.images import Raw, as_raw, read_image
 from device.recon.methods import METHODS
@@ -20,7 +20,7 @@ from device.recon.reconstructor import Reconstructor
 from device.values import Image, Mask, Reconstruction
 from services.instrument.hard_cases.cases import CLEAN, Case
 from services.instrument.hard_cases.frames import Eye, HardFrame, head_toml
-from services.instrument.once import Order, calibrated, recipes
+from services.instrument.once import Order, calibrated, planned
 
 LADDER = "ladder"  # as the instrument: the quick look, the refraction, then the rounds
 COLUMNS = (LADDER, *METHODS)
@@ -81,10 +81,8 @@ class Solvers:
         return make(raw.pixels, simulated=True, deadline=deadline)
 
     def _planned(self, order: Order, raw: Raw) -> Reconstructor:
-        calibration = calibrated(order, raw)
         shape = raw.pixels.shape[0], raw.pixels.shape[1]
-        wanted = recipes(order, calibration, shape, 0)
-        return Reconstructor(calibration, shape, self._planner, SystemClock(), wanted)
+        return planned(order, calibrated(order, raw), shape, self._planner, 0)
 
 
 class Grid:
