@@ -4,7 +4,7 @@ Calibrated dark frames and bad-pixel masks know the stable ones. This module fin
 what the optics cannot do: the PSF is the sharpest picture that the diffuser can make, so a pixel that differs from its
 surroundings by more than the noise and the sharpest edge of the PSF holds something else than light.
 
-* saturated pixels, and SATURATED_REACH_PX around saturated areas, where the clipped noise is biased;
+* saturated pixels, and those around them whose noise the converter clips;
 * values below the black level that no noise explains;
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
   deviations plus the PSF's own sharpness times the ring's range;
@@ -32,6 +32,7 @@ from device.values import Calibration, Image, Mask, Psf
 
 NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250 frames
 SATURATED_REACH_PX = 3
+CLIPPED_SD = 3.0  # of the noise below the white level, where the converter clips one value in a thousand
 AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
 MOST_OUTLIERS = 0.05  # share of pixels; more is the structure of the frame, and none of them is called a defect
 NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
@@ -140,7 +141,10 @@ class DefectFinder:
         saturated, low = values >= self._white_dn, light < least_dn
         defective = np.zeros(counts.shape, np.bool_)
         if saturated.any() or low.any():
-            defective = around_areas(counts >= self._white_dn)
+            if saturated.any():
+                white_light_dn = self._white_dn - float(offset.mean(dtype=np.float64))
+                noise_dn = (noise.per_dn * white_light_dn + noise.floor_dn2) ** 0.5
+                defective = clipped(counts, self._white_dn, noise_dn)
             defective.ravel()[places[low]] = True
         self._add_outliers(counts, offset, noise, places, defective)
         if np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX:
@@ -267,14 +271,19 @@ def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:
     return np.asarray(kept[labels])
 
 
-def around_areas(saturated: Mask) -> Mask:
-    """Saturated areas and the pixels within SATURATED_REACH_PX of them; single hot pixels are not an area."""
-    if not saturated.any():
-        return saturated
-    neighbours = ndimage.convolve(saturated.astype(np.uint8), np.ones((3, 3), np.uint8), mode="constant")
-    areas = saturated & (neighbours > AREA_NEIGHBOURS)
-    size = 2 * SATURATED_REACH_PX + 1
-    return np.asarray(ndimage.maximum_filter(areas, size) | saturated)
+def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
+    """Saturated pixels, and those where the light is so near `white_dn` that the converter clips its noise.
+
+    `noise_dn` is the standard deviation there. Where the mean of a pixel's surroundings is within CLIPPED_SD of it from
+    the white level, only the lower part of the noise is left, and it draws the outline of the overexposed area. A hot
+    pixel has dark surroundings and stays alone.
+    """
+    mean = ndimage.uniform_filter(np.minimum(counts, np.float32(white_dn)), 2 * SATURATED_REACH_PX + 1)
+    near: Mask = mean > white_dn - CLIPPED_SD * noise_dn
+    saturated: Mask = counts >= white_dn
+    neighbours = ndimage.uniform_filter(saturated.astype(np.float32), 3)
+    areas = saturated & (neighbours > (AREA_NEIGHBOURS + 0.5) / 9)
+    return np.asarray(near | ndimage.maximum_filter(areas, 2 * SATURATED_REACH_PX + 1) | saturated)
 
 
 def ring_ranges(psf: Psf) -> tuple[float, float]:

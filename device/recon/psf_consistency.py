@@ -45,6 +45,7 @@ MOST_BIN = 4
 LEAST_SAMPLES = 64  # of the short side
 MOST_SAMPLES = 400_000
 RING = 250  # frequencies: as in `witness`
+MOST_MISSING = 0.1  # share of the pixels: a right PSF scores .25 at 15 %, as a foreign one may
 AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
 PSF_ERROR = 0.02  # of the mean |H|^2: a frequency that the PSF does not pass is not amplified
 SCALES = np.arange(-12, 13) * 0.0025 + 1  # of the PSF: eyes of +-8 dpt, or another depth
@@ -120,12 +121,13 @@ class PsfConsistency:
         """The figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF stretched by `scale`.
 
         `defects` (rows, cols) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF
-        is too small or too even to be asked.
+        is too small, too even, or too much of the frame is missing to be asked.
         """
         if min(self._grid.shape) < LEAST_SAMPLES // 2:
             return None
         plane = counts if counts.ndim == 2 else counts.mean(axis=2).astype(np.float32)
-        spectra = self._tapered_spectra(self._preparer(plane, None, defects))
+        frame = self._preparer(plane, None, defects)
+        spectra = self._tapered_spectra(frame)
         found = self._ask(spectra, stretched(self._psf, scale))
         if found is None or found.match is not Match.FOREIGN:
             return found
@@ -133,7 +135,9 @@ class PsfConsistency:
         again = self._ask(spectra, stretched(self._psf, float(best)))
         proven = again is not None and again.match is Match.CONSISTENT and again.orientation > PROVEN
         turned = again is not None and again.match is Match.ROTATED
-        return again if proven or turned else found
+        if proven or turned:
+            return again
+        return found if frame.missing <= MOST_MISSING else None
 
     def _tapered_spectra(self, frame: Linear) -> list[Spectrum]:
         """The spectrum of the frame about its mean, once for each taper."""

@@ -12,6 +12,8 @@ from device.values import Geometry, Image
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
 LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 SURELY = 3.0  # standard errors
+MOST_MISFIT = 6.0  # rms in units of the noise: 1 for good frames, 5 with a lid or stray light, 7 and more in flicker
+PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
 FAINT_DN = 1e-9
 MISMATCHES = {
     Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
@@ -73,23 +75,41 @@ def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
     return float((inside > bright).mean())
 
 
-def complaints(quality: dict[str, float | None], match: Match | None = None) -> tuple[str, ...]:
+def explains(quality: dict[str, float | None], match: Match | None, misfit: float | None) -> bool:
+    """Whether the model explains the frame, so that what was estimated through the PSF means anything.
+
+    Not so if the PSF does not match, the light did not come through the eye, or the picture leaves a `misfit` (rms, in
+    units of the noise) above MOST_MISFIT.
+    """
+    through = quality.get("through")
+    seen = through is None or through >= LEAST_THROUGH
+    return seen and match not in MISMATCHES and (misfit is None or misfit <= MOST_MISFIT)
+
+
+def matched(quality: dict[str, float | None]) -> Match:
+    """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF."""
+    sure = quality.get("structure_sure")
+    return Match.FOREIGN if sure is not None and sure < -SURELY else Match.UNKNOWN
+
+
+def complaints(quality: dict[str, float | None], match: Match, misfit: float | None) -> tuple[str, ...]:
     """What is wrong with a picture, in plain words, the most useful first; empty if nothing is.
 
-    `match` is the verdict of the PSF consistency check; where it was not asked, `structure_sure` decides.
+    `misfit` is the rms of what the picture leaves unexplained in units of the noise; None where no field is known.
     """
-    said = []
+    found = []
     if (quality["saturated"] or 0) > 0.001:
-        said.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
+        found.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
     through = quality.get("through")
     if through is not None and through < LEAST_THROUGH:
-        said.append("No eye was seen: the light came from everywhere. Centre the ring on the pupil.")
-    elif match is None:
-        sure = quality.get("structure_sure")
-        said += [MISMATCHES[Match.FOREIGN]] if sure is not None and sure < -SURELY else []
+        found.append("No eye was seen: the light came from everywhere. Centre the ring on the pupil.")
     elif match in MISMATCHES:
-        said.append(MISMATCHES[match])
+        found.append(MISMATCHES[match])
+    elif misfit is not None and misfit > MOST_MISFIT:
+        found.append(
+            "The picture does not explain this frame: parts of it may be false. Take it again in steady light."
+        )
     share = quality.get("coverage")
-    if share is not None and share < 0.75:
-        said.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")
-    return tuple(said)
+    if explains(quality, match, misfit) and share is not None and share < 0.75:
+        found.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")
+    return tuple(found)

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import isinf
+from math import isfinite, isinf
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner, Spectrum
 from device.recon.prepare import Preparer
 from device.recon.psf_consistency import Match, PsfConsistency
-from device.recon.quality import complaints
+from device.recon.quality import PRESUMED, complaints, explains, matched
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
@@ -226,13 +226,16 @@ class Reconstructor:
         recipe, facts = climb.done.recipe, climb.facts
         dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
         quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
-        match = None
+        misfit = facts.get("residual") if isfinite(field_radius_px(self.calibration)) else None
+        match, eye = matched(quality), climb.refraction
         if self._consistency is not None and not dark:
             figures = self._consistency(climb.counts, climb.psf_scale, climb.known_defects)
             quality |= {} if figures is None else figures.facts
             match = Match.UNKNOWN if figures is None else figures.match
-        warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match)
-        eye = climb.refraction
+        warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match, misfit)
+        if not explains(quality, match, misfit):
+            eye = None
+            quality |= {key: None for key in PRESUMED if key in quality}
         if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")

@@ -19,7 +19,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner
 from device.recon.psf_consistency import PsfConsistency
 from device.recon.reconstructor import Recipe, Reconstructor, ladder
-from device.spec import InstrumentSpec, load_head
+from device.spec import CameraSpec, InstrumentSpec, load_head
 from device.values import Calibration, Geometry, Image, Reconstruction, Sensor
 from services.instrument import sweep_plot
 from services.records.picture import to_png
@@ -133,8 +133,7 @@ def calibrated(order: Order, raw: Raw) -> Calibration:
         if spec.optics is None:
             raise SpecError(f"{order.head} has no [optics], so it gives no geometry")
         geometry = spec.optics.geometry(spec.camera.pitch_um)
-        camera = spec.camera
-        sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, min(camera.white_dn, raw.white_dn))
+        sensor = _sensor(spec.camera, raw)
         field_deg = field_deg if field_deg is not None else spec.optics.field_deg
     elif field_deg is not None:
         raise SettingError(
@@ -150,6 +149,15 @@ def calibrated(order: Order, raw: Raw) -> Calibration:
     return Calibration(
         psfs=psfs, sensor=sensor, geometry=geometry, field_deg=field_deg,
         dark_dn=dark, flat=flat, bad=raw.bad, simulated=simulated,
+    )  # fmt: skip
+
+
+def _sensor(camera: CameraSpec, raw: Raw) -> Sensor:
+    """The head's sensor in the counts of a raw file: one of 8 bits holds the upper 8 bits of the converter."""
+    dropped = 2 ** (camera.bit_depth - 8) if raw.white_dn == 255 and camera.bit_depth > 8 else 1
+    return Sensor(
+        camera.black_dn / dropped, camera.gain_e_per_dn * dropped, camera.read_noise_e,
+        min(camera.white_dn / dropped, raw.white_dn),
     )  # fmt: skip
 
 
