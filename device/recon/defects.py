@@ -32,7 +32,7 @@ from device.values import Calibration, Image, Mask, Psf
 
 NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250 frames
 SATURATED_REACH_PX = 3
-CLIPPED_SD = 3.0  # of the noise below the white level, where the converter clips one value in a thousand
+CLIPPED_SD = 2.0  # of the noise below the white level, where the converter clips one value in forty
 AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
 MOST_OUTLIERS = 0.05  # share of pixels; more is the structure of the frame, and none of them is called a defect
 NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
@@ -40,6 +40,7 @@ SHADOW = 0.1  # of the light around it: a narrow gap is darker
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light that the field explains: more is a reflex. Overexposed eyes have 0.003 and less
+HALO_BEGINS = 0.05  # of it in the first ring; an eye of 6 dpt, seen through the stored PSF, shows 0.02
 HALO_SD = 3.0  # standard errors of a ring's mean excess
 HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo spoils the first fit of the field that shows it
@@ -59,11 +60,11 @@ class PixelNoise:
     floor_dn2: float
 
     @classmethod
-    def measured(cls, counts: Pixels, dark: Image) -> "PixelNoise":
+    def measured(cls, counts: Pixels, dark: Image, white_dn: float = float("inf")) -> "PixelNoise":
         """The noise of a frame (rows, cols), from what a scatter of pixels differs by from their four neighbours.
 
         A line is fitted through the trimmed variances of LEVELS groups of equal brightness, so the fine structure that
-        most pixels have counts as noise.
+        most pixels have counts as noise. Pixels at `white_dn` have none and are left out.
         """
         rows, cols = counts.shape
         if min(rows, cols) < 3:
@@ -74,7 +75,7 @@ class PixelNoise:
         light = [_light_at(counts, dark, i + a, j + b) for a, b in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))]
         mean = (light[1] + light[2] + light[3] + light[4]) / 4
         off = light[0] - mean
-        known = np.isfinite(off)
+        known = np.isfinite(off) & (counts[i, j] < white_dn)
         mean, off = mean[known], off[known]
         order = np.argsort(mean)
         groups = [group for group in np.array_split(order, LEVELS) if group.size]
@@ -126,7 +127,7 @@ class DefectFinder:
         `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched.
         """
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
-        noise = PixelNoise.measured(counts, offset)
+        noise = PixelNoise.measured(counts, offset, self._white_dn)
         limit = NOISE_SD**2 * float(LINE)
         least_dn = self._least_dn(offset, noise)
         found = kernels.mark_suspects(
@@ -256,6 +257,9 @@ def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64]
     number = np.bincount(rings)
     mean = np.bincount(rings, excess[near]) / np.maximum(number, 1)
     limit = np.maximum(HALO, HALO_SD * noise / np.sqrt(np.maximum(number / 4, 1)))
+    first = int(np.flatnonzero(number[1:])[0]) + 1
+    if mean[first] < HALO_BEGINS:
+        return 0
     below = np.flatnonzero((mean[1:] <= limit[1:]) & (number[1:] > 0))
     return int(below[0]) if below.size else int(rings.max())
 

@@ -12,7 +12,9 @@ from device.values import Geometry, Image
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
 LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 SURELY = 3.0  # standard errors
-MOST_MISFIT = 6.0  # rms in units of the noise: 1 for good frames, 5 with a lid or stray light, 7 and more in flicker
+MOST_MISFIT = (
+    5.2  # rms in units of the noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
+)
 PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
 FAINT_DN = 1e-9
 MISMATCHES = {
@@ -86,6 +88,12 @@ def explains(quality: dict[str, float | None], match: Match | None, misfit: floa
     return seen and match not in MISMATCHES and (misfit is None or misfit <= MOST_MISFIT)
 
 
+def is_lit(quality: dict[str, float | None]) -> bool:
+    """Whether the field is lit well enough for an estimate that rests on its edge; true where that is not known."""
+    share = quality.get("coverage")
+    return share is None or share >= LEAST_LIT
+
+
 def matched(quality: dict[str, float | None]) -> Match:
     """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF."""
     sure = quality.get("structure_sure")
@@ -109,7 +117,8 @@ def complaints(quality: dict[str, float | None], match: Match, misfit: float | N
         found.append(
             "The picture does not explain this frame: parts of it may be false. Take it again in steady light."
         )
-    share = quality.get("coverage")
-    if explains(quality, match, misfit) and share is not None and share < 0.75:
-        found.append(f"Only {share:.0%} of the field is lit. Ask to look at the green light; take it again.")
+    if explains(quality, match, misfit) and not is_lit(quality):
+        found.append(
+            f"Only {quality['coverage']:.0%} of the field is lit. Ask to look at the green light; take it again."
+        )
     return tuple(found)

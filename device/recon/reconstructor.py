@@ -17,7 +17,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner, Spectrum
 from device.recon.prepare import Preparer
 from device.recon.psf_consistency import Match, PsfConsistency
-from device.recon.quality import PRESUMED, complaints, explains, matched
+from device.recon.quality import PRESUMED, complaints, explains, is_lit, matched
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
@@ -233,8 +233,10 @@ class Reconstructor:
             quality |= {} if figures is None else figures.facts
             match = Match.UNKNOWN if figures is None else figures.match
         warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match, misfit)
-        if not explains(quality, match, misfit):
+        explained = explains(quality, match, misfit)
+        if not (explained and is_lit(quality)):
             eye = None
+        if not explained:
             quality |= {key: None for key in PRESUMED if key in quality}
         if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)

@@ -34,9 +34,8 @@ from device.values import Calibration, Image, Mask
 
 SAMPLE_UM = 20.0  # as coarse as the caustic's band (3 to 22 cycles/mm) permits
 TAPER_UM = 300.0
-FITS_WITH_GAPS = 12  # of the smooth part: without its brightest places each takes the answer only part of the way
-SETTLED_DPT = 0.01
-FADE_SAMPLES = 2.0  # over which detail fades into a gap
+FADE_SAMPLES = 2.0  # over which detail is continued into a narrow gap
+WIDE_SAMPLES, RAMP_SAMPLES = 5, 10  # a gap that holds a square so wide is tapered over so many samples
 SPAN_DPT = 9.0
 RINGS, TURNS = 20, 4
 SMEAR = 0.1  # of a ring's mean |H|^2: what the tapered window mixes in from neighbouring frequencies
@@ -54,8 +53,7 @@ class Refraction:
 
     `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate of
     the coarse search, sorted; `nats` is how much likelier its best is than its median. `noise_sd_dpt` is what the
-    photons alone explain, `disagreement_dpt` how far the upper half of the band is from all of it, `missing` the share of
-    the frame's pixels that were left out.
+    photons alone explain, `disagreement_dpt` how far the upper half of the band is from all of it.
     """
 
     sphere_dpt: float
@@ -64,17 +62,12 @@ class Refraction:
     nats: float
     curve: tuple[tuple[float, float], ...]
     disagreement_dpt: float = 0.0
-    missing: float = 0.0
 
     @property
     def sd_dpt(self) -> float:
-        """The standard deviation of M: one smooth but wrong valley shows where two parts of the band disagree.
-
-        Gaps take the smooth part's support, and draw the answer to 0 by about their share of the frame.
-        """
+        """The standard deviation of M: one smooth but wrong valley shows where two parts of the band disagree."""
         more_dpt = max(0.0, self.disagreement_dpt - UPPER_BIAS_DPT)
-        gaps_dpt = self.missing * (1 + abs(self.sphere_dpt))
-        return float(np.sqrt(self.noise_sd_dpt**2 + more_dpt**2 + gaps_dpt**2))
+        return float(np.hypot(self.noise_sd_dpt, more_dpt))
 
     @property
     def in_doubt(self) -> bool:
@@ -143,6 +136,7 @@ class Refractor:
         self.seen = np.zeros(self.grid.window, np.float32)
         self._weights: Image = self.taper
         self._faded: Image | None = None
+        self._narrow: Mask | None = None
 
     def _choose_frequencies(self) -> None:
         """The band that carries the speckle, in rings; and the quarter of all frequencies that carries least."""
@@ -174,31 +168,29 @@ class Refractor:
         if coarse.relief < LEAST_NATS:
             return None
         sphere_dpt = coarse.walk(sphere_dpt, self.step_dpt / 2)
-        for _ in range(FITS_WITH_GAPS if frame.has_gaps else 1):
-            begin_dpt = sphere_dpt
-            self.fit_smooth(frame, self.otf(self.grid, begin_dpt))
-            fine = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self.band))
-            for part in (2, 4):
-                sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
-            if abs(sphere_dpt) >= SPAN_DPT:
-                return None
-            vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
-            sphere_dpt = vertex_dpt
-            if abs(vertex_dpt - begin_dpt) < SETTLED_DPT:
-                break
+        self.fit_smooth(frame, self.otf(self.grid, sphere_dpt))
+        fine = Search(lambda m_dpt: self.unlikelihood(frame, noise, m_dpt, self.band))
+        for part in (2, 4):
+            sphere_dpt = fine.walk(sphere_dpt, self.step_dpt / part)
+        if abs(sphere_dpt) >= SPAN_DPT:
+            return None
+        vertex_dpt, bend = fine.parabola(sphere_dpt, self.step_dpt / 4)
         sd_dpt = min(SD_FACTOR * (self._spread / bend) ** 0.5, SPAN_DPT) if bend > 0 else SPAN_DPT
         curve = tuple(sorted(coarse.known.items()))
         apart_dpt = abs(self._found_by_the_upper_half(frame, noise, sphere_dpt) - vertex_dpt)
-        missing = frame.missing if frame.has_gaps else 0.0
-        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve, apart_dpt, missing)
+        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve, apart_dpt)
 
     def frame(self, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Linear:
         """The frame on this model's samples; `seen` becomes the weights of its samples."""
         frame = self.preparer(counts, dark, defects)
-        np.multiply(frame.good, self.taper, out=self.seen)
-        self._weights, self._faded = self.taper, None
+        self._weights, self._faded, self._narrow = self.taper, None, None
         if frame.has_gaps:
-            self._weights = self.taper * (frame.good >= LEAST_GOOD)
+            gap = frame.good < LEAST_GOOD
+            wide = ndimage.binary_opening(gap, np.ones((WIDE_SAMPLES, WIDE_SAMPLES), np.bool_))
+            near = np.minimum(1, ndimage.distance_transform_edt(~wide) / RAMP_SAMPLES) if wide.any() else 1.0
+            self._weights = (self.taper * (0.5 - 0.5 * np.cos(np.pi * near))).astype(np.float32)
+            self._narrow = gap & ~wide
+        np.multiply(frame.good, self._weights, out=self.seen)
         return frame
 
     def _found_by_the_upper_half(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
@@ -223,21 +215,21 @@ class Refractor:
         level, stray = self.shading.fit(frame, self._smooth)
         self.model.fft.space[:] = self._smooth
         self._object[:] = self.model.fft.forward()
-        if frame.has_gaps:
-            self._fade_into_gaps(frame, stray)
+        if self._narrow is not None:
+            self._fill_narrow_gaps(frame, stray, self._narrow)
         return level
 
-    def _fade_into_gaps(self, frame: Linear, stray: float) -> None:
-        """Into `_faded`: the detail around gaps, fading into them, tapered; 0 elsewhere.
+    def _fill_narrow_gaps(self, frame: Linear, stray: float, narrow: Mask) -> None:
+        """Into `_faded`: the detail around narrow gaps, continued into them; 0 elsewhere.
 
-        A gap of zeros has an edge, and an edge has power at every frequency: it would count as the retina's. The smooth
-        part stays out: a gap filled with what one candidate predicts would speak for that candidate.
+        Wide gaps are tapered like the window. A gap of zeros has an edge, and an edge has power at every frequency: it
+        would count as the retina's.
         """
         smooth = self.model.blur(self._smooth)[self.grid.slices] + np.float32(stray)
         known = (frame.good >= LEAST_GOOD).astype(np.float32)
         detail = ndimage.gaussian_filter((frame.y - smooth) * known, FADE_SAMPLES)
         share = ndimage.gaussian_filter(known, FADE_SAMPLES)
-        self._faded = ((1 - known) * self.taper * detail / np.maximum(share, 0.5)).astype(np.float32)
+        self._faded = (narrow * self._weights * detail / np.maximum(share, 0.1)).astype(np.float32)
 
     def residual(self, frame: Linear, m_dpt: float) -> float:
         """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered.
@@ -250,7 +242,8 @@ class Refractor:
         np.multiply(self._object, self._otf, out=model.fft.spectrum)
         smooth = model.fft.inverse()[grid.slices]
         level, stray = flat_fit(kernels.dots(frame.y, smooth, frame.good))
-        kernels.residual(frame.y, smooth, self._weights, level, stray, (0, 0), self.fft.space)
+        weights = self._weights if self._narrow is None else self._weights * ~self._narrow
+        kernels.residual(frame.y, smooth, weights, level, stray, (0, 0), self.fft.space)
         if self._faded is not None:
             self.fft.space += self._faded
         self.fft.forward()
