@@ -12,9 +12,8 @@ from device.values import Geometry, Image
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
 LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 SURELY = 3.0  # standard errors
-MOST_MISFIT = (
-    5.2  # rms in units of the noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
-)
+LEAST_LIT = 0.75  # share of the field
+MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
 FAINT_DN = 1e-9
 MISMATCHES = {
