@@ -113,13 +113,14 @@ class Raw:
     """A raw file as the solver wants it: uint16 counts or float32, (rows, cols) or (rows, cols, 3).
 
     `white_dn` is where it saturates (infinite for float), `bad` the pixels that hold no image, `shift` how many bits a
-    left-justified converter was moved back.
+    left-justified converter was moved back, `stored_bits` how many bits the file has for a pixel.
     """
 
     pixels: NDArray[np.uint16] | NDArray[np.float32]
     white_dn: float
     bad: Mask
     shift: int
+    stored_bits: int
 
 
 def as_raw(array: NDArray[Any]) -> Raw:
@@ -130,7 +131,9 @@ def as_raw(array: NDArray[Any]) -> Raw:
     """
     if array.dtype.kind == "f":
         strange = ~np.isfinite(array)
-        return Raw(np.where(strange, 0, array).astype(np.float32), float("inf"), _any_channel(strange), 0)
+        return Raw(
+            np.where(strange, 0, array).astype(np.float32), float("inf"), _any_channel(strange), 0, 8 * array.itemsize
+        )
     if array.dtype.kind == "i" and array.size and array.min() < 0:
         raise FrameError("this image holds negative whole numbers, which no sensor counts")
     if array.max() > 65535:
@@ -141,7 +144,7 @@ def as_raw(array: NDArray[Any]) -> Raw:
     bad = _any_channel(stray)
     top = int(counts[~bad].max()) if not bad.all() else 0
     bits = next(bits for bits in (8, 10, 12, 14, 16) if top < 2**bits)
-    return Raw(counts, float(2**bits - 1), bad, shift)
+    return Raw(counts, float(2**bits - 1), bad, shift, 8 * array.itemsize)
 
 
 def _any_channel(mask: Mask) -> Mask:

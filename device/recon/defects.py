@@ -34,10 +34,12 @@ NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250
 SATURATED_REACH_PX = 3
 CLIPPED_SD = 2.0  # of the noise below the white level, where the converter clips one value in forty
 AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
-MOST_OUTLIERS = 0.05  # share of pixels; more is the structure of the frame, and none of them is called a defect
+MOST_OUTLIERS = 0.05  # share of pixels of one kind; more are the structure of the frame, and none is called a defect
 NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
+LIT = 4.0  # in units of the largest value without light: less is no edge
 SHADOW = 0.1  # of the light around it: a narrow gap is darker
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
+STEPS = np.arange(0.3, 1.01, 0.05)  # shares of a range that are tried on the PSF
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light that the field explains: more is a reflex. Overexposed eyes have 0.003 and less
 HALO_BEGINS = 0.05  # of it in the first ring; an eye of 6 dpt, seen through the stored PSF, shows 0.02
@@ -117,7 +119,7 @@ class DefectFinder:
         self._bad: Mask = np.zeros(shape, np.bool_)
         if calibration.bad is not None and calibration.bad.shape == shape:
             self._bad = calibration.bad
-        self._ranges = ring_ranges(calibration.psfs[index])
+        self._ranges, self._steepest = ring_ranges(calibration.psfs[index]), steepest(calibration.psfs[index])
         self._calibration, self._shape, self._index = calibration, shape, index
         self._suspect: Mask = np.zeros(shape, np.bool_)
 
@@ -140,6 +142,8 @@ class DefectFinder:
         light = _light_at(counts, offset, *np.divmod(places, counts.shape[1]))
         dark_dn = NOISE_SD * noise.floor_dn2**0.5
         saturated, low = values >= self._white_dn, light < least_dn
+        if np.count_nonzero(low) > MOST_OUTLIERS * counts.size:
+            low[:] = False  # the black level is another one, or the sensor gave nothing
         defective = np.zeros(counts.shape, np.bool_)
         if saturated.any() or low.any():
             if saturated.any():
@@ -187,11 +191,46 @@ class DefectFinder:
 
         Narrow ones (NARROW_PX) are far darker than their surroundings; wider ones hold no light at all.
         """
+        lit_dn = LIT * dark_dn
+        sharp = steep(light, 0.5 * (1 + self._steepest), lit_dn)
         around = ndimage.grey_closing(light, (NARROW_PX, NARROW_PX))
-        narrow = (light < np.maximum(SHADOW * around, dark_dn)) & (around > 4 * dark_dn)
-        return _with_sharp_border(narrow, self._suspect) | _with_sharp_border(
-            (light <= dark_dn) & ~narrow, self._suspect
-        )
+        narrow = (light < np.maximum(SHADOW * around, dark_dn)) & (around > lit_dn)
+        wide = (light <= dark_dn) & ~narrow
+        return _with_sharp_border(narrow, sharp) | _with_sharp_border(wide, sharp)
+
+
+def steep(image: Image, share: float, least: float) -> Mask:
+    """Pixels beside a step, along a row or a column, that is more than `least` and `share` of its surroundings' range.
+
+    The range is that of four pixels in line, two on either side of the step.
+    """
+    out = np.zeros(image.shape, np.bool_)
+    for axis in (0, 1):
+        line, marks = np.moveaxis(image, axis, 0), np.moveaxis(out, axis, 0)
+        four = np.stack([line[k : len(line) - 3 + k] for k in range(4)])
+        step = np.abs(four[2] - four[1])
+        found = (step > least) & (step >= share * (four.max(axis=0) - four.min(axis=0)))
+        marks[1:-2] |= found
+        marks[2:-1] |= found
+    return out
+
+
+def steepest(psf: Psf) -> float:
+    """The largest share of the range of four pixels in line that the PSF itself passes in one step, 0 to 1."""
+    pixels, least = psf.pixels, 0.1 * float(psf.pixels.max())
+    shares = [share for share in STEPS if steep(pixels, share, least).any()]
+    return max(shares, default=0.0)
+
+
+def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:
+    """Those connected areas whose border is `sharp` over EDGE_SHARE of its length; the sensor's edge is no border."""
+    labels, count = ndimage.label(areas)
+    border = areas & ~ndimage.binary_erosion(areas, border_value=1)
+    length_px = np.bincount(labels[border], minlength=count + 1)
+    sharp_px = np.bincount(labels[border & sharp], minlength=count + 1)
+    kept = sharp_px >= np.maximum(EDGE_SHARE * length_px, 1)
+    kept[0] = False
+    return np.asarray(kept[labels])
 
 
 class HaloFinder:
@@ -264,17 +303,6 @@ def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64]
     return int(below[0]) if below.size else int(rings.max())
 
 
-def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:
-    """Those connected areas whose border is `sharp` over EDGE_SHARE of its length."""
-    labels, count = ndimage.label(areas)
-    border = areas & ~ndimage.binary_erosion(areas, border_value=1)
-    length_px = np.bincount(labels[border], minlength=count + 1)
-    sharp_px = np.bincount(labels[border & sharp], minlength=count + 1)
-    kept = sharp_px >= np.maximum(EDGE_SHARE * length_px, 1)
-    kept[0] = False
-    return np.asarray(kept[labels])
-
-
 def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
     """Saturated pixels, and those where the light is so near `white_dn` that the converter clips its noise.
 
@@ -300,6 +328,6 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
         return float("inf"), float("inf")
     nothing = np.zeros((1, pixels.shape[1]), np.float32)
     noise = PixelNoise.measured(pixels, nothing)
-    return kernels.ring_excess(
-        pixels, 0.1 * float(pixels.max()), NOISE_SD**2 * noise.per_dn, NOISE_SD**2 * noise.floor_dn2
-    )
+    least, limit = 0.1 * float(pixels.max()), NOISE_SD**2
+    none = np.zeros(pixels.shape, np.bool_)
+    return kernels.ring_excess(pixels, nothing, none, least, limit * noise.per_dn, limit * noise.floor_dn2)

@@ -270,37 +270,38 @@ def _mark_row(
 
 
 @_jit
+def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, out: Image) -> int:
+    """The light of the pixels at Chebyshev distance `reach` from (i, j) that are not `bad`, into `out`; how many."""
+    rows, cols = counts.shape
+    n = 0
+    for a in range(max(i - reach, 0), min(i + reach, rows - 1) + 1):
+        for b in range(max(j - reach, 0), min(j + reach, cols - 1) + 1):
+            if max(abs(a - i), abs(b - j)) == reach and not bad[a, b]:
+                out[n] = np.float32(counts[a, b]) - dark[a % len(dark), b]
+                n += 1
+    return n
+
+
+@_jit
 def outliers(
-    counts: Pixels,
-    dark: Image,
-    bad: Mask,
-    where: Places,
-    slope_dn: float,
-    floor_dn2: float,
-    ranges: tuple[float, float],
-    out: Mask,
-) -> int:
+    counts: Pixels, dark: Image, bad: Mask, where: Places, slope_dn: float, floor_dn2: float,
+    ranges: tuple[float, float], out: Mask,
+) -> int:  # fmt: skip
     """Mark in `out` those of the pixels `where` (flat indices) that differ from a ring around them; their number.
 
     A ring is the 8 pixels at distance 1 or the 16 at distance 2, without `bad` ones. A pixel differs when it is off the
     ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the ring's own
     range, its 1 + k highest and lowest left out.
     """
-    rows, cols = counts.shape
     ring = np.empty(16, np.float32)
     found = 0
     for place in where:
-        i, j = place // cols, place % cols
+        i, j = place // counts.shape[1], place % counts.shape[1]
         if bad[i, j] or out[i, j]:
             continue
         odd, light = False, np.float32(counts[i, j]) - dark[i % len(dark), j]
         for k in range(2):
-            reach, n = k + 1, 0
-            for a in range(max(i - reach, 0), min(i + reach, rows - 1) + 1):
-                for b in range(max(j - reach, 0), min(j + reach, cols - 1) + 1):
-                    if max(abs(a - i), abs(b - j)) == reach and not bad[a, b]:
-                        ring[n] = np.float32(counts[a, b]) - dark[a % len(dark), b]
-                        n += 1
+            n = _ring(counts, dark, bad, i, j, k + 1, ring)
             if n > 2 * k + 4:
                 known = np.sort(ring[:n])
                 middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
@@ -314,27 +315,25 @@ def outliers(
 
 
 @_jit
-def ring_excess(image: Image, least: float, slope_dn: float, floor_dn2: float) -> tuple[float, float]:
-    """The largest `ranges` that `outliers` would need to find nothing in an image, among its pixels above `least`."""
+def ring_excess(
+    image: Image, nothing: Image, none: Mask, least: float, slope_dn: float, floor_dn2: float
+) -> tuple[float, float]:
+    """The largest `ranges` that `outliers` would need to find nothing in an image, among its pixels above `least`.
+
+    `nothing` is a row of zeros, `none` a mask (rows, cols) that is nowhere true.
+    """
     rows, cols = image.shape
-    ring = np.empty(16, np.float32)
-    worst = np.zeros(2, np.float64)
+    ring, worst = np.empty(16, np.float32), np.zeros(2, np.float64)
     for i in range(2, rows - 2):
         for j in range(2, cols - 2):
             if image[i, j] < least:
                 continue
             for k in range(2):
-                n, reach = 0, k + 1
-                for a in range(i - reach, i + reach + 1):
-                    for b in range(j - reach, j + reach + 1):
-                        if max(abs(a - i), abs(b - j)) == reach:
-                            ring[n] = image[a, b]
-                            n += 1
+                n = _ring(image, nothing, none, i, j, k + 1, ring)
                 known = np.sort(ring[:n])
                 middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
                 spread = known[n - 2 - k] - known[1 + k]
-                noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
-                excess = abs(image[i, j] - middle) - noise
+                excess = abs(image[i, j] - middle) - np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
                 if excess > 0:
                     worst[k] = max(worst[k], excess / max(spread, np.float32(1e-30)))
     return worst[0], worst[1]

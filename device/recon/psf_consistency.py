@@ -46,6 +46,7 @@ LEAST_SAMPLES = 64  # of the short side
 MOST_SAMPLES = 400_000
 RING = 250  # frequencies: as in `witness`
 MOST_MISSING = 0.1  # share of the pixels: a right PSF scores .25 at 15 %, as a foreign one may
+LEAST_SIGNAL = 1.3  # over the noise: below, right PSFs score as low as foreign ones (500 electrons at the peak: 1.2)
 AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
 PSF_ERROR = 0.02  # of the mean |H|^2: a frequency that the PSF does not pass is not amplified
 SCALES = np.arange(-12, 13) * 0.0025 + 1  # of the PSF: eyes of +-8 dpt, or another depth
@@ -137,7 +138,14 @@ class PsfConsistency:
         turned = again is not None and again.match is Match.ROTATED
         if proven or turned:
             return again
-        return found if frame.missing <= MOST_MISSING else None
+        return found if frame.missing <= MOST_MISSING and self._signal(spectra[0]) >= LEAST_SIGNAL else None
+
+    def _signal(self, spectrum: Spectrum) -> float:
+        """Mean |Y|^2 in the band over the noise: 1 where there is nothing else."""
+        power, seen = _power(self._otf(self._psf)), _power(spectrum)
+        low, high = band(self._frequency, power, max(self._grid.window))
+        inside = (self._frequency > low) & (self._frequency < high) & self._off_axes
+        return float(seen[inside].mean()) / max(self._noise(seen, power), 1e-30)
 
     def _tapered_spectra(self, frame: Linear) -> list[Spectrum]:
         """The spectrum of the frame about its mean, once for each taper."""

@@ -125,6 +125,7 @@ class Reconstructor:
     """Plans once for a calibration and a sensor shape; then turns frames into pictures within a deadline.
 
     `recipes` run in order; the last is the wanted picture, those before it are quick looks. One thread at a time.
+    `timed` runs it on noise first, so that every cost is known before the first deadline; without a deadline leave it.
     `consistency` is asked about each frame's PSF, outside the deadline: for files, where seconds do not matter.
     With `refract`, where geometry and field are known, the frame tells the eye's refraction after the quick look, and
     what follows is solved with the PSF of that eye.
@@ -133,7 +134,7 @@ class Reconstructor:
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
         recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
-        consistency: PsfConsistency | None = None,
+        consistency: PsfConsistency | None = None, timed: bool = True,
     ) -> None:  # fmt: skip
         recipes = recipes or ladder(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
@@ -147,7 +148,8 @@ class Reconstructor:
         self._sharp = self.rungs[min(1, len(self.rungs) - 1) :]  # what is solved with the eye's own PSF
         self._find_cost, self._refocus_cost = Cost(), Cost()
         self._consistency: PsfConsistency | None = None
-        self._warm_up()
+        if timed:
+            self._warm_up()
         self._consistency = consistency  # noise needs no check
 
     def _warm_up(self) -> None:
@@ -233,7 +235,7 @@ class Reconstructor:
             quality |= {} if figures is None else figures.facts
             match = Match.UNKNOWN if figures is None else figures.match
         warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match, misfit)
-        explained = explains(quality, match, misfit)
+        explained = not dark and explains(quality, match, misfit)
         if not (explained and is_lit(quality)):
             eye = None
         if not explained:

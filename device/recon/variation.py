@@ -182,7 +182,7 @@ class Variation(EvidenceWiener):
         typical = 1 / self.noise.variance_dn2(0.5 * float(frame.y.max()))
         rejected = self.reg / (np.abs(model.otf) ** 2 + self.reg)
         self.tau = KAPPA * float(np.sqrt(typical * np.vdot(self._dual, rejected * rejected)))
-        self.rho = RHO * self.tau / max(abs(self.level), 1e-12)
+        self.rho = max(RHO * self.tau / max(abs(self.level), 1e-12), 1e-30)  # a frame without light has no tau
         self.stiffness = STIFF * typical
         self._blur()
         y = self._y = frame.y - np.float32(self.stray)

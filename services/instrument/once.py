@@ -76,7 +76,10 @@ def planned(
     """The solver that an order asks for, planned for its calibration and frames of a shape; `index` is the PSF's."""
     consistency = PsfConsistency(calibration, shape, index)
     recipes = _recipes(order, calibration, shape, index)
-    return Reconstructor(calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency)
+    timed = order.budget_s is not None
+    return Reconstructor(
+        calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency, timed=timed
+    )
 
 
 def _refuse_places(order: Order) -> None:
@@ -154,7 +157,7 @@ def calibrated(order: Order, raw: Raw) -> Calibration:
 
 def _sensor(camera: CameraSpec, raw: Raw) -> Sensor:
     """The head's sensor in the counts of a raw file: one of 8 bits holds the upper 8 bits of the converter."""
-    dropped = 2 ** (camera.bit_depth - 8) if raw.white_dn == 255 and camera.bit_depth > 8 else 1
+    dropped = 2 ** (camera.bit_depth - 8) if raw.stored_bits == 8 and camera.bit_depth > 8 else 1
     return Sensor(
         camera.black_dn / dropped, camera.gain_e_per_dn * dropped, camera.read_noise_e,
         min(camera.white_dn / dropped, raw.white_dn),
