@@ -38,6 +38,7 @@ MOST_OUTLIERS = 0.05  # share of pixels of one kind; more are the structure of t
 NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
 LIT = 4.0  # in units of the largest value without light: less is no edge
 SHADOW = 0.1  # of the light around it: a narrow gap is darker
+EDGE = 0.3  # of the light around it: the step at the border of a gap is larger
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
 STEPS = np.arange(0.3, 1.01, 0.05)  # shares of a range that are tried on the PSF
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
@@ -60,6 +61,10 @@ class PixelNoise:
 
     per_dn: float
     floor_dn2: float
+
+    def at_least(self, other: "PixelNoise") -> "PixelNoise":
+        """The larger of both at every brightness: a frame that is mostly dark shows little of its shot noise."""
+        return PixelNoise(max(self.per_dn, other.per_dn), max(self.floor_dn2, other.floor_dn2))
 
     @classmethod
     def measured(cls, counts: Pixels, dark: Image, white_dn: float = float("inf")) -> "PixelNoise":
@@ -116,6 +121,8 @@ class DefectFinder:
         self._dark: Image = np.full((1, shape[1]), sensor.black_dn, np.float32)
         if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
             self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
+        gain, read_e = sensor.gain_e_per_dn, sensor.read_noise_e or 0.0
+        self._least_noise = PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2)
         self._bad: Mask = np.zeros(shape, np.bool_)
         if calibration.bad is not None and calibration.bad.shape == shape:
             self._bad = calibration.bad
@@ -129,7 +136,7 @@ class DefectFinder:
         `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched.
         """
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
-        noise = PixelNoise.measured(counts, offset, self._white_dn)
+        noise = PixelNoise.measured(counts, offset, self._white_dn).at_least(self._least_noise)
         limit = NOISE_SD**2 * float(LINE)
         least_dn = self._least_dn(offset, noise)
         found = kernels.mark_suspects(
@@ -192,24 +199,25 @@ class DefectFinder:
         Narrow ones (NARROW_PX) are far darker than their surroundings; wider ones hold no light at all.
         """
         lit_dn = LIT * dark_dn
-        sharp = steep(light, 0.5 * (1 + self._steepest), lit_dn)
         around = ndimage.grey_closing(light, (NARROW_PX, NARROW_PX))
+        sharp = steep(light, 0.5 * (1 + self._steepest), np.maximum(lit_dn, EDGE * around))
         narrow = (light < np.maximum(SHADOW * around, dark_dn)) & (around > lit_dn)
         wide = (light <= dark_dn) & ~narrow
         return _with_sharp_border(narrow, sharp) | _with_sharp_border(wide, sharp)
 
 
-def steep(image: Image, share: float, least: float) -> Mask:
-    """Pixels beside a step, along a row or a column, that is more than `least` and `share` of its surroundings' range.
+def steep(image: Image, share: float, least: Image) -> Mask:
+    """Pixels beside a step, along a row or a column, of at least `least` and of `share` of its surroundings' range.
 
-    The range is that of four pixels in line, two on either side of the step.
+    The range is that of four pixels in line, two on either side of the step; `least` (rows, cols) counts where it is
+    larger of the two sides.
     """
     out = np.zeros(image.shape, np.bool_)
     for axis in (0, 1):
-        line, marks = np.moveaxis(image, axis, 0), np.moveaxis(out, axis, 0)
+        line, marks, limit = (np.moveaxis(array, axis, 0) for array in (image, out, least))
         four = np.stack([line[k : len(line) - 3 + k] for k in range(4)])
         step = np.abs(four[2] - four[1])
-        found = (step > least) & (step >= share * (four.max(axis=0) - four.min(axis=0)))
+        found = (step > np.maximum(limit[1:-2], limit[2:-1])) & (step >= share * np.ptp(four, axis=0))
         marks[1:-2] |= found
         marks[2:-1] |= found
     return out
@@ -217,7 +225,8 @@ def steep(image: Image, share: float, least: float) -> Mask:
 
 def steepest(psf: Psf) -> float:
     """The largest share of the range of four pixels in line that the PSF itself passes in one step, 0 to 1."""
-    pixels, least = psf.pixels, 0.1 * float(psf.pixels.max())
+    pixels = psf.pixels
+    least = np.full_like(pixels, 0.1 * float(pixels.max()))
     shares = [share for share in STEPS if steep(pixels, share, least).any()]
     return max(shares, default=0.0)
 
