@@ -49,6 +49,9 @@ HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo spoils the first fit of the field that shows it
 HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
 LEAST_AREA = 2  # samples of a saturated area that may have a halo
+PSF_NOISE_SD = (
+    1.0  # of a PSF's measured noise, in which its own lines count, taken off before its sharpness is measured
+)
 PASSES = 3  # an outlier hides its neighbour until it is left out
 SAMPLES, LEVELS = 20_000, 6
 LINE = np.float32(1.25)  # variance of a pixel minus the mean of four, in units of a pixel's variance
@@ -337,6 +340,6 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
         return float("inf"), float("inf")
     nothing = np.zeros((1, pixels.shape[1]), np.float32)
     noise = PixelNoise.measured(pixels, nothing)
-    least, limit = 0.1 * float(pixels.max()), NOISE_SD**2
+    least, limit = 0.1 * float(pixels.max()), PSF_NOISE_SD**2
     none = np.zeros(pixels.shape, np.bool_)
     return kernels.ring_excess(pixels, nothing, none, least, limit * noise.per_dn, limit * noise.floor_dn2)

