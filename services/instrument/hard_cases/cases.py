@@ -194,9 +194,9 @@ CASES: tuple[Case, ...] = (
     _case("PSF turned by 180 deg", "wrong PSF", turned_psf, "psf", NO_TEST),
     _case("rim cut", "parts of the field", lambda eye: eye.frame(shade=crescent_dark(5.0, 16.7)), "lit"),
     _case("half a lid", "parts of the field",
-          lambda eye: eye.frame({"sim.light.stray": 0.5}, above_dark(0.0)), "lit eye", PEDESTAL),
+          lambda eye: eye.frame({"sim.light.stray": 0.5}, above_dark(0.0)), "lit eye misfit", PEDESTAL),
     *(
-        _case(f"stray light {share:.0%}", "light", stray(share), "eye", PEDESTAL)
+        _case(f"stray light {share:.0%}", "light", stray(share), "eye bright", PEDESTAL)
         for share in (0.2, 1.0)
     ),
     *(
@@ -204,7 +204,7 @@ CASES: tuple[Case, ...] = (
         for deg in (0.5, 1.5)
     ),
     _case("flicker 10 %", "light",
-          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1)), "", BANDS),
+          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1)), "misfit", BANDS),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),

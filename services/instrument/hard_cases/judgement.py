@@ -26,6 +26,7 @@ KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (  # the first that fits
     ("signal", ("no signal",)),
     ("eye", ("no eye",)),
     ("psf", ("psf",)),
+    ("misfit", ("does not explain",)),
     ("bright", ("too bright",)),
     ("lit", ("is lit", "of the field")),
     ("counts", ("black level", "gain", "bits", "counts")),
