@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.recon import kernels
-from device.recon.kernels import Pixels
+from device.recon.kernels import Pixels, Places
 from device.recon.model import field_radius_px, tight_model
 from device.recon.plan import Planner
 from device.recon.prepare import Linear, Preparer
@@ -52,8 +52,9 @@ LEAST_AREA = 2  # samples of a saturated area that may have a halo
 PSF_NOISE_SD = (
     1.0  # of a PSF's measured noise, in which its own lines count, taken off before its sharpness is measured
 )
+FEW = 200  # suspects at the calibrated noise, which is right then
 PASSES = 3  # an outlier hides its neighbour until it is left out
-SAMPLES, LEVELS = 20_000, 6
+SAMPLES, LEVELS = 6_000, 6
 LINE = np.float32(1.25)  # variance of a pixel minus the mean of four, in units of a pixel's variance
 QUANTISATION_DN2 = 1 / 12
 
@@ -79,14 +80,11 @@ class PixelNoise:
         rows, cols = counts.shape
         if min(rows, cols) < 3:
             return cls(0.0, float("inf"))
-        stride = max(1, (rows - 2) * (cols - 2) // SAMPLES) | 1
-        place = np.arange(0, (rows - 2) * (cols - 2), stride)
-        i, j = 1 + place // (cols - 2), 1 + place % (cols - 2)
-        light = [_light_at(counts, dark, i + a, j + b) for a, b in ((0, 0), (0, 1), (0, -1), (1, 0), (-1, 0))]
-        mean = (light[1] + light[2] + light[3] + light[4]) / 4
-        off = light[0] - mean
-        known = np.isfinite(off) & (counts[i, j] < white_dn)
-        mean, off = mean[known], off[known]
+        places = np.arange(0, (rows - 2) * (cols - 2), max(1, (rows - 2) * (cols - 2) // SAMPLES) | 1)
+        mean, off = np.empty(places.size, np.float32), np.empty(places.size, np.float32)
+        kernels.neighbours(counts, dark, places, mean, off)
+        known = np.isfinite(off) & (counts[1 + places // (cols - 2), 1 + places % (cols - 2)] < white_dn)
+        mean, off = mean[known].astype(np.float64), off[known].astype(np.float64)
         order = np.argsort(mean)
         groups = [group for group in np.array_split(order, LEVELS) if group.size]
         level = np.array([max(float(np.median(mean[group])), 0.0) for group in groups])
@@ -125,48 +123,70 @@ class DefectFinder:
         if calibration.dark_dn is not None and calibration.dark_dn.shape == shape:
             self._dark = np.nan_to_num(calibration.dark_dn).astype(np.float32)
         gain, read_e = sensor.gain_e_per_dn, sensor.read_noise_e or 0.0
-        self._least_noise = PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2)
+        self._least_noise = (
+            PixelNoise(0.0, 0.0) if gain is None else PixelNoise(1 / gain, (read_e / gain) ** 2 + QUANTISATION_DN2)
+        )
         self._bad: Mask = np.zeros(shape, np.bool_)
         if calibration.bad is not None and calibration.bad.shape == shape:
             self._bad = calibration.bad
         self._ranges, self._steepest = ring_ranges(calibration.psfs[index]), steepest(calibration.psfs[index])
         self._calibration, self._shape, self._index = calibration, shape, index
+        self._known: Mask = self._bad.copy()
         self._suspect: Mask = np.zeros(shape, np.bool_)
 
-    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Mask | None:
-        """The defective pixels of a frame (rows, cols), uint16 or float32; None where there are none.
+    def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Places | None:
+        """The defective pixels of a frame (rows, cols), uint16 or float32, as flat indices; None where there are none.
 
         `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched.
         """
         offset = self._dark if dark is None else np.asarray(dark, np.float32)
-        noise = PixelNoise.measured(counts, offset, self._white_dn).at_least(self._least_noise)
-        limit = NOISE_SD**2 * float(LINE)
-        least_dn = self._least_dn(offset, noise)
-        found = kernels.mark_suspects(
-            counts, offset, limit * noise.per_dn, limit * noise.floor_dn2, self._white_dn, least_dn, self._suspect
-        )
+        noise, found = self._least_noise, FEW + 1
+        if noise.floor_dn2 > 0:
+            found = self._mark_suspects(counts, offset, noise)
+        if found > FEW:  # the gain is not known, or the frame is noisier, or there are many defects
+            noise = PixelNoise.measured(counts, offset, self._white_dn).at_least(noise)
+            found = self._mark_suspects(counts, offset, noise)
         if not found:
             return None
+        least_dn = self._least_dn(offset, noise)
         places = np.flatnonzero(self._suspect)
-        values = counts.ravel()[places]
         light = _light_at(counts, offset, *np.divmod(places, counts.shape[1]))
         dark_dn = NOISE_SD * noise.floor_dn2**0.5
-        saturated, low = values >= self._white_dn, light < least_dn
-        if np.count_nonzero(low) > MOST_OUTLIERS * counts.size:
-            low[:] = False  # the black level is another one, or the sensor gave nothing
+        saturated = counts.ravel()[places] >= self._white_dn
+        low = (
+            (light < least_dn) if np.count_nonzero(light < least_dn) <= MOST_OUTLIERS * counts.size else light < -np.inf
+        )
+        outlying = self._outliers(counts, offset, noise, places[~saturated & ~low])
+        gap = np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX
+        if not (saturated.any() or low.any() or gap):
+            return outlying if outlying.size else None
         defective = np.zeros(counts.shape, np.bool_)
-        if saturated.any() or low.any():
-            if saturated.any():
-                white_light_dn = self._white_dn - float(offset.mean(dtype=np.float64))
-                noise_dn = (noise.per_dn * white_light_dn + noise.floor_dn2) ** 0.5
-                defective = clipped(counts, self._white_dn, noise_dn)
-            defective.ravel()[places[low]] = True
-        self._add_outliers(counts, offset, noise, places, defective)
-        if np.count_nonzero(light <= dark_dn) >= LEAST_EDGE_PX:
+        defective.ravel()[np.concatenate([outlying, places[low]])] = True
+        self._add_areas(counts, dark, noise, defective, bool(gap), bool(saturated.any()))
+        return np.flatnonzero(defective) if defective.any() else None
+
+    def _mark_suspects(self, counts: Pixels, offset: Image, noise: PixelNoise) -> int:
+        """Mark in `_suspect` what lies apart from its neighbours or beyond black and white; the number of pixels."""
+        limit = NOISE_SD**2 * float(LINE)
+        return kernels.mark_suspects(
+            counts, offset, limit * noise.per_dn, limit * noise.floor_dn2, self._white_dn,
+            self._least_dn(offset, noise), self._suspect,
+        )  # fmt: skip
+
+    def _add_areas(
+        self, counts: Pixels, dark: Pixels | None, noise: PixelNoise, defective: Mask, gap: bool, saturated: bool
+    ) -> None:
+        """Mark clipped areas, gaps and halos in `defective`, which holds the single pixels."""
+        offset = self._dark if dark is None else np.asarray(dark, np.float32)
+        if saturated:
+            white_light_dn = self._white_dn - float(offset.mean(dtype=np.float64))
+            noise_dn = (noise.per_dn * white_light_dn + noise.floor_dn2) ** 0.5
+            defective |= clipped(counts, self._white_dn, noise_dn)
+        if gap:
+            dark_dn = NOISE_SD * noise.floor_dn2**0.5
             defective |= self._gaps(np.where(defective, np.float32(0), counts - offset), dark_dn)
-        if saturated.any() and self._halo is not None:
+        if saturated and self._halo is not None:
             defective |= self._halo.mask(counts, dark, defective)
-        return defective if defective.any() else None
 
     @cached_property
     def _halo(self) -> "HaloFinder | None":
@@ -181,20 +201,17 @@ class DefectFinder:
         margin_dn = NOISE_SD * noise.floor_dn2**0.5
         return -(0.5 * black_dn + margin_dn) if black_dn > 4 * margin_dn else -3e38
 
-    def _add_outliers(
-        self, counts: Pixels, offset: Image, noise: PixelNoise, places: NDArray[np.int64], defective: Mask
-    ) -> None:
-        """Mark the outliers among `places`, unless they are so many that they are the structure of the frame."""
+    def _outliers(self, counts: Pixels, offset: Image, noise: PixelNoise, places: Places) -> Places:
+        """The outliers among `places`; none if they are so many that they are the structure of the frame."""
         limit = NOISE_SD**2
         slope_dn, floor_dn2 = limit * noise.per_dn, limit * noise.floor_dn2
-        outlying = np.zeros_like(defective)
-        known = defective | self._bad
+        odd, known = np.zeros(places.size, np.bool_), self._known.ravel()
         for _ in range(PASSES):
-            if not kernels.outliers(counts, offset, known, places, slope_dn, floor_dn2, self._ranges, outlying):
+            if not kernels.outliers(counts, offset, self._known, places, slope_dn, floor_dn2, self._ranges, odd):
                 break
-            known |= outlying
-        if outlying.sum() <= MOST_OUTLIERS * outlying.size:
-            defective |= outlying
+            known[places[odd]] = True
+        known[places] = self._bad.ravel()[places]
+        return places[odd] if np.count_nonzero(odd) <= MOST_OUTLIERS * counts.size else places[:0]
 
     def _gaps(self, light: Image, dark_dn: float) -> Mask:
         """Areas without light behind a sharp edge: what no blur by the PSF can leave dark.
@@ -259,7 +276,7 @@ class HaloFinder:
 
         The field is fitted outside the halos that are known so far, and their rings measured again, HALO_TURNS times.
         """
-        frame = self._prepare(counts, dark, defective)
+        frame = self._prepare(counts, dark, np.flatnonzero(defective))
         lost = frame.good < 0.5
         labels, count = ndimage.label(lost)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)

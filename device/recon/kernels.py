@@ -101,6 +101,37 @@ def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tupl
 
 
 @_jit
+def leave_out(
+    counts: Pixels, dark: Image, bend_per_dn: float, gain: Image, white_dn: float, first: tuple[int, int], n: int,
+    places: Places, out: Image, good: Image,
+) -> tuple[int, float]:  # fmt: skip
+    """Take the pixels `places` (flat indices) out of what `linearise` made; their number and their light in DN.
+
+    The other arguments are those of `linearise`. Pixels that it did not believe are passed over.
+    """
+    rows, cols = out.shape
+    bend, white, lowest = np.float32(bend_per_dn), np.float32(white_dn), np.float32(-3e38)
+    one, two, all_px = np.float32(1), np.float32(2), np.float32(n * n)
+    lost, light = 0, np.float64(0)
+    for place in places:
+        a, b = place // counts.shape[1], place % counts.shape[1]
+        i, j = (a - first[0]) // n, (b - first[1]) // n
+        value, weight = np.float32(counts[a, b]), gain[a % len(gain), b]
+        believed = (value < white) & (value > lowest) & (weight > 0)
+        if a < first[0] or b < first[1] or i >= rows or j >= cols or not believed:
+            continue
+        value -= dark[a % len(dark), b]
+        bent = bend * value
+        value *= (one - bent * (one - two * bent)) * weight
+        used = np.round(good[i, j] * all_px)
+        out[i, j] = (out[i, j] * used - value) / (used - one) if used > one else np.float32(0)
+        good[i, j] = (used - one) / all_px
+        lost += 1
+        light += value
+    return lost, light
+
+
+@_jit
 def dots(y: Image, flat: Image, good: Image) -> Sums:
     """Sums over the frame that fit y = a flat + b: <y,f>, <y,1>, <f,f>, <f,1>, <1,1>, each weighted by `good`."""
     yf = y1 = ff = f1 = n = np.float64(0)
@@ -218,6 +249,23 @@ def stretch(
 
 
 @_jit
+def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Image) -> None:
+    """The mean light of the four neighbours of inner pixels, and what each differs by from it.
+
+    `places` count the pixels that have four neighbours, row by row.
+    """
+    inner = counts.shape[1] - 2
+    light = np.empty(5, np.float32)
+    for k in range(places.size):
+        i, j = 1 + places[k] // inner, 1 + places[k] % inner
+        for m in range(5):
+            a, b = i + (m == 1) - (m == 2), j + (m == 3) - (m == 4)
+            light[m] = np.float32(counts[a, b]) - dark[a % len(dark), b]
+        mean[k] = np.float32(0.25) * (light[1] + light[2] + light[3] + light[4])
+        off[k] = light[0] - mean[k]
+
+
+@_jit
 def mark_suspects(
     counts: Pixels, dark: Image, slope_dn: float, floor_dn2: float, white_dn: float, least_dn: float, out: Mask
 ) -> int:
@@ -284,33 +332,31 @@ def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, ou
 
 @_jit
 def outliers(
-    counts: Pixels, dark: Image, bad: Mask, where: Places, slope_dn: float, floor_dn2: float,
-    ranges: tuple[float, float], out: Mask,
+    counts: Pixels, dark: Image, known: Mask, places: Places, slope_dn: float, floor_dn2: float,
+    ranges: tuple[float, float], odd: Mask,
 ) -> int:  # fmt: skip
-    """Mark in `out` those of the pixels `where` (flat indices) that differ from a ring around them; their number.
+    """Mark in `odd` those of the pixels `places` (flat indices) that differ from a ring around them; their number.
 
-    A ring is the 8 pixels at distance 1 or the 16 at distance 2, without `bad` ones. A pixel differs when it is off the
-    ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the ring's own
-    range, its 1 + k highest and lowest left out.
+    A ring is the 8 pixels at distance 1 or the 16 at distance 2, without `known` defects. A pixel differs when it is
+    off the ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the ring's
+    own range, its 1 + k highest and lowest left out.
     """
     ring = np.empty(16, np.float32)
     found = 0
-    for place in where:
-        i, j = place // counts.shape[1], place % counts.shape[1]
-        if bad[i, j] or out[i, j]:
+    for m in range(places.size):
+        i, j = places[m] // counts.shape[1], places[m] % counts.shape[1]
+        if known[i, j]:
             continue
-        odd, light = False, np.float32(counts[i, j]) - dark[i % len(dark), j]
+        light = np.float32(counts[i, j]) - dark[i % len(dark), j]
         for k in range(2):
-            n = _ring(counts, dark, bad, i, j, k + 1, ring)
+            n = _ring(counts, dark, known, i, j, k + 1, ring)
             if n > 2 * k + 4:
-                known = np.sort(ring[:n])
-                middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
-                spread = known[n - 2 - k] - known[1 + k]
+                ordered = np.sort(ring[:n])
+                middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+                spread = ordered[n - 2 - k] - ordered[1 + k]
                 noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
-                odd = odd or abs(light - middle) > noise + ranges[k] * spread
-        if odd:
-            out[i, j] = True
-            found += 1
+                odd[m] |= abs(light - middle) > noise + ranges[k] * spread
+        found += odd[m]
     return found
 
 

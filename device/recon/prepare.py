@@ -7,8 +7,8 @@ import numpy as np
 from device.errors import FrameError
 from device.recon import kernels
 from device.recon.geometry import Grid
-from device.recon.kernels import Pixels
-from device.values import Calibration, Image, Mask
+from device.recon.kernels import Pixels, Places
+from device.values import Calibration, Image
 
 LEAST_GOOD = 0.5  # share of a sample's pixels that hold light; with fewer it is a gap
 MOST_BAD = 0.3  # share of pixels that may be missing (optics.md 5.4: at 30 % a masked fit still finds 0.89 of 0.95)
@@ -69,20 +69,24 @@ class Preparer:
         y = np.empty(grid.window, np.float32) if inbox is None else inbox
         self._out = Linear(y, np.empty(grid.window, np.float32), 0.0, 0.0, 0.0)
 
-    def __call__(self, counts: Pixels, dark: Pixels | None = None, defects: Mask | None = None) -> Linear:
+    def __call__(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Linear:
         """Linear DN of one frame (rows, cols), uint16 or float32; `dark` is this shot's own dark frame.
 
-        NaN counts as missing, and so do the pixels of `defects` (rows, cols). The result lives in buffers that the next
+        NaN counts as missing, and so do the pixels `defects` (flat indices). The result lives in buffers that the next
         call overwrites.
         """
         _fitting("frame", counts, self.grid.sensor)
         offset = self.dark if dark is None else _fitting("dark frame", dark, self.grid.sensor)
-        gain = self.gain if defects is None else np.where(defects, np.float32(0), self.gain)
         y, good, grid = self._out.y, self._out.good, self.grid
         first, n = grid.first_px, grid.n
         saturated, believed, light_dn = kernels.linearise(
-            counts, offset, self.bend_per_dn, gain, self.white, first, n, y, good
+            counts, offset, self.bend_per_dn, self.gain, self.white, first, n, y, good
         )
+        if defects is not None:
+            lost, lost_dn = kernels.leave_out(
+                counts, offset, self.bend_per_dn, self.gain, self.white, first, n, defects, y, good
+            )
+            believed, light_dn = believed - lost, light_dn - lost_dn
         mean_good = believed / (good.size * n**2)
         if mean_good < 1 - MOST_BAD:
             raise FrameError(

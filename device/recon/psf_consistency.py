@@ -30,11 +30,11 @@ from scipy import ndimage
 
 from device.recon.evidence import band
 from device.recon.geometry import Grid, Pair
-from device.recon.kernels import Pixels
+from device.recon.kernels import Pixels, Places
 from device.recon.model import taper
 from device.recon.prepare import Linear, Preparer
 from device.recon.resolution import EMPTY_OPEN, working_bin
-from device.values import Calibration, Image, Mask, Psf
+from device.values import Calibration, Image, Psf
 
 ANGLES_DEG = np.linspace(30, 150, 8)  # of the certainly wrong PSFs; with 180 degrees more each is its own partner
 PROVEN = 5.0  # sd of `orientation` and `mirrored`
@@ -118,10 +118,10 @@ class PsfConsistency:
         self._off_axes = (row_cycles > AXIS)[:, None] & (col_cycles > AXIS)[None]
         self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
 
-    def __call__(self, counts: Pixels, scale: float = 1.0, defects: Mask | None = None) -> Consistency | None:
+    def __call__(self, counts: Pixels, scale: float = 1.0, defects: Places | None = None) -> Consistency | None:
         """The figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF stretched by `scale`.
 
-        `defects` (rows, cols) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF
+        `defects` (flat indices) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF
         is too small, too even, or too much of the frame is missing to be asked.
         """
         if min(self._grid.shape) < LEAST_SAMPLES // 2:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.evidence import BINS, Evidence, PowerLaw
-from device.recon.psf_consistency import Match
+from device.recon.psf_consistency import MOST_MISSING, Match
 from device.values import Geometry, Image
 
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; optics.md 1.1
@@ -94,9 +94,12 @@ def is_lit(quality: dict[str, float | None]) -> bool:
 
 
 def matched(quality: dict[str, float | None]) -> Match:
-    """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF."""
-    sure = quality.get("structure_sure")
-    return Match.FOREIGN if sure is not None and sure < -SURELY else Match.UNKNOWN
+    """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF.
+
+    UNKNOWN where more than MOST_MISSING of the frame is missing: gaps have a spectrum of their own.
+    """
+    sure, missing = quality.get("structure_sure"), quality.get("missing") or 0.0
+    return Match.FOREIGN if sure is not None and sure < -SURELY and missing <= MOST_MISSING else Match.UNKNOWN
 
 
 def complaints(quality: dict[str, float | None], match: Match, misfit: float | None) -> tuple[str, ...]:

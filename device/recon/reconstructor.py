@@ -11,7 +11,7 @@ import numpy as np
 from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
 from device.recon.defects import DefectFinder
-from device.recon.kernels import Pixels
+from device.recon.kernels import Pixels, Places
 from device.recon.methods import DEFAULT, Solver, method_named
 from device.recon.model import field_radius_px
 from device.recon.plan import Planner, Spectrum
@@ -21,7 +21,7 @@ from device.recon.quality import PRESUMED, complaints, explains, is_lit, matched
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
-from device.values import Calibration, Image, Mask, Reconstruction, Report, check_image_shape
+from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Stage:
     last: bool
 
 
-ChannelFrame = tuple[Pixels, Pixels | None, Mask | None]  # counts, dark frame, defective pixels
+ChannelFrame = tuple[Pixels, Pixels | None, Places | None]  # counts, dark frame, defective pixels
 Watcher = Callable[[Stage], None]
 Between = Callable[[], None]
 
@@ -262,7 +262,7 @@ class _Climb:
     ) -> None:  # fmt: skip
         self.clock, self.counts, self.dark = owner.clock, counts, dark
         self._defects = owner.defects
-        self._found: dict[int, Mask | None] = {}
+        self._found: dict[int, Places | None] = {}
         self.deadline, self.most, self.between = deadline, most, between
         self.last = owner.rungs[-1]
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
@@ -298,10 +298,10 @@ class _Climb:
         return counts, dark, self._found[c]
 
     @property
-    def known_defects(self) -> Mask | None:
+    def known_defects(self) -> Places | None:
         """The pixels that are defective in any channel that was solved."""
-        masks = [mask for mask in self._found.values() if mask is not None]
-        return np.logical_or.reduce(masks) if masks else None
+        found = [places for places in self._found.values() if places is not None]
+        return np.unique(np.concatenate(found)) if found else None
 
     def up(self, rung: _Rung) -> bool:
         """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""

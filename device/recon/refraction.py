@@ -23,7 +23,7 @@ from device.recon.choose import flat_fit
 from device.recon.defects import DefectFinder
 from device.recon.evidence import band
 from device.recon.geometry import Grid, Pair, support_radius_px
-from device.recon.kernels import Pixels
+from device.recon.kernels import Pixels, Places
 from device.recon.model import dirichlet, field_radius_px, taper, tight_model
 from device.recon.noise import Noise
 from device.recon.plan import Planner, RealFft, Spectrum
@@ -151,10 +151,10 @@ class Refractor:
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
 
-    def find(self, counts: Pixels, dark: Pixels | None = None, defects: Mask | None = None) -> Refraction | None:
+    def find(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Refraction | None:
         """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span.
 
-        `defects` (rows, cols) are left out, see `DefectFinder`.
+        `defects` (flat indices) are left out, see `DefectFinder`.
         """
         if self.band.where.size < LEAST_FREQUENCIES:
             return None
@@ -180,7 +180,7 @@ class Refractor:
         apart_dpt = abs(self._found_by_the_upper_half(frame, noise, sphere_dpt) - vertex_dpt)
         return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.relief, curve, apart_dpt)
 
-    def frame(self, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Linear:
+    def frame(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """The frame on this model's samples; `seen` becomes the weights of its samples."""
         frame = self.preparer(counts, dark, defects)
         self._weights, self._faded, self._narrow = self.taper, None, None

@@ -14,14 +14,14 @@ import numpy as np
 
 from device.errors import FrameError
 from device.recon.defects import DefectFinder
-from device.recon.kernels import Pixels
+from device.recon.kernels import Pixels, Places
 from device.recon.model import Model, field_radius_px, tight_model
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
 from device.recon.quality import LEAST_THROUGH
 from device.recon.reconstructor import plane
 from device.recon.variation import EvidenceWiener
-from device.values import Calibration, Image, Mask
+from device.values import Calibration, Image
 
 Word = Literal["good", "again"]
 Code = Literal[
@@ -188,7 +188,7 @@ class _Eye:
         self._weight = cycles[self._band] ** 3  # a retina's power falls so: every ring has its say
         self._turn = np.exp(2j * np.arctan2(across, along))[self._band]
 
-    def read(self, plain: Reading, counts: Pixels, dark: Pixels | None, defects: Mask | None) -> Reading:
+    def read(self, plain: Reading, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Reading:
         """The reading with what the field tells."""
         picture, solver = self._picture, self._solver
         if plain.saturated > MOST_SATURATED:

@@ -27,7 +27,7 @@ def within(
 
     def hold(measured: float, bound: float) -> None:
         nonlocal count
-        record_property("margin", [measured, bound])
+        record_property("margin", [float(measured), float(bound)])  # numbers that xdist can send
         assert measured <= bound
         if count < len(before):
             seen = before[count][0]

@@ -41,8 +41,10 @@ def frame(seed: int, peak_e: float = 10_000.0, points: int = 40) -> Counts:
 
 
 def found(counts: Counts, calibration: Calibration = CALIBRATION) -> Mask:
-    mask = DefectFinder(calibration, SHAPE)(counts)
-    return np.zeros(SHAPE, np.bool_) if mask is None else mask
+    places = DefectFinder(calibration, SHAPE)(counts)
+    mask = np.zeros(SHAPE, np.bool_)
+    mask.ravel()[[] if places is None else places] = True
+    return mask
 
 
 @given(st.integers(0, 10_000), st.floats(200, 18_000))
