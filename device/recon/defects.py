@@ -33,6 +33,7 @@ from device.values import Calibration, Image, Mask, Psf
 NOISE_SD = 6.0  # 2 million pixels of Gaussian noise hold one beyond this in 250 frames
 SATURATED_REACH_PX = 3
 CLIPPED_SD = 2.0  # of the noise below the white level, where the converter clips one value in forty
+CLIPPED_SHARE = 0.1  # of the white level, at the most: a well of 400 electrons has noise of 0.05
 AREA_NEIGHBOURS = 4  # of 8: saturated pixels with as many saturated neighbours are an area, not hot pixels
 MOST_OUTLIERS = 0.05  # share of pixels of one kind; more are the structure of the frame, and none is called a defect
 NARROW_PX = 25  # dead columns and rows up to this width are told by their brighter surroundings alone
@@ -340,7 +341,7 @@ def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
     pixel has dark surroundings and stays alone.
     """
     mean = ndimage.uniform_filter(np.minimum(counts, np.float32(white_dn)), 2 * SATURATED_REACH_PX + 1)
-    near: Mask = mean > white_dn - CLIPPED_SD * noise_dn
+    near: Mask = mean > white_dn - min(CLIPPED_SD * noise_dn, CLIPPED_SHARE * white_dn)
     saturated: Mask = counts >= white_dn
     neighbours = ndimage.uniform_filter(saturated.astype(np.float32), 3)
     areas = saturated & (neighbours > (AREA_NEIGHBOURS + 0.5) / 9)
