@@ -26,7 +26,7 @@ from device.recon import kernels
 from device.recon.kernels import Pixels, Places
 from device.recon.model import field_radius_px, tight_model
 from device.recon.plan import Planner
-from device.recon.prepare import Linear, Preparer
+from device.recon.prepare import Linear, Preparer, fitting
 from device.recon.shading import Shading
 from device.values import Calibration, Image, Mask, Psf
 
@@ -138,9 +138,11 @@ class DefectFinder:
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Places | None:
         """The defective pixels of a frame (rows, cols), uint16 or float32, as flat indices; None where there are none.
 
-        `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched.
+        `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched. FrameError for another
+        shape than the calibration's.
         """
-        offset = self._dark if dark is None else np.asarray(dark, np.float32)
+        fitting("frame", counts, self._shape)
+        offset = self._dark if dark is None else fitting("dark frame", np.asarray(dark, np.float32), self._shape)
         noise, found = self._least_noise, FEW + 1
         if noise.floor_dn2 > 0:
             found = self._mark_suspects(counts, offset, noise)

@@ -45,11 +45,11 @@ class Preparer:
         self.dark = np.full((1, shape[1]), calibration.sensor.black_dn, np.float32)  # one row stands for all
         self.gain = np.ones((1, shape[1]), np.float32)
         if calibration.dark_dn is not None:
-            self.dark = _fitting("dark frame", calibration.dark_dn, shape).astype(np.float32)
+            self.dark = fitting("dark frame", calibration.dark_dn, shape).astype(np.float32)
         if calibration.flat is not None or calibration.bad is not None or len(self.dark) > 1:
             self.gain = np.ones(shape, np.float32)
         if calibration.flat is not None:
-            flat = _fitting("flat frame", calibration.flat, shape)
+            flat = fitting("flat frame", calibration.flat, shape)
             usable = np.isfinite(flat) & (flat > 0)
             mean = float(flat[usable].mean(dtype=np.float64)) if usable.any() else 1.0
             self.gain[:] = np.where(usable, mean / np.where(usable, flat, 1), 0)
@@ -57,7 +57,7 @@ class Preparer:
             self.gain[~np.isfinite(self.dark)] = 0
             self.dark[~np.isfinite(self.dark)] = 0
         if calibration.bad is not None:
-            self.gain[_fitting("bad-pixel mask", calibration.bad, shape)] = 0
+            self.gain[fitting("bad-pixel mask", calibration.bad, shape)] = 0
         missing = float((self.gain == 0).mean())
         if missing > MOST_BAD:
             raise FrameError(
@@ -75,8 +75,8 @@ class Preparer:
         NaN counts as missing, and so do the pixels `defects` (flat indices). The result lives in buffers that the next
         call overwrites.
         """
-        _fitting("frame", counts, self.grid.sensor)
-        offset = self.dark if dark is None else _fitting("dark frame", dark, self.grid.sensor)
+        fitting("frame", counts, self.grid.sensor)
+        offset = self.dark if dark is None else fitting("dark frame", dark, self.grid.sensor)
         y, good, grid = self._out.y, self._out.good, self.grid
         first, n = grid.first_px, grid.n
         saturated, believed, light_dn = kernels.linearise(
@@ -96,7 +96,8 @@ class Preparer:
         return Linear(y, good, light_dn / max(believed, 1), saturated / (good.size * n**2), 1 - mean_good)
 
 
-def _fitting(name: str, array: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def fitting(name: str, array: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The array itself; FrameError if it has not the sensor's (rows, cols): compiled code checks no bounds."""
     if array.shape != shape:
         raise FrameError(
             f"the {name} has {' x '.join(map(str, array.shape))} pixels, this head {shape[0]} x {shape[1]}",

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from device.errors import FrameError
 from device.recon.defects import DefectFinder, PixelNoise
 from device.values import Calibration, Counts, Mask, Psf, Sensor
 
@@ -109,6 +110,15 @@ def test_clipped_light_takes_its_surroundings_with_it_and_a_hot_pixel_does_not()
     assert mask[full].all()
     assert mask[ndimage.binary_dilation(full & (rows_px > 50), iterations=3)].mean() > 0.95
     assert mask[25:36, 25:36].sum() == 1
+
+
+@pytest.mark.parametrize(("rows", "dark_rows"), [(80, None), (200, None), (160, 80)])
+def test_a_frame_of_another_camera_mode_is_refused(rows: int, dark_rows: int | None) -> None:
+    """Compiled code checks no bounds."""
+    counts = np.full((rows, SHAPE[1]), 500, np.uint16)
+    dark = None if dark_rows is None else np.full((dark_rows, SHAPE[1]), 64, np.uint16)
+    with pytest.raises(FrameError, match="camera mode|pixels"):
+        DefectFinder(CALIBRATION, SHAPE)(counts, dark)
 
 
 def test_a_black_level_that_is_not_the_calibrated_one_is_no_defect() -> None:
