@@ -117,7 +117,7 @@ def test_a_frame_of_another_camera_mode_is_refused(rows: int, dark_rows: int | N
     """Compiled code checks no bounds."""
     counts = np.full((rows, SHAPE[1]), 500, np.uint16)
     dark = None if dark_rows is None else np.full((dark_rows, SHAPE[1]), 64, np.uint16)
-    with pytest.raises(FrameError, match="camera mode|pixels"):
+    with pytest.raises(FrameError, match=r"has .* pixels"):
         DefectFinder(CALIBRATION, SHAPE)(counts, dark)
 
 
