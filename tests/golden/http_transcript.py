@@ -1,17 +1,15 @@
 """HTTP transcripts of every endpoint, good and refused, one per chapter, and the OpenAPI document."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from services.instrument.sending import FIRST_S
 from tests.golden import compare
-from tests.golden.instrument import Refusing, instrument
+from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
 
 Chapter = Callable[[], list[dict[str, Any]]]
-PATIENCE_S = 120.0
 UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-ffffff"
 RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, whose thread measures meanwhile
 PIN, STANDS = {"pin": "2580"}, ("cap", "screen", "point")
@@ -42,10 +40,10 @@ def captures() -> list[dict[str, Any]]:
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/other.png")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/RAW.TIFF")
         log.events(
-            lambda heard: heard[-1]["event"] == "state" and heard[-1]["data"] == {"state": "aim"} and len(heard) > 3, 0
+            lambda event: event["event"] == "state" and event["data"] == {"state": "aim"} and int(event["id"]) > 2, 0
         )
         log.ask("GET /api/events", headers={"Last-Event-ID": "yesterday"})
-        log.ask("GET /api/preview", "/api/preview?after=0&eye=OD")
+        log.ask_for_live("GET /api/preview", "/api/preview?after=0&eye=OD")
         log.ask("GET /api/preview", "/api/preview?after=-1")
         log.ask("GET /api/preview", "/api/preview?eye=left")
         log.ask("GET /api/preview", headers={"Sec-Fetch-Site": "cross-site"})
@@ -55,6 +53,7 @@ def captures() -> list[dict[str, Any]]:
 
 def _failures(log: Transcript, id: str) -> None:
     """What a press, the status and the checks answer after a camera fails, and after a file is damaged."""
+    until(lambda: bool(log.instrument.owner.findings))
     log.ask("GET /api/health")
     (camera,) = log.instrument.cameras
     camera.broken = True
@@ -83,7 +82,7 @@ def visits() -> list[dict[str, Any]]:
         second = log.ask("POST /api/captures", json=log.key(**press), note="a retake")
         log.ask("POST /api/captures", json=log.key(**press | {"eye": "OS"}), note="the slot is of the other eye")
         log.ask("POST /api/captures", json=log.key(**press | {"slot": "nose"}))
-        log.ask("GET /api/preview", f"/api/preview?eye=OD&visit={visit['id']}")
+        log.ask_for_live("GET /api/preview", f"/api/preview?eye=OD&visit={visit['id']}")
         _slots(log, at, first["id"], second["id"])
         _listing(log, visit)
         _ends(log, at, visit["id"])
@@ -266,7 +265,7 @@ def _calibrated(log: Transcript) -> str:
     log.ask(ready, json={"stand": "cap", "mishap": "lamp on"}, racing=RACING)
     _settled(log, "asking", failed=True)
     log.ask("GET /api/calibration", note="the step failed, and is asked for again", racing=("progress",))
-    log.ask("GET /api/calibration/preview")
+    log.ask_for_live("GET /api/calibration/preview")
     for stand in STANDS:
         _settled(log, "asking", stand=stand)
         assert log.instrument.send("POST", "/api/calibration/ready", json={"stand": stand}).status_code == 200
@@ -296,14 +295,6 @@ def _settled(log: Transcript, state: str, stand: str | None = None, failed: bool
         return said["state"] == state and stand in (None, said["stand"]) and (said["error"] is not None or not failed)
 
     until(is_there)
-
-
-def until(holds: Callable[[], bool]) -> None:
-    """Wait in real time, for another thread; fails after PATIENCE_S."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < end_s, "it did not happen"
-        time.sleep(0.02)
 
 
 def updates() -> list[dict[str, Any]]:

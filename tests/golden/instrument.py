@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -44,6 +45,7 @@ from services.records.store import Store
 from tests.updates import Board
 
 DAY_S = 86400.0
+PATIENCE_S = 120.0
 FREE_BYTES = 10**12
 HEAD = """\
 name = "Golden head"
@@ -264,3 +266,11 @@ def _sticks(folder: Path) -> Sticks:
     stick.mkdir(parents=True)
     mounts.write_text(f"proc /proc proc rw 0 0\n/dev/sda1 {stick} vfat rw 0 0\n")
     return Sticks((folder / "media",), mounts)
+
+
+def until(holds: Callable[[], bool]) -> None:
+    """Wait in real time, for another thread; fails after PATIENCE_S."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end_s, "it did not happen"
+        time.sleep(0.02)

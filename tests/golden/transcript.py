@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import httpx
@@ -11,7 +11,7 @@ import tifffile
 from PIL import Image
 
 from services.instrument.api import HEADERS
-from tests.golden.instrument import Heard, Instrument
+from tests.golden.instrument import Instrument, until
 from tests.golden.normalise import Normaliser
 
 PAGE_RULES = {name.lower(): text for name, text in HEADERS.items()}
@@ -50,10 +50,17 @@ class Transcript:
         self._add(operation, note, request, said)
         return answer.json() if "json" in answer.headers.get("content-type", "") else None
 
-    def events(self, enough: Heard, after: int | None, note: str = "") -> None:
-        """Record the server-sent events until `enough`, without heartbeats after the first."""
-        heard = self.instrument.follow(enough, after)
-        kept = [one for number, one in enumerate(heard) if number == 0 or one["event"] != "beat"]
+    def ask_for_live(self, operation: str, path: str | None = None) -> None:
+        """Record a request for a live picture once there is one: on a busy computer it may take more than 2 s."""
+        method, template = operation.split(" ")
+        until(lambda: self.instrument.send(method, path or template).status_code == 200)
+        self.ask(operation, path)
+
+    def events(self, is_last: Callable[[dict[str, Any]], bool], after: int | None, note: str = "") -> None:
+        """Record the server-sent events up to the first that `is_last`, without heartbeats after the first."""
+        heard = self.instrument.follow(lambda events: any(map(is_last, events)), after)
+        last = next(number for number, one in enumerate(heard) if is_last(one))
+        kept = [one for number, one in enumerate(heard[: last + 1]) if number == 0 or one["event"] != "beat"]
         body = [{key: self._event(key, one) for key in one} for one in kept]
         request = {"to": "GET /api/events", "headers": {} if after is None else {"Last-Event-ID": str(after)}}
         self._add("GET /api/events", note, request, {"status": 200, "events": body})
