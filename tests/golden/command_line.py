@@ -1,0 +1,164 @@
+"""`--help` of every command, and the exit code and output of good and bad calls, in one process of fixed width."""
+
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import typer
+
+from services.cli import app, main
+from tests.golden import compare
+from tests.golden.instrument import HEAD
+from tests.golden.normalise import Normaliser
+from tests.house import ROOT
+
+WIDTH = "100"
+START = "from tests.golden.command_line import print_made; print_made()"
+UNSET = (
+    "FORCE_COLOR",
+    "GITHUB_ACTIONS",
+    "PY_COLORS",
+    "CLICOLOR_FORCE",
+    "TTY_COMPATIBLE",
+    "NOTIFY_SOCKET",
+    "LISTEN_PID",
+)
+CALLS = (  # in this order: later ones use the files of earlier ones
+    "", "fly", "--version",
+    "methods", "methods --rows 136 --cols 240", "methods --rows 0",
+    "optics", "optics --sensor imx296", "optics --sensor none", "optics --head {0}/head.toml --sensor imx296",
+    "simulate {0}/head.toml --explain", "simulate {0}/head.toml -o {0}/scene", "simulate {0}/head.toml",
+    "simulate {0}/none.toml -o {0}/scene", "simulate {0}/head.toml --explain --only moonlight",
+    "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff --head {0}/head.toml --method gradient -o {0}/x.npy",
+    "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff -o {0}/x.npy --method guess",
+    "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff -o {0}/x.bmp",
+    "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff -o {0}/x.npy --budget-s 0",
+    "reconstruct {0}/scene/raw.tiff -o {0}/x.npy", "reconstruct {0}/none.tiff --psf {0}/scene/psf.tiff -o {0}/x.npy",
+    "reconstruct {0}/scene/raw.tiff --psf {0}/none.tiff -o {0}/x.npy", "reconstruct",
+    "run --head {0}/none.toml", "run --port 0", "run --head {0}/head.toml --replay {0}",
+    "run --head {0}/head.toml --send {0}/none.toml", "run --head {0}/head.toml --protocol {0}/none.toml",
+    "health --at http://127.0.0.1:9", "health --at http://127.0.0.1:9 --json", "health --at nonsense",
+    "probe --head {0}/head.toml", "probe --head {0}/none.toml", "probe",
+    "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
+    "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
+    "frontier --json {0}/f.json --plot {0}/f.svg", "frontier --json {0}/f.json --plot {0}/f.svg --repeats 0",
+    "paper -o {0}/paper --only nothing", "hard -o {0}/hard --case nothing", "hard -o {0}/hard --method guess",
+    "calibrations", "calibrations list --archive {0}/a", "calibrations new-key {0}/key --name Ada",
+    "calibrations new-key {0}/key --name Ada",
+    "calibrations import-psf {0}/scene/psf.tiff --archive {0}/a --by Ada --source bench",
+    "calibrations import-psf {0}/none.tiff --archive {0}/a --by Ada --source bench",
+    "calibrations list --archive {0}/a", "calibrations show {1} --archive {0}/a",
+    "calibrations show 0000 --archive {0}/a", "calibrations export {1} {0}/e.zip --archive {0}/a --key {0}/key",
+    "calibrations export {0}/e.zip --archive {0}/a --key {0}/none", "calibrations export a b c --archive {0}/a --key k",
+    "calibrations import {0}/e.zip --archive {0}/b --trust {0}/key.pub",
+    "calibrations import {0}/head.toml --archive {0}/b --trust {0}/key.pub",
+    "calibrations use {1} --archive {0}/b", "calibrations use 0000 --archive {0}/b",
+    "snapshots", "snapshots list --data {0}/none", "snapshots restore x --data {0}/none --yes",
+    "update", "update status --settings {0}/none.toml", "update check --settings {0}/none.toml",
+    *(f"update {word} --settings {{0}}/none.toml" for word in ("restart", "settle", "answer", "tidy")),
+    "update install {0}/none.raucb --settings {0}/none.toml",
+)  # fmt: skip
+PROGRAMS = (  # of units and of RAUC, each in a process of its own
+    "-m services.update --help", "-m services.update fly", "device/drivers/blank.py --help", "device/drivers/blank.py",
+    "device/drivers/blank.py --device {0}/none", "services/update/bootchooser.py fly",
+)  # fmt: skip
+
+
+def record() -> dict[str, Any]:
+    """Return help texts by command and the calls, made by a process whose terminal is 100 columns wide."""
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary).resolve()
+        command = [sys.executable, "-c", START, str(folder)]
+        done = subprocess.run(command, cwd=ROOT, env=_environment(folder), capture_output=True, text=True, check=True)
+        normaliser = Normaliser(folder)
+        made: dict[str, Any] = json.loads(done.stdout)
+        made["programs"] = [_program(words, folder) for words in PROGRAMS]
+        return {kind: _plain(value, normaliser) for kind, value in made.items()}
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """Return an environment without what changes colours and widths, with folders of its own."""
+    kept = {name: value for name, value in os.environ.items() if name not in UNSET}
+    own = {"HOME": folder, "XDG_CACHE_HOME": folder / "cache", "XDG_DATA_HOME": folder / "data"}
+    fixed = {"COLUMNS": WIDTH, "TERMINAL_WIDTH": WIDTH, "TERM": "dumb", "NO_COLOR": "1", "LC_ALL": "C.UTF-8"}
+    return kept | fixed | {name: str(path) for name, path in own.items()} | {"PYTHONPATH": str(ROOT)}
+
+
+def _program(words: str, folder: Path) -> dict[str, Any]:
+    command = [sys.executable, *words.format(folder).split()]
+    done = subprocess.run(command, cwd=ROOT, env=_environment(folder), capture_output=True, text=True, check=False)
+    return {"call": f"python {words.format(folder)}", "exit": done.returncode, "out": done.stdout, "err": done.stderr}
+
+
+def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
+    """Return a value with texts as lists of lines, blanks in rows as two, measured numbers in `out` as placeholders."""
+    if isinstance(value, dict):
+        return {name: _plain(one, normaliser, name) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_plain(one, normaliser, key) for one in value]
+    if not isinstance(value, str):
+        return value
+    if key == "call":
+        return normaliser.text(value)
+    lines = [normaliser.text(line.rstrip().replace(version("diffuscope"), "<version>")) for line in value.splitlines()]
+    if key == "out":
+        lines = [re.sub(r"(?<![\w.])-?\d+\.\d+(e-?\d+)?(?![\w.])", "<number>", line) for line in lines]
+        lines = [re.sub(r"((?:simulated|skipped) +\S+ +)\d+ ", r"\1<ms> ", line) for line in lines]
+    return [re.sub(r" {2,}", "  ", line) for line in lines if line]
+
+
+def commands() -> Iterator[list[str]]:
+    """Yield the words of every command and subcommand; the first has none."""
+
+    def below(command: Any, words: list[str]) -> Iterator[list[str]]:
+        yield words
+        for name, inner in getattr(command, "commands", {}).items():
+            yield from below(inner, [*words, name])
+
+    yield from below(typer.main.get_command(app), [])
+
+
+def called(words: list[str]) -> dict[str, Any]:
+    """Call the command line in this process; exit code and what it printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            main(words)
+            code: Any = 0
+        except SystemExit as ended:
+            code = ended.code
+    return {"exit": code or 0, "out": out.getvalue(), "err": err.getvalue()}
+
+
+def _made(folder: Path) -> dict[str, Any]:
+    """Return everything that is done in one process."""
+    (folder / "head.toml").write_text(HEAD)
+    helps = {" ".join(["diffuscope", *words]): called([*words, "--help"]) for words in commands()}
+    calls = []
+    for call in CALLS:
+        kept = [path.name for path in (folder / "a").glob("*") if len(path.name) == 16]
+        words = call.format(folder, *(kept or ["none"])).split()
+        calls.append({"call": " ".join(["diffuscope", *words])} | called(words))
+    return {"help": helps, "calls": calls}
+
+
+def print_made() -> None:
+    """Print what is done in one process as JSON; the first word is an empty folder for the files of the calls."""
+    folder = Path(sys.argv[1])
+    sys.argv[:] = ["diffuscope"]  # the name in the usage lines
+    json.dump(_made(folder), sys.stdout)
+
+
+def write() -> Path:
+    """Write the record of the command line."""
+    compare.write("command-line", record())
+    return compare.RECORDS / "command-line.json"

@@ -1,0 +1,443 @@
+"""HTTP transcripts of every endpoint, good and refused, one per chapter, and the OpenAPI document."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from services.instrument.sending import FIRST_S
+from tests.golden import compare
+from tests.golden.instrument import Refusing, instrument, until
+from tests.golden.transcript import Transcript
+
+Chapter = Callable[[], list[dict[str, Any]]]
+UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-ffffff"
+RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, whose thread measures meanwhile
+PIN, STANDS = {"pin": "2580"}, ("cap", "screen", "point")
+
+
+def captures() -> list[dict[str, Any]]:
+    """Test pictures without a visit: press, list, files, live picture, events, a camera that fails."""
+    with instrument() as device:
+        log = Transcript(device)
+        log.ask("GET /api/status", note="before the first picture")
+        press = log.key(eye="OD")
+        made = log.ask("POST /api/captures", json=press)
+        log.ask("POST /api/captures", json=press, note="the same key again: the same capture")
+        log.ask("POST /api/captures", json=press | {"eye": "OS"}, note="the same key with another eye")
+        log.ask("POST /api/captures", json={"eye": "left"})
+        log.ask("POST /api/captures", json={"eye": "OD", "lamp": 1})
+        log.ask("POST /api/captures", json={"eye": "OD", "slot": "R-centre"})
+        log.ask("POST /api/captures", content=b"{half", headers={"Content-Type": "application/json"})
+        log.ask("POST /api/captures", content=b" " * 20_000)
+        log.ask("GET /api/captures")
+        log.ask("GET /api/captures", f"/api/captures?before={made['id']}&limit=2")
+        log.ask("GET /api/captures", "/api/captures?limit=0")
+        log.ask("GET /api/captures", f"/api/captures?before={UNKNOWN_CAPTURE}")
+        log.ask("GET /api/captures/{id}", f"/api/captures/{made['id']}")
+        log.ask("GET /api/captures/{id}", f"/api/captures/{UNKNOWN_CAPTURE}")
+        for name in ("picture.png", "raw.tiff", "dark.tiff", "report.json", "quick.jpg"):
+            log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/{name}")
+        log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/other.png")
+        log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/RAW.TIFF")
+        log.events(
+            lambda event: event["event"] == "state" and event["data"] == {"state": "aim"} and int(event["id"]) > 2, 0
+        )
+        log.ask("GET /api/events", headers={"Last-Event-ID": "yesterday"})
+        log.ask_for_live("GET /api/preview", "/api/preview?after=0&eye=OD")
+        log.ask("GET /api/preview", "/api/preview?after=-1")
+        log.ask("GET /api/preview", "/api/preview?eye=left")
+        log.ask("GET /api/preview", headers={"Sec-Fetch-Site": "cross-site"})
+        _failures(log, made["id"])
+        return log.exchanges
+
+
+def _failures(log: Transcript, id: str) -> None:
+    """What a press, the status and the checks answer after a camera fails, and after a file is damaged."""
+    until(lambda: bool(log.instrument.owner.findings))
+    log.ask("GET /api/health")
+    (camera,) = log.instrument.cameras
+    camera.broken = True
+    log.ask("POST /api/captures", json={"eye": "OD"}, note="the camera was unplugged")
+    camera.broken = False
+    (log.instrument.store.folder / "captures" / id / "picture.png").write_bytes(b"not what was stored")
+    log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{id}/picture.png", note="the file was changed on the disk")
+
+
+def visits() -> list[dict[str, Any]]:
+    """A visit from its number to its outcome, the right to take pictures, and every refusal of the two."""
+    with instrument() as device:
+        log = Transcript(device)
+        log.ask("GET /api/protocol")
+        begin = log.key()
+        visit = log.ask("POST /api/visits", json=begin)
+        log.ask("POST /api/visits", json=begin, note="the same key again: the same visit")
+        log.ask("POST /api/visits", json=log.key(number="A00010"), note="a wrong check digit")
+        log.ask("POST /api/visits", json={"key": "short"})
+        at = f"/api/visits/{visit['id']}"
+        press = {"eye": "OD", "visit": visit["id"], "slot": "R-centre"}
+        log.ask("POST /api/captures", json=log.key(**press), note="no consent is recorded")
+        log.ask("GET /api/preview", f"/api/preview?visit={visit['id']}", note="no consent is recorded")
+        _answers(log, at)
+        first = log.ask("POST /api/captures", json=log.key(**press))
+        second = log.ask("POST /api/captures", json=log.key(**press), note="a retake")
+        log.ask("POST /api/captures", json=log.key(**press | {"eye": "OS"}), note="the slot is of the other eye")
+        log.ask("POST /api/captures", json=log.key(**press | {"slot": "nose"}))
+        log.ask_for_live("GET /api/preview", f"/api/preview?eye=OD&visit={visit['id']}")
+        _slots(log, at, first["id"], second["id"])
+        _listing(log, visit)
+        _ends(log, at, visit["id"])
+        _controllers(log)
+        return log.exchanges
+
+
+def _answers(log: Transcript, at: str) -> None:
+    fields = {
+        "name": "Meena K.",
+        "village": "Nowhere",
+        "phone": "12345",
+        "age": 54,
+        "sex": "woman",
+        "vision_od": "6/12",
+    }
+    answer = "PATCH /api/visits/{id}"
+    for name, value in fields.items():
+        log.ask(answer, at, json=log.key(field=name, value=value))
+    log.ask(answer, at, json=log.key(field="consent", value="declined"))
+    log.ask("GET /api/preview", f"/api/preview?visit={at.rsplit('/', 1)[1]}", note="consent was declined")
+    log.ask(answer, at, json=log.key(field="consent", value="agreed"))
+    log.ask(answer, at, json=log.key(field="phone", value=None), note="an answer is taken back")
+    log.ask(answer, at, json=log.key(field="age", value=-1))
+    log.ask(answer, at, json=log.key(field="shoe size", value=42))
+    log.ask(answer, f"/api/visits/{UNKNOWN_VISIT}", json=log.key(field="age", value=1))
+
+
+def _slots(log: Transcript, at: str, first: str, second: str) -> None:
+    """Which capture stands for a slot, which eye it shows, and why a picture could not be taken."""
+    log.ask("POST /api/captures/{id}/keep", f"/api/captures/{first}/keep", json=log.key())
+    log.ask("POST /api/captures/{id}/keep", f"/api/captures/{UNKNOWN_CAPTURE}/keep", json=log.key())
+    log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=None))
+    log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=second))
+    log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=UNKNOWN_CAPTURE))
+    log.ask("POST /api/captures/{id}/eye", f"/api/captures/{first}/eye", json=log.key(eye="OS"))
+    log.ask("POST /api/captures/{id}/eye", f"/api/captures/{first}/eye", json=log.key(eye="left"))
+    log.ask("POST /api/captures/{id}/eye", f"/api/captures/{UNKNOWN_CAPTURE}/eye", json=log.key(eye="OS"))
+    log.ask("POST /api/visits/{id}/could-not", f"{at}/could-not", json=log.key(slot="L-nerve", reason="lids"))
+    log.ask("POST /api/visits/{id}/could-not", f"{at}/could-not", json=log.key(slot="L-nerve", reason="boredom"))
+
+
+def _listing(log: Transcript, visit: dict[str, Any]) -> None:
+    log.ask("GET /api/visits")
+    log.ask("GET /api/visits", f"/api/visits?day={visit['day']}&open=true&q={visit['number']}&limit=1")
+    log.ask("GET /api/visits", "/api/visits?day=yesterday")
+    log.ask("GET /api/visits", "/api/visits?q=%25")
+    log.ask("GET /api/visits/{id}", f"/api/visits/{visit['id']}")
+    log.ask("GET /api/visits/{id}", f"/api/visits/{UNKNOWN_VISIT}")
+
+
+def _ends(log: Transcript, at: str, id: str) -> None:
+    """Finish, what a finished visit refuses, and the undo until the end of the day."""
+    finish, reopen = "POST /api/visits/{id}/finish", "POST /api/visits/{id}/reopen"
+    order = log.key()
+    log.ask(finish, f"{at}/finish", json=order)
+    log.ask(finish, f"{at}/finish", json=order, note="the same key again")
+    log.ask(finish, f"/api/visits/{UNKNOWN_VISIT}/finish", json=log.key())
+    log.ask("PATCH /api/visits/{id}", at, json=log.key(field="age", value=55), note="the visit is finished")
+    log.ask("POST /api/captures", json=log.key(eye="OD", visit=id, slot="R-centre"), note="the visit is finished")
+    log.ask(reopen, f"{at}/reopen", json=log.key())
+    log.ask(finish, f"{at}/finish", json=log.key())
+    log.instrument.clock.elapsed_s += 3 * 86400
+    log.ask(reopen, f"{at}/reopen", json=log.key(), note="three days later")
+
+
+def _controllers(log: Transcript) -> None:
+    """The right to take pictures: two screens, one of them holds it."""
+    mine, other = {"key": "00000000000000aa"}, {"key": "00000000000000bb"}
+    log.ask("POST /api/controller", json=mine)
+    log.ask("POST /api/controller", json=other, note="another screen holds it")
+    log.ask("POST /api/visits", json=log.key(), headers={"X-Controller": other["key"]})
+    log.ask("POST /api/controller", json=other | {"take": True})
+    log.ask("POST /api/controller", json=other | {"release": True})
+    log.ask("POST /api/controller", json={"take": True})
+
+
+def exports() -> list[dict[str, Any]]:
+    """Ways to take a visit away: a ZIP file, a copy on a USB stick, and the diary."""
+    with instrument() as device:
+        log = Transcript(device)
+        visit = _finished_visit(log)
+        log.exchanges.clear()
+        log.ask("GET /api/exports")
+        log.ask("GET /api/visits/{id}/export.zip", f"/api/visits/{visit}/export.zip")
+        log.ask("GET /api/visits/{id}/export.zip", f"/api/visits/{UNKNOWN_VISIT}/export.zip")
+        copy, at = "POST /api/visits/{id}/export", f"/api/visits/{visit}/export"
+        order = log.key(folder=str(device.stick))
+        log.ask(copy, at, json=order)
+        log.ask(copy, at, json=order, note="the same key again: no second copy")
+        log.ask(copy, at, json=log.key(folder=str(device.stick)), note="a second copy")
+        log.ask(copy, at, json=log.key(folder="/etc"))
+        log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=str(device.stick)))
+        _diary(log)
+        return log.exchanges
+
+
+def _diary(log: Transcript) -> None:
+    paths = ("/api/technician/diary", "/api/technician/diary.txt")
+    for path in paths:
+        log.ask(f"GET {path}", note="nobody is logged in")
+    export = "POST /api/technician/diary/export"
+    log.ask(export, json={"folder": str(log.instrument.stick)}, note="nobody is logged in")
+    log.ask("POST /api/technician/pin", json=PIN)
+    for path in paths:
+        log.ask(f"GET {path}")
+    log.ask("GET /api/technician/diary", "/api/technician/diary?limit=0")
+    log.ask(export, json={"folder": str(log.instrument.stick)})
+    log.ask(export, json={"folder": "/etc"})
+
+
+def _finished_visit(log: Transcript) -> str:
+    visit: str = log.ask("POST /api/visits", json=log.key())["id"]
+    at = f"/api/visits/{visit}"
+    for name, value in {"consent": "agreed", "name": "Meena K.", "age": 54}.items():
+        log.ask("PATCH /api/visits/{id}", at, json=log.key(field=name, value=value))
+    log.ask("POST /api/captures", json=log.key(eye="OD", visit=visit, slot="R-centre"))
+    log.ask("POST /api/visits/{id}/finish", f"{at}/finish", json=log.key())
+    return visit
+
+
+def technician() -> list[dict[str, Any]]:
+    """The PIN: first choice, wrong tries and their waits, logging out, and the time-out."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        log.ask("GET /api/technician")
+        log.ask("POST /api/technician/unlock", json=PIN, note="no PIN was ever set")
+        log.ask("POST /api/technician/pin", json={"pin": "12"})
+        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("GET /api/technician")
+        log.ask("POST /api/technician/here")
+        log.ask("POST /api/technician/lock")
+        log.ask("POST /api/technician/lock", note="nobody is logged in")
+        log.ask("POST /api/technician/here", note="nobody is logged in")
+        log.ask("POST /api/technician/pin", json={"pin": "1111"}, note="nobody is logged in, and there is a PIN")
+        log.ask("POST /api/technician/unlock", json={"pin": "1111"})
+        log.ask("POST /api/technician/unlock", json=PIN, note="too soon after a wrong PIN")
+        log.ask("POST /api/technician/unlock", json={"pin": "1" * 41})
+        device.clock.elapsed_s += 2
+        log.ask("POST /api/technician/unlock", json=PIN)
+        device.clock.elapsed_s += 400
+        log.ask("POST /api/technician/here", note="after the time-out")
+        log.ask("GET /api/technician", note="after the time-out")
+        return log.exchanges
+
+
+def calibration() -> list[dict[str, Any]]:
+    """Two calibrations of a head that has none: each step, a mishap, a stop, the way back to the first."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        log.ask("GET /api/status", note="without a calibration")
+        log.ask("POST /api/captures", json={"eye": "OD"}, note="without a calibration")
+        locked = {"": {"by": "Eve"}, "/ready": {"stand": "cap"}, "/cancel": {}, "/use": {"id": "0" * 16}}
+        for path, body in locked.items():
+            log.ask(f"POST /api/calibration{path}", json=body, note="nobody is logged in")
+        for path in ("", "/preview"):
+            log.ask(f"GET /api/calibration{path}", note="nobody is logged in")
+        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("GET /api/calibration")
+        log.ask("GET /api/calibration/preview", note="nothing is being calibrated")
+        log.ask("GET /api/calibration/preview", "/api/calibration/preview?after=-1")
+        log.ask("POST /api/calibration", json={"by": ""})
+        made = _calibrated(log)
+        use = "POST /api/calibration/use"
+        log.ask(use, json={"id": made}, racing=("state",))
+        log.ask(use, json={"id": "0" * 16})
+        log.ask(use, json={"id": "../data"})
+        _stopped(log)
+        return log.exchanges
+
+
+def _calibrated(log: Transcript) -> str:
+    """Measure every step, the first one twice because the lamp is on the first time; the id of the result."""
+    ready = "POST /api/calibration/ready"
+    _settled(log, "begin")
+    log.ask("POST /api/calibration", json={"by": "Ada"}, racing=RACING)
+    _settled(log, "asking")
+    log.ask(ready, json={"stand": "point"}, note="another step is under way")
+    log.ask("POST /api/calibration", json={"by": "Bob"}, note="another calibration is under way")
+    log.ask(ready, json={"stand": "cap", "mishap": "lamp on"}, racing=RACING)
+    _settled(log, "asking", failed=True)
+    log.ask("GET /api/calibration", note="the step failed, and is asked for again", racing=("progress",))
+    log.ask_for_live("GET /api/calibration/preview")
+    for stand in STANDS:
+        _settled(log, "asking", stand=stand)
+        assert log.instrument.send("POST", "/api/calibration/ready", json={"stand": stand}).status_code == 200
+    _settled(log, "idle")
+    log.ask("GET /api/calibration", note="measured and in force")
+    made: str = log.instrument.send("GET", "/api/calibration").json()["made"]["id"]
+    return made
+
+
+def _stopped(log: Transcript) -> None:
+    _settled(log, "idle")
+    log.ask("POST /api/calibration/ready", json={"stand": "cap"}, note="nothing is being calibrated")
+    log.ask("POST /api/calibration", json={"by": "Ada"}, racing=RACING)
+    _settled(log, "asking")
+    log.ask("POST /api/captures", json={"eye": "OD"}, note="the technician has the head")
+    log.ask("POST /api/calibration/ready", json={"stand": "cap", "mishap": "earthquake"})
+    log.ask("GET /api/status", note="the technician has the head")
+    log.ask("GET /api/health", note="the technician has the head")
+    log.ask("POST /api/calibration/cancel", racing=("state",))
+
+
+def _settled(log: Transcript, state: str, stand: str | None = None, failed: bool = False) -> None:
+    """Wait, in real time, until the thread that owns the head is in this state."""
+
+    def is_there() -> bool:
+        said = log.instrument.send("GET", "/api/calibration").json()
+        return said["state"] == state and stand in (None, said["stand"]) and (said["error"] is not None or not failed)
+
+    until(is_there)
+
+
+def updates() -> list[dict[str, Any]]:
+    """An update from a USB stick and one from a tablet, with the updater and its stand-in for RAUC."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        for call, body in {"GET ": None, "POST /check": None, "POST /restart": None}.items():
+            method, path = call.split(" ")
+            log.ask(
+                f"{method} /api/update{path}", note="nobody is logged in", **({} if body is None else {"json": body})
+            )
+        log.ask("POST /api/update/install", json={"id": "0" * 16}, note="nobody is logged in")
+        log.ask("PUT /api/update/file", content=b"x", note="nobody is logged in")
+        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("GET /api/update")
+        device.board.bundle("two.raucb", padding_bytes=1000)
+        device.board.bundle("foreign.raucb", signer="a stranger", padding_bytes=1000)
+        log.ask("POST /api/update/check")
+        log.ask("POST /api/update/restart", note="another request waits")
+        device.board.updater("1.0").answer()
+        found = log.ask("GET /api/update", note="what was found")["found"]
+        log.ask("POST /api/update/install", json={"id": "two"})
+        (two,) = [one["id"] for one in found if one["name"] == "two.raucb"]
+        log.ask("POST /api/update/install", json={"id": two})
+        log.ask("POST /api/update/check", note="another request waits")
+        device.board.updater("1.0", restart=("true",)).answer()
+        log.ask("GET /api/update", note="installed, and restarting")
+        log.ask("PUT /api/update/file", content=b"whole", note="while it restarts")
+        return log.exchanges
+
+
+def tablets() -> list[dict[str, Any]]:
+    """Files that a tablet sends, an installed update that is tried later, and a computer without an updater."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("PUT /api/update/file", content=b"no bundle")
+        log.ask("PUT /api/update/file", content=b"", headers={"Content-Length": "0"})
+        log.ask("PUT /api/update/file", content=b"half", headers={"Content-Length": "8"})
+        log.ask("POST /api/update/check", content=b"x" * 20_000)
+        bundle = device.board.bundle("two.raucb", padding_bytes=1000)
+        device.board.updater("1.0").install(bundle, restart=False)
+        log.ask("GET /api/update", note="installed, and not tried yet")
+        log.ask("POST /api/update/restart")
+        for folder in (device.board.wishes, device.board.state):
+            folder.rename(folder.with_name(f"{folder.name}.gone"))
+        log.ask("GET /api/update", note="no updater")
+        log.ask("POST /api/update/restart", note="no updater")
+        return log.exchanges
+
+
+def outbox() -> list[dict[str, Any]]:
+    """The upload queue: not set up, a visit that waits, one that the receiver refuses, one that arrived."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        log.ask("GET /api/outbox", note="no receiver is set up")
+        log.ask("POST /api/outbox/try", json=log.key(), note="no receiver is set up")
+        first = log.exchanges
+    receiver = Refusing()
+    with instrument(carrier=receiver) as device:
+        log = Transcript(device)
+        _finished_visit(log)
+        log.exchanges.clear()
+        device.clock.elapsed_s += FIRST_S
+        log.ask("GET /api/outbox", note="one visit waits")
+        sender = device.app.state.notices.sender
+        assert sender.step()
+        log.ask("GET /api/outbox", note="the receiver refused it")
+        log.ask("GET /api/status", note="the receiver refused it")
+        log.ask("POST /api/outbox/try", json=log.key(visit="no such/visit"))
+        log.ask("POST /api/outbox/try", json=log.key())
+        receiver.refuses = False
+        assert sender.step()
+        log.ask("GET /api/outbox", note="it arrived")
+        return first + log.exchanges
+
+
+def explorer() -> list[dict[str, Any]]:
+    """Accuracy against time: measured, chosen, and a capture that another method makes again."""
+    with instrument() as device:
+        log = Transcript(device)
+        made = log.ask("POST /api/captures", json={"eye": "OD"})["id"]
+        log.exchanges.clear()
+        again, at = "GET /api/technician/captures/{id}/again.png", f"/api/technician/captures/{made}/again.png"
+        log.ask("GET /api/technician/explorer", note="nobody is logged in")
+        log.ask("POST /api/technician/explorer", note="nobody is logged in")
+        log.ask("PUT /api/technician/pace", json={"pace": "best"}, note="nobody is logged in")
+        log.ask(again, f"{at}?method=gradient", note="nobody is logged in")
+        log.ask("POST /api/technician/pin", json=PIN)
+        log.ask("GET /api/technician/explorer")
+        log.ask("PUT /api/technician/pace", json={"pace": "best"})
+        log.ask("PUT /api/technician/pace", json={"pace": "never"})
+        log.ask(again, f"{at}?method=gradient&bin=2&rounds=3")
+        log.ask(again, f"{at}?method=guess")
+        log.ask(again, f"{at}?method=gradient&bin=17")
+        log.ask(again, f"/api/technician/captures/{UNKNOWN_CAPTURE}/again.png?method=gradient")
+        log.ask("POST /api/technician/explorer", note="a measurement begins")
+        log.ask("POST /api/technician/explorer", note="a measurement is under way")
+        until(lambda: not device.explorer.state()["busy"])
+        log.ask("GET /api/technician/explorer", note="measured")
+        return log.exchanges
+
+
+def security() -> list[dict[str, Any]]:
+    """Who may ask, and how: host, origin, methods, paths, the pages; then every operation by a foreign host name."""
+    with instrument(calibrated_before=False) as device:
+        log = Transcript(device)
+        foreign, json_type = {"Host": "evil.example"}, {"Content-Type": "application/json"}
+        log.ask("GET /", note="the page")
+        log.ask("GET /technician", note="the page of the technician")
+        log.ask("GET /web/nowhere.js")
+        log.ask("GET /api/nowhere")
+        log.ask("DELETE /api/captures")
+        log.ask("POST /api/visits", json=log.key(), headers={"Origin": "http://evil.example"})
+        log.ask("POST /api/visits", json=log.key(), headers={"Origin": "http://eye.local"})
+        log.ask("POST /api/visits", content=b"{}", headers=json_type | {"Content-Length": "-1"})
+        for operation in operations(device.app.openapi()):
+            path = operation.split(" ")[1].format(id="x", name="x.png")
+            log.ask(operation, path, note="a foreign host name", headers=foreign)
+        return log.exchanges
+
+
+CHAPTERS: dict[str, Chapter] = {
+    one.__name__: one
+    for one in (captures, visits, exports, technician, calibration, updates, tablets, outbox, explorer, security)
+}
+
+
+def openapi() -> dict[str, Any]:
+    """Return the OpenAPI document as the application gives it, its version number replaced."""
+    with instrument(calibrated_before=False) as device:
+        document: dict[str, Any] = device.send("GET", "/api/openapi.json").json()
+    return document | {"info": document["info"] | {"version": "<version>"}}
+
+
+def operations(document: dict[str, Any]) -> list[str]:
+    """Return every operation of an OpenAPI document as `METHOD /path`."""
+    return [f"{method.upper()} {path}" for path, methods in document["paths"].items() for method in methods]
+
+
+def write() -> Path:
+    """Write the OpenAPI document and the transcript of every chapter."""
+    compare.write("openapi", openapi())
+    for name, chapter in CHAPTERS.items():
+        compare.write(f"http-{name}", chapter())
+    return compare.RECORDS

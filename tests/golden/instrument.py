@@ -1,0 +1,276 @@
+"""A complete simulated instrument behind the HTTP application: virtual time, temporary folders, no network."""
+
+import asyncio
+import io
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event
+from typing import Any
+
+import httpx
+import numpy as np
+from fastapi import FastAPI
+from numpy.typing import NDArray
+
+from device.calibration.archive import Archive
+from device.clock import VirtualClock
+from device.errors import CameraMissing, SendRejected
+from device.head import Bench, Head, open_bench, open_head
+from device.ports import Camera
+from device.spec import CalibrationTable, InstrumentSpec, load_head
+from device.values import Frame, Shot
+from services.instrument.api import create_app
+from services.instrument.bulletin import Bulletin
+from services.instrument.carrier import Carrier, Parcel
+from services.instrument.diary import Diary
+from services.instrument.diary_api import diary_routes
+from services.instrument.exam import Exam
+from services.instrument.explorer import Explorer
+from services.instrument.explorer_api import explorer_routes
+from services.instrument.exporting import Sticks
+from services.instrument.owner import House, Owner, archive_of, calibrated
+from services.instrument.technician import Door
+from services.instrument.updates_api import update_routes
+from services.instrument.updating import UpdateDesk
+from services.instrument.watchdog import Watchdog
+from services.records.light_book import LightBook
+from services.records.outbox import Receipt
+from services.records.store import Store
+from tests.updates import Board
+
+DAY_S = 86400.0
+PATIENCE_S = 120.0
+FREE_BYTES = 10**12
+HEAD = """\
+name = "Golden head"
+
+[camera]
+backend = "sim"
+rows = 136
+cols = 240
+pitch_um = 40.32
+full_well_e = 23000
+read_noise_e = 1.03
+
+[light]
+backend = "sim"
+
+[optics]
+iris_um = 3200
+diffuser_to_sensor_um = 6000
+angular_magnification = 0.75
+field_deg = 33.4
+
+[bus]
+backend = "sim"
+thermometer = 0x48
+battery = 0x36
+memory = 0x50
+
+[sim]
+
+[sim.object]
+haemorrhages = 3
+
+[sim.sensor]
+prnu = 0.01
+dsnu_e = 2.0
+hot_pixels = 0.0003
+"""
+Heard = Callable[[list[dict[str, Any]]], bool]
+
+
+@dataclass
+class BreakableCamera:
+    """A camera that answers no more while `broken`."""
+
+    inner: Camera
+    broken: bool = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.inner.shape
+
+    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
+        if self.broken:
+            raise CameraMissing("the camera was unplugged")
+        return self.inner.expose(shot, into)
+
+    def prepare(self, shot: Shot) -> None:
+        self.inner.prepare(shot)
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+@dataclass
+class Refusing:
+    """A receiver that refuses the next parcels while `refuses`."""
+
+    refuses: bool = True
+    kept: list[str] = field(default_factory=list)
+
+    def deliver(self, parcel: Parcel, pause: Callable[[], None]) -> Receipt:
+        if self.refuses:
+            raise SendRejected("the receiver answers 403 Forbidden")
+        self.kept.append(parcel.name)
+        return Receipt(parcel.sha256, "length")
+
+    def abort(self) -> None:
+        pass
+
+
+@dataclass
+class Instrument:
+    """The application and the parts that a transcript changes from outside."""
+
+    app: FastAPI
+    folder: Path
+    clock: VirtualClock
+    owner: Owner
+    store: Store
+    board: Board
+    cameras: list[BreakableCamera]
+    explorer: Explorer
+    cookies: httpx.Cookies = field(default_factory=httpx.Cookies)
+
+    @property
+    def stick(self) -> Path:
+        """The one USB stick that is present."""
+        return self.folder / "media" / "STICK"
+
+    def send(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """Send one request to the application in this process; keep its cookies."""
+        headers = {"Sec-Fetch-Site": "same-origin"} | options.pop("headers", {})
+
+        async def sent() -> httpx.Response:
+            transport = httpx.ASGITransport(app=self.app)
+            async with httpx.AsyncClient(
+                transport=transport, base_url="http://eye.local", cookies=self.cookies, timeout=60
+            ) as client:
+                answer = await client.request(method, path, headers=headers, **options)
+                self.cookies = client.cookies
+                return answer
+
+        return asyncio.run(sent())
+
+    def follow(self, enough: Heard, after: int | None = None) -> list[dict[str, Any]]:
+        """Read `/api/events` as a browser does, until `enough`; number, kind and data of each event."""
+        return asyncio.run(_followed(self.app, enough, after))
+
+
+async def _followed(app: FastAPI, enough: Heard, after: int | None) -> list[dict[str, Any]]:
+    done, heard, text = asyncio.Event(), list[dict[str, Any]](), io.StringIO()
+    last = [] if after is None else [(b"last-event-id", str(after).encode())]
+
+    async def receive() -> dict[str, Any]:
+        await done.wait()
+        return {"type": "http.disconnect"}
+
+    async def send(message: Any) -> None:
+        text.write(message.get("body", b"").decode())
+        heard[:] = [_parsed(block) for block in text.getvalue().split("\n\n")[:-1]]
+        if heard and enough(heard):
+            done.set()
+
+    scope = {
+        "type": "http", "asgi": {"version": "3.0", "spec_version": "2.3"}, "http_version": "1.1", "method": "GET",
+        "scheme": "http", "path": "/api/events", "raw_path": b"/api/events", "query_string": b"", "root_path": "",
+        "headers": [(b"host", b"eye.local"), *last], "server": ("eye.local", 80), "client": ("page", 1),
+    }  # fmt: skip
+    await asyncio.wait_for(app(scope, receive, send), 60)
+    return heard
+
+
+def _parsed(block: str) -> dict[str, Any]:
+    lines = dict(line.split(": ", 1) for line in block.splitlines())
+    return lines | {"data": json.loads(lines["data"])}
+
+
+@cache
+def _plans() -> TemporaryDirectory[str]:
+    """The folder of FFT plans, one for the process: measuring them takes seconds."""
+    return TemporaryDirectory()
+
+
+@contextmanager
+def instrument(calibrated_before: bool = True, carrier: Carrier | None = None) -> Iterator[Instrument]:
+    """Build an instrument in a temporary folder, with every room of `diffuscope run`; close it at the end.
+
+    With `calibrated_before` false the head file names an archive of calibrations that is empty: no picture can be
+    taken, and the instrument is there at once.
+    """
+    with TemporaryDirectory() as temporary, ExitStack() as undo:
+        folder, clock = Path(temporary).resolve(), VirtualClock()
+        (folder / "head.toml").write_text(HEAD)
+        spec = load_head(folder / "head.toml")
+        if not calibrated_before:
+            spec = spec.model_copy(update={"calibration": CalibrationTable(archive=folder / "archive")})
+        store = undo.enter_context(
+            Store(folder / "data", clock=clock, reserve_bytes=0, free_bytes=lambda _: FREE_BYTES)
+        )
+        owner, cameras, explorer = _owner(folder, spec, clock, store, undo)
+        undo.callback(owner.close)
+        sticks, board = _sticks(folder), Board.new(folder / "board")
+        door = Door(folder / "technician.json", clock)
+        diary = Diary(folder / "diary")
+        undo.callback(diary.close)
+        desk = UpdateDesk(board.state, board.wishes, clock, "1.0")
+        rooms = [
+            explorer_routes(explorer, store, lambda: owner.exam.head.calibration),
+            update_routes(desk, door),
+            diary_routes(diary, sticks, clock),
+        ]
+        app = create_app(owner, door, names=("eye.local",), sticks=sticks, rooms=rooms, carrier=carrier)
+        if calibrated_before:
+            assert owner.exam.ready.wait(120)
+        yield Instrument(app, folder, clock, owner, store, board, cameras, explorer)
+
+
+def _owner(
+    folder: Path, spec: InstrumentSpec, clock: VirtualClock, store: Store, undo: ExitStack
+) -> tuple[Owner, list[BreakableCamera], Explorer]:
+    root, bulletin, cameras, benches = archive_of(spec, folder), Bulletin(), list[BreakableCamera](), list[Bench]()
+    plans = Path(_plans().name)
+    house = House(spec, Archive(root), store, bulletin, clock, Watchdog(None), Event().set)
+    book = LightBook(store.engine, clock, DAY_S, boot="once")
+    coarse = spec.camera.model_copy(update={"rows": 68, "cols": 120, "pitch_um": 2 * spec.camera.pitch_um})
+    measured = spec.model_copy(update={"camera": coarse})  # by the explorer: a quarter of the time
+    explorer = Explorer(folder / "explorer", plans, clock, measured, bulletin.tell)
+
+    def exam() -> Exam:
+        head: Head = open_head(calibrated(spec, root), clock, book)
+        cameras.append(BreakableCamera(head.camera))
+        return Exam(
+            replace(head, camera=cameras[-1]), store, bulletin, clock, plans, house.died, Watchdog(None),
+            lambda: explorer.budget_s,
+        )  # fmt: skip
+
+    def bench() -> Bench:
+        benches.append(opened := open_bench(spec, clock))
+        assert opened.world is not None
+        opened.world.frames = 1000 * len(benches)  # the noise of a second calibration differs from that of the first
+        return opened
+
+    return Owner(house, exam, bench), cameras, explorer
+
+
+def _sticks(folder: Path) -> Sticks:
+    stick, mounts = folder / "media" / "STICK", folder / "mounts"
+    stick.mkdir(parents=True)
+    mounts.write_text(f"proc /proc proc rw 0 0\n/dev/sda1 {stick} vfat rw 0 0\n")
+    return Sticks((folder / "media",), mounts)
+
+
+def until(holds: Callable[[], bool]) -> None:
+    """Wait in real time, for another thread; fails after PATIENCE_S."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < end_s, "it did not happen"
+        time.sleep(0.02)

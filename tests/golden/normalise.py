@@ -1,0 +1,67 @@
+"""Replacement of what differs from run to run (names, times, measured numbers, digests, paths) by placeholders."""
+
+import re
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+TIME = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:\+\d\d:\d\d|Z)?"
+NAMED = (  # a name is numbered by its first appearance, so that equal names stay equal
+    ("capture", r"\b\d{8}T\d{6}-O[DS]-[0-9a-f]{6}\b"),
+    ("visit", r"\b\d{8}T\d{6}-[0-9a-f]{6}\b"),
+    ("id", r"\b(?!0{8})[0-9a-f]{16}\b"),
+)
+MEASURED = {"report", "numbers", "verdict", "measured", "found", "x-aim"}  # floats below these keys are results
+COUNTS = {"free_bytes", "size_bytes", "space_left", "people_left", "takes_s", "took_s", "left_s", "spent_s"}
+TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # what the explorer concludes from times of the computer
+OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer that runs them
+
+
+class Normaliser:
+    """Placeholders for one transcript; `folder` is its temporary folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = str(folder)
+        self._names: dict[str, str] = {}
+        self._counts: dict[str, int] = {}
+
+    def text(self, said: str) -> str:
+        """Return a text with its names, times and paths replaced."""
+        said = said.replace(self._folder, "<folder>")
+        for kind, pattern in NAMED:
+            said = re.sub(pattern, self._numbered(kind), said)
+        said = re.sub(r"\b[0-9a-f]{64}\b", "<sha256>", said)
+        said = re.sub(r"/web/[0-9a-f]{12}/", "/web/<mark>/", said)
+        said = re.sub(r"technician=[\w-]{20,}", "technician=<token>", said)
+        said = re.sub(TIME, "<time>", said)
+        return re.sub(r"\b\d{4}-\d\d-\d\d( \d\d:\d\d)?\b", "<date>", said)
+
+    def json(self, value: Any, key: str = "", measured: bool = False) -> Any:
+        """Return a JSON value with its texts, and the floats that were measured, replaced."""
+        measured = measured or key in MEASURED
+        if isinstance(value, str):
+            said = "<version>" if value == version("diffuscope") else self.text(value)
+            return re.sub(r"-?\d+\.\d+", "<number>", said) if measured else said
+        if key in TIMED:
+            return "<timed>"
+        if isinstance(value, list | tuple):
+            return [self.json(one, key, measured) for one in value]
+        if isinstance(value, Mapping):
+            if "unit" in value and "limit" in value:  # a finding about the calibration
+                value = value | {"value": "<number>"}
+            if value.get("name") in OF_THE_COMPUTER and "limit" in value:
+                value = value | dict.fromkeys(("value", "known", "ok", "remedy"), "<of the computer>")
+            return {self.text(str(name)): self.json(one, str(name), measured) for name, one in value.items()}
+        if isinstance(value, bool) or value is None:
+            return value
+        return "<number>" if key in COUNTS or (measured and isinstance(value, float)) else value
+
+    def _numbered(self, kind: str) -> Callable[[re.Match[str]], str]:
+        def name(found: re.Match[str]) -> str:
+            if found[0] not in self._names:
+                self._counts[kind] = self._counts.get(kind, 0) + 1
+                self._names[found[0]] = f"<{kind} {self._counts[kind]}>"
+            return self._names[found[0]]
+
+        return name

@@ -1,0 +1,33 @@
+"""The command line, and the codes and sentences of the sources, are as recorded."""
+
+from typing import Any
+
+import pytest
+
+from tests.golden import command_line, compare, error_codes
+
+
+@pytest.fixture(scope="module")
+def present() -> dict[str, Any]:
+    """What the command line says now: one process for all tests."""
+    return command_line.record()
+
+
+@pytest.mark.parametrize("part", ["help", "calls", "programs"])
+def test_the_command_line_is_as_recorded(part: str, present: dict[str, Any]) -> None:
+    difference = compare.difference(compare.read("command-line")[part], present[part])
+    assert not difference, difference
+
+
+def test_every_command_is_called_well_or_badly() -> None:
+    recorded = compare.read("command-line")
+    calls = [f"{one['call']} " for one in recorded["calls"]]
+    leaves = [name for name in recorded["help"] if not any(other.startswith(f"{name} ") for other in recorded["help"])]
+    called = [name for name in leaves if any(call.startswith(f"{name} ") for call in calls)]
+    assert called == leaves
+
+
+@pytest.mark.parametrize("part", ["errors", "codes", "sentences"])
+def test_codes_and_sentences_are_as_recorded(part: str) -> None:
+    difference = compare.difference(compare.read("errors")[part], error_codes.record()[part])
+    assert not difference, difference
