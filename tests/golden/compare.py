@@ -1,0 +1,49 @@
+"""JSON records on disk, and a readable difference between a record and the present result."""
+
+import difflib
+import json
+from pathlib import Path
+from typing import Any
+
+RECORDS = Path(__file__).parent / "records"
+MOST_LINES = 60  # of a difference that is printed
+
+
+def as_text(record: Any) -> str:
+    """Return a record as indented JSON with sorted keys; lists and tuples of plain values stay on one line."""
+    return "".join(_lines(record, 0)) + "\n"
+
+
+def write(name: str, record: Any) -> None:
+    """Write a record as `records/NAME.json`."""
+    RECORDS.mkdir(exist_ok=True)
+    (RECORDS / f"{name}.json").write_text(as_text(record), encoding="utf-8")
+
+
+def read(name: str) -> Any:
+    """Read `records/NAME.json`."""
+    return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def difference(recorded: Any, present: Any) -> str:
+    """Return a unified diff of two records, at most MOST_LINES long; empty where they are equal."""
+    texts = [as_text(one).splitlines() for one in (recorded, json.loads(json.dumps(present)))]
+    lines = list(difflib.unified_diff(*texts, "recorded", "present", lineterm="", n=2))
+    more = [f"... and {len(lines) - MOST_LINES} lines more"] if len(lines) > MOST_LINES else []
+    return "\n".join(lines[:MOST_LINES] + more)
+
+
+def _lines(value: Any, depth: int) -> list[str]:
+    """Return the pieces of a value's text; a value that fits into one line is not broken."""
+    flat = json.dumps(value, ensure_ascii=False, sort_keys=True)
+    if not isinstance(value, dict | list | tuple) or not value or len(flat) + depth <= 116:
+        return [flat]
+    pad, end = " " * (depth + 1), " " * depth
+    if isinstance(value, dict):
+        inner = [
+            f"{pad}{json.dumps(str(key), ensure_ascii=False)}: {''.join(_lines(value[key], depth + 1))}"
+            for key in sorted(value)
+        ]
+        return ["{\n", ",\n".join(inner), f"\n{end}}}"]
+    inner = [f"{pad}{''.join(_lines(one, depth + 1))}" for one in value]
+    return ["[\n", ",\n".join(inner), f"\n{end}]"]
