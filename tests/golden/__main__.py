@@ -9,10 +9,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.golden import mutants, scenes
+from tests.golden import bus, exam, files, mutants, scenes
 
 RECORDS: dict[str, Callable[[], Path]] = {
     "scenes": scenes.write,
+    "exam": exam.write,
+    "bus": bus.write,
+    "files": files.write,
 }
 
 
