@@ -180,12 +180,12 @@ def press(stage: Stage) -> None:
 def press_while_aiming(stage: Stage) -> None:
     """Live pictures in red, then a press after one second of them."""
     stage.soon(lambda: stage.press("OS"), 1.0)
-    assert stage.rig.exam.preview(0) is not None
+    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
 
 
 def aiming_ends(stage: Stage) -> None:
     """Live pictures go on for as long as they are wanted, and end by themselves."""
-    assert stage.rig.exam.preview(0) is not None
+    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
 
 
 def press_during_refinement(stage: Stage) -> None:
@@ -269,7 +269,7 @@ def sigterm_during_exposure(stage: Stage) -> None:
 def sigterm_while_aiming(stage: Stage) -> None:
     """SIGTERM in the midst of a live picture."""
     stage.soon(stage.close, 0.02)
-    stage.rig.exam.preview(0)
+    stage.rig.exam.preview(0, wait_s=PATIENCE_S)
 
 
 def head_lost(stage: Stage) -> None:
