@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-mutants bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -52,6 +52,9 @@ test-systemd: .venv/ready ## Boot a real systemd in a container and try the unit
 # verity needs device-mapper where it is installed; FORMAT=plain is for trying out, on devices that were built with it.
 FORMAT ?= verity
 KEYS ?= out/keys
+
+test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store and exam against seeded mutants; ten minutes, not in CI.
+	@$(BIN)/python -m tests.golden mutants
 
 bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORMAT=plain, ARCH=arm64.
 	@systemd/image/install $(ARCH)

@@ -1,7 +1,7 @@
 """Program of the golden records.
 
-    python -m tests.golden write [NAME ...]       write these records anew (all, without a name)
-    python -m tests.golden mutants [--only N]     apply each seeded mutant to a copy of the tree and run its tests
+python -m tests.golden write [NAME ...]       write these records anew (all, without a name)
+python -m tests.golden mutants [--only N]     apply each seeded mutant to a copy of the tree and run its tests
 """
 
 import argparse

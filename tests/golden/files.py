@@ -1,13 +1,13 @@
 """Record of files: a data folder, calibrations, a signed file, an export, settings and journals, kept as written.
 
-    kept/data/              the instrument's data folder: store, dose ledger, journal of interrupted captures, settings
-    kept/calibrations/      two calibrations
-    kept/sent.calibration   one of them as a signed file; key, key.pub are those of this record alone
-    kept/export.zip         a visit as it is downloaded
-    kept/send.toml          settings of the upload
-    kept/update/            the state of an update
-    records/files.json      what is read from all of these
-    records/schema.sql      the tables
+kept/data/              the instrument's data folder: store, dose ledger, journal of interrupted captures, settings
+kept/calibrations/      two calibrations
+kept/sent.calibration   one of them as a signed file; key, key.pub are those of this record alone
+kept/export.zip         a visit as it is downloaded
+kept/send.toml          settings of the upload
+kept/update/            the state of an update
+records/files.json      what is read from all of these
+records/schema.sql      the tables
 """
 
 import hashlib
@@ -38,7 +38,7 @@ from services.records.people import People
 from services.records.protocol import load_protocol
 from services.records.store import Store
 from services.records.underway import Lost, Underway
-from services.records.update_notes import Trouble, read_entry, write_entry
+from services.records.update_notes import JOURNAL, Trouble, read_entry, write_entry
 from services.update.journal import Journal
 from tests.golden import compare
 from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, traced, until
@@ -276,7 +276,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),
         "export": zip_bytes == (folder / "export.zip").read_bytes(),
         "journal of interrupted captures": journal,
-        "state of an update": next(place.glob("*.json")).read_bytes() == next((folder / "update").iterdir()).read_bytes(),
+        "state of an update": (place / JOURNAL).read_bytes() == (folder / "update" / JOURNAL).read_bytes(),
     }
 
 
