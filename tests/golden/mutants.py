@@ -87,7 +87,7 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(STORE, "            self._refuse_twice(part, kept)\n", "", T_RECORDS),
     Mutant(STORE, "< need_bytes + self._reserve_bytes:", "< need_bytes:", T_RECORDS),
     Mutant(STORE, "if limit < 1:", "if limit < 0:", T_RECORDS),
-    Mutant(STORE, "None if before is None else _row(session, before).kept", "None", T_RECORDS),
+    Mutant(STORE, "before).kept)", "before).kept - 1)", T_RECORDS),
     Mutant(
         STORE, 'if stray.name.startswith(".") or not _is_whole(stray)]',
         'if stray.name.startswith(".")]', T_RECORDS,
