@@ -118,7 +118,7 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(
         EXAM, " or self._in_the_making == SEATS",
-        "", exam("test_a_third_press_is_refused_while_two_pictures_are_made"),
+        "", exam("test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made"),
     ),
     Mutant(
         EXAM, "self._pressed.remember(key, self._press)",
