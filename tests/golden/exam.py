@@ -26,7 +26,7 @@ from tests.journey.test_exam import Astonishing
 
 CAPTURE = re.compile(r"\d{8}T\d{6}-(?:OD|OS)-[0-9a-f]{6}")
 KEY = "0123456789abcdef"
-PATIENCE_S = 60.0
+PATIENCE_S = 150.0  # the first picture may have to compile the kernels
 
 
 @dataclass
