@@ -138,6 +138,11 @@ class Stage:
         """Break parts of the simulated head from now on."""
         self.rig.world.faults.update(faults)
 
+    def add_journal(self) -> None:
+        """Add what the journal of interrupted captures holds now to the trace."""
+        notes = sorted((self.rig.store.folder / "underway").iterdir())
+        self.trace.add(journal=[json.loads(path.read_bytes()) for path in notes])
+
     def close(self) -> None:
         """Close as the server does after SIGTERM, from another thread, and go on once the exam knows of it."""
         self.closing = Thread(target=self.rig.owner.close, name="closing", daemon=True)
@@ -173,7 +178,8 @@ def refusal(error: BaseException) -> dict[str, Any]:
 
 
 def press(stage: Stage) -> None:
-    """One press of the right eye."""
+    """One press of the right eye; while it is exposed, the journal of interrupted captures names it."""
+    stage.soon(stage.add_journal)
     stage.press("OD", KEY)
 
 
