@@ -119,6 +119,7 @@ class Stage:
     trace: Trace
     answers: list[Any] = field(default_factory=list)
     closing: Thread | None = None
+    aims_until_s: float = 0.0
 
     def press(self, eye: Eye, key: str | None = None, errand: Errand | None = None) -> Any:
         """Press, and remember the future or the refusal."""
@@ -162,7 +163,7 @@ class Stage:
 def rests(stage: Stage) -> bool:
     """Return whether nothing is pressed, aimed at or looked at any more."""
     exam, before = stage.rig.exam, stage.clock.now_s()
-    if exam.state != "aim" or exam.fitness.due or stage.rig.world.glow is not None:
+    if exam.state != "aim" or exam.fitness.due or stage.rig.world.glow is not None or before < stage.aims_until_s:
         return False
     sleep(0.1)
     return exam.state == "aim" and not exam.fitness.due and stage.clock.now_s() == before
@@ -191,6 +192,7 @@ def press_while_aiming(stage: Stage) -> None:
 
 def aiming_ends(stage: Stage) -> None:
     """Live pictures go on for as long as they are wanted, and end by themselves."""
+    stage.aims_until_s = 3.09  # within the pause after the last one
     assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
 
 
@@ -340,6 +342,7 @@ def watched(spec: InstrumentSpec) -> tuple[World, Calibration]:
 
 def play(stage: Stage, name: str) -> dict[str, Any]:
     """Run one scenario and return its trace and the state after it; captures are named by their order."""
+    until(lambda: bool(stage.trace.entries), PATIENCE_S)  # its first state: the exam is ready a little before
     SCENARIOS[name](stage)
     stage.settle()
     rig = stage.rig

@@ -34,6 +34,11 @@ def exam(name: str) -> str:
     return f"{T_EXAM}::{name}"
 
 
+def scenario(name: str) -> str:
+    """Return one scenario of the exam's record."""
+    return f"{T_TRACE}::test_a_scenario_is_as_recorded[{name}]"
+
+
 class Mutant(NamedTuple):
     """One changed place: a file, its exact old text, the new text, and what pytest is asked to run."""
 
@@ -142,18 +147,24 @@ MUTANTS: tuple[Mutant, ...] = (
         EXAM, "made = unmade(shot.frame, error)",
         "raise", exam("test_a_shot_of_which_no_picture_can_be_made_is_kept_as_it_is"),
     ),
-    Mutant(EXAM, "            self._over(id, kept=False)\n", "", T_TRACE),
-    Mutant(EXAM, "            self.underway.begin(press.under_way(id), press.key)\n", "", T_TRACE),
-    Mutant(EXAM, "self._wanted_until_s = 0.0  # aiming is over", "pass  # aiming is over", T_TRACE),
-    Mutant(EXAM, "self._pause(2 * dark_s - self._preview.exposed_s - self.clock.now_s())", "self._pause(0.0)", T_TRACE),
+    Mutant(EXAM, "            self._over(id, kept=False)\n", "", scenario("camera_stalled")),
+    Mutant(EXAM, "            self.underway.begin(press.under_way(id), press.key)\n", "", scenario("press")),
+    Mutant(
+        EXAM, "self._wanted_until_s = 0.0  # aiming is over",
+        "pass  # aiming is over", scenario("press_while_aiming"),
+    ),
+    Mutant(
+        EXAM, "self._pause(2 * dark_s - self._preview.exposed_s - self.clock.now_s())",
+        "self._pause(0.0)", scenario("press_while_aiming"),
+    ),
     Mutant(EXAM, "            self._wanted = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
         EXPOSING, "    head.check()\n    shot = Shot(head.spec.camera.exposure_s)",
-        "    shot = Shot(head.spec.camera.exposure_s)", T_TRACE,
+        "    shot = Shot(head.spec.camera.exposure_s)", scenario("head_lost"),
     ),
     Mutant(
         EXPOSING, "head.light.on(Glow(head.spec.light.preview_colour), eyes)",
-        "head.light.on(Glow(head.spec.light.colour), eyes)", T_TRACE,
+        "head.light.on(Glow(head.spec.light.colour), eyes)", scenario("press_while_aiming"),
     ),
 )  # fmt: skip
 
