@@ -70,13 +70,19 @@ class ScriptedClock(GateClock):
         """Call `act` when the clock reaches `moment_s`."""
         self._script = sorted([*self._script, (moment_s, act)], key=lambda one: one[0])
 
+    @property
+    def is_done(self) -> bool:
+        """Whether the whole script has been played."""
+        return not self._script
+
     def sleep(self, duration_s: float) -> None:
         """Move the clock on, with a stop at each moment of the script."""
         end_s = self.elapsed_s + max(0.0, duration_s)
         while self._script and self._script[0][0] <= end_s:
-            moment_s, act = self._script.pop(0)
-            super().sleep(moment_s - self.elapsed_s)
-            act()
+            entry = self._script[0]
+            super().sleep(entry[0] - self.elapsed_s)
+            entry[1]()
+            self._script.remove(entry)
         super().sleep(end_s - self.elapsed_s)
 
 
@@ -117,6 +123,7 @@ class Stage:
     rig: Rig
     clock: ScriptedClock
     trace: Trace
+    end: Callable[[], None]
     answers: list[Any] = field(default_factory=list)
     closing: Thread | None = None
     aims_until_s: float = 0.0
@@ -152,6 +159,7 @@ class Stage:
 
     def settle(self) -> None:
         """Wait until the presses are answered and the exam rests, or has ended."""
+        until(lambda: self.clock.is_done, PATIENCE_S)
         for answer in [one for one in self.answers if hasattr(one, "exception")]:
             answer.exception(PATIENCE_S)
         if self.closing is not None:
@@ -316,7 +324,6 @@ def instruments() -> Iterator[Callable[[str], Stage]]:
         def built(name: str) -> Stage:
             trace, clock = Trace(), ScriptedClock()
             trace.now_s = clock.now_s
-            WatchedWorld.trace = trace
             options: dict[str, Any] = {"head": equipped, "bulletin": TracedBulletin(trace), "clock": clock}
             pulled = Event()
             if name == "camera_pulled":
@@ -324,9 +331,12 @@ def instruments() -> Iterator[Callable[[str], Stage]]:
                 del options["head"]  # whose chips are those of a simulated camera's world
                 options["camera"] = lambda camera: Astonishing(camera, pulled, CameraMissing("the cable is out"))
             build = builder((world, calibration), folder / "plans")
-            rig = build(folder / name, undo.enter_context(ExitStack()), **options, **LIMITS.get(name, {}))
-            undo.callback(rig.world.faults.clear)
-            return Stage(rig, clock, trace)
+            own = undo.enter_context(ExitStack())
+            rig = build(folder / name, own, **options, **LIMITS.get(name, {}))
+            own.callback(rig.world.faults.clear)
+            assert isinstance(rig.world, WatchedWorld)
+            rig.world.trace = trace  # nothing was lit before
+            return Stage(rig, clock, trace, own.close)
 
         yield built
 
@@ -362,7 +372,9 @@ def play(stage: Stage, name: str) -> dict[str, Any]:
             },
         },
     }
-    return numbered(found)
+    played = numbered(found)
+    stage.end()
+    return played
 
 
 def answered(answer: Any) -> Any:
