@@ -5,7 +5,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-mutants bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
 
 help: ## List the words that make knows.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -31,7 +31,7 @@ JOURNEYS := tests/browser/test_page.py tests/browser/test_visit.py
 # A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
 # the summary names it, because it is then the test or the page that has to be mended.
 test: .venv/ready browser buses strace ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd and not paper" --ignore tests/browser --ignore tests/ports --ignore tests/parts
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd and not paper" --ignore tests/browser --ignore tests/ports --ignore tests/parts --ignore tests/golden
 	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
 	@$(BIN)/python -m pytest $(JOURNEYS) --reruns 1 -rR
 
@@ -52,6 +52,12 @@ test-systemd: .venv/ready ## Boot a real systemd in a container and try the unit
 # verity needs device-mapper where it is installed; FORMAT=plain is for trying out, on devices that were built with it.
 FORMAT ?= verity
 KEYS ?= out/keys
+
+test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files and scenes with their golden records; not in CI yet.
+	@umockdev-wrapper $(BIN)/python -m pytest tests/golden
+
+test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store and exam against seeded mutants; ten minutes, not in CI.
+	@$(BIN)/python -m tests.golden mutants
 
 bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORMAT=plain, ARCH=arm64.
 	@systemd/image/install $(ARCH)

@@ -234,6 +234,27 @@ def test_a_third_press_is_refused_while_two_pictures_are_made(make_rig: Any) -> 
     assert rig.store.captures() == [second, first]
 
 
+def test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made(make_rig: Any) -> None:
+    eager = Eager()
+    rig = make_rig(bulletin=eager)
+
+    def press_a_second_time() -> Any:
+        eager.press = press_a_third_time  # at the second picture's quick look: both exposures are done
+        return rig.exam.press("OS")
+
+    def press_a_third_time() -> str:
+        with pytest.raises(Busy):
+            rig.exam.press("OD")
+        return str(rig.exam.state)
+
+    eager.press = press_a_second_time
+    first = rig.exam.press("OD").result(30)
+    pressed, state = eager.pressed
+    second = pressed.result(30)
+    assert rig.store.captures() == [second, first]
+    assert state == "busy"
+
+
 def test_plans_that_cannot_be_made_are_told_and_nobody_waits(make_rig: Any) -> None:
     pulled = Event()
     pulled.set()

@@ -6,7 +6,7 @@ from types import TracebackType
 import pytest
 
 from device.clock import Clock, SystemClock, VirtualClock
-from device.dose import Hazard, light_limits, radiometry
+from device.dose import Beam, Hazard, light_limits, radiometry
 from device.errors import LightFault, LightLimit
 from device.guard import GuardedLight
 from device.ledger import MemoryLedger
@@ -209,3 +209,15 @@ def test_a_holder_that_was_stopped_wakes_up_with_a_lamp_that_does_not_count_as_l
         clock.sleep(0.1)
         assert lamp.glow == Glow("green")
         assert guarded.glow is None
+
+
+def test_light_brighter_than_a_retina_may_see_is_refused_dark_and_uncounted(lamp: Lamp, clock: VirtualClock) -> None:
+    """Its dose would be small: the irradiance is what refuses it."""
+    bright = Hazard({"green": Beam(0.440, 1e-3, 1e-6)}, light_limits())
+    guarded = GuardedLight(lamp, clock, 1.0, bright, MemoryLedger(clock))
+    with pytest.raises(LightLimit, match="times brighter"), guarded.on(GREEN):
+        pytest.fail("it shone")
+    assert lamp.glow is None
+    assert guarded.ledger.spent_j_per_cm2("OD") == 0.0
+    with guarded.on(Glow("green", 0.2)):
+        assert lamp.glow == Glow("green", 0.2)

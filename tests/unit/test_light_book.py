@@ -13,7 +13,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.dose import Beam, Hazard, light_limits
-from device.errors import LightLimit, StoreError
+from device.errors import LightDay, LightLimit, StoreError
 from device.guard import AFTERGLOW_S, GuardedLight
 from device.ledger import SLOT_S, MemoryLedger
 from device.values import Glow
@@ -84,6 +84,13 @@ def test_neither_the_date_nor_the_time_that_it_was_off_forgives_anything(store: 
     ledger.reserve(("OD",), STOP, STOP)
 
 
+def test_a_boot_whose_clock_is_far_ahead_forgives_nothing(store: Store, clock: VirtualClock) -> None:
+    """The time before this boot's first look was not seen, however long its computer has been on."""
+    book(store, clock).reserve(("OD",), STOP, STOP)
+    ahead = VirtualClock(elapsed_s=10 * DAY_S)
+    assert book(store, ahead, "second").spent_j_per_cm2("OD") == STOP
+
+
 def test_a_new_process_of_the_same_boot_goes_on_where_the_last_one_stopped(store: Store, clock: VirtualClock) -> None:
     book(store, clock).reserve(("OD",), STOP, STOP)
     clock.sleep(DAY_S + 2 * SLOT_S)
@@ -114,6 +121,17 @@ def test_a_moment_later_today_is_told_by_its_hour_alone() -> None:
     ledger.reserve(("OS",), STOP, STOP)
     with pytest.raises(LightLimit, match=r"the left eye .* light is allowed again after 01:30$"):
         ledger.reserve(("OS",), STOP, STOP)
+
+
+def test_a_wait_of_hours_is_the_limit_of_the_day_and_a_shorter_one_is_a_rest() -> None:
+    clock = VirtualClock()
+    ledger = MemoryLedger(clock)
+    ledger.reserve(("OD",), STOP, STOP)
+    for passed_s, kind in ((0.0, LightDay), (22 * 3600.0, LightLimit)):
+        clock.sleep(passed_s)
+        with pytest.raises(LightLimit) as told:
+            ledger.reserve(("OD",), STOP, STOP)
+        assert type(told.value) is kind
 
 
 def test_an_exposure_that_is_too_much_for_any_day_is_told_as_such(store: Store, clock: VirtualClock) -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from device.errors import NotKept, SettingError, StoreDamaged, StoreError, StoreFull
 from device.values import Capture
 from services.records import schema
-from services.records.store import Store
+from services.records.store import WHOLE, Store
 
 MEMORY = Path("/dev/shm")  # order does not depend on the disk, and many shelves are made
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -178,6 +178,20 @@ def test_a_torn_capture_is_moved_aside_whole_and_never_over_another(store: Store
         assert again.read("kept", "raw.tiff") == FILES["raw.tiff"]
     with Store(store.folder) as once_more:
         assert once_more.swept == ()
+
+
+def test_a_capture_with_all_its_files_that_was_never_renamed_is_moved_aside_and_named(store: Store) -> None:
+    """The process died between the last file and the name: no row promises it, and nothing of it is lost."""
+    store.close()
+    part = store.folder / "captures" / ".whole.part"
+    part.mkdir()
+    for name in WHOLE:
+        (part / name).write_bytes(b"content")
+    with Store(store.folder, reserve_bytes=0) as again:
+        assert again.swept == ("whole",)
+        assert again.orphans() == ["whole"]
+        assert again.torn() == {}
+        assert {path.name for path in (store.folder / "torn" / "whole").iterdir()} == WHOLE
 
 
 @pytest.mark.parametrize("leave", ["nothing", "an empty file"])

@@ -1,7 +1,8 @@
 """The buses of a Raspberry Pi behind umockdev, in a process of its own: `/usr/bin/python3 serve.py FOLDER`.
 
 Prints the root that UMOCKDEV_DIR must name. Every message on SPI is written to FOLDER/spi.jsonl with its moment
-(CLOCK_MONOTONIC, seconds) and the LEDs that shine after it. FOLDER/faults holds what is broken, one word to a line:
+(CLOCK_MONOTONIC, seconds), its bytes and the LEDs that shine after it, every message on I2C to FOLDER/i2c.jsonl with
+its chip, its direction and its bytes. FOLDER/faults holds what is broken, one word to a line:
 "spi.short" (half a message arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is
 dead), "power" (brown-out: the chain loses its latch), "memory.blank" (the head's memory is as from the shop).
 """
@@ -102,7 +103,7 @@ class Spi(Bus):
         arrived = wire[: len(wire) // 2] if "spi.short" in broken else wire
         self.chain.take(arrived)
         seen = {"at_s": time.monotonic(), "hz": self.settings[4], "bytes": len(arrived), "lit": self.chain.lit}
-        self.log.write(json.dumps(seen) + "\n")
+        self.log.write(json.dumps(seen | {"mode": self.settings[1], "hex": arrived.hex()}) + "\n")
         self.log.flush()
         return len(arrived)
 
@@ -113,6 +114,12 @@ class I2c(Bus):
     def __init__(self, chips):
         super().__init__()
         self.chips, self.address = chips, 0
+        self.log = (FOLDER / "i2c.jsonl").open("a", encoding="ascii")
+
+    def note(self, address, way, data):
+        self.log.write(json.dumps({"chip": address, way: bytes(data).hex()}) + "\n")
+        self.log.flush()
+        return bytes(data)
 
     def answer(self, request, arg):
         if request == 0x0705:  # I2C_FUNCS
@@ -145,9 +152,9 @@ class I2c(Bus):
                 return -1, ENXIO
             buffer = table.resolve(at + 8, length)
             if flags & 1:
-                buffer.update(0, list(chip.read(length)))
+                buffer.update(0, list(self.note(address, "read", chip.read(length))))
             else:
-                chip.write(bytes(buffer.retrieve()))
+                chip.write(self.note(address, "write", buffer.retrieve()))
         return count, 0
 
     def smbus(self, arg):
@@ -158,9 +165,10 @@ class I2c(Bus):
             return -1, ENXIO
         if size == 3:  # a word, the low byte first
             block = data.resolve(8, 34)
-            chip.write(bytes([command]) + (b"" if reads else bytes(block.retrieve())[:2]))
+            said = bytes([command]) + (b"" if reads else bytes(block.retrieve())[:2])
+            chip.write(self.note(self.address, "write", said))
             if reads:
-                block.update(0, list(chip.read(2)))
+                block.update(0, list(self.note(self.address, "read", chip.read(2))))
             return 0, 0
         return (0, 0) if size == 0 else (-1, EINVAL)
 

@@ -1,0 +1,400 @@
+"""Record of the exam in virtual time: events and lamp changes of each scenario, and the state after it."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event, Thread
+from time import sleep
+from typing import Any
+
+from device.clock import VirtualClock
+from device.errors import CameraMissing, ConsentDeclined, DiffuscopeError
+from device.sim.calibrate import simulated_calibration
+from device.sim.world import World
+from device.spec import InstrumentSpec, load_head
+from device.values import Calibration, Eye, Glow
+from services.instrument.bulletin import Bulletin
+from services.records.errand import Errand
+from tests.golden import compare
+from tests.journey.asking import equipped
+from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, until
+from tests.journey.test_exam import Astonishing
+
+CAPTURE = re.compile(r"\d{8}T\d{6}-(?:OD|OS)-[0-9a-f]{6}")
+KEY = "0123456789abcdef"
+PATIENCE_S = 150.0  # the first picture may have to compile the kernels
+
+
+@dataclass
+class Trace:
+    """Events and lamp changes in the order in which they happened, with the virtual time of each."""
+
+    entries: list[dict[str, Any]] = field(default_factory=list)
+    now_s: Callable[[], float] = lambda: 0.0
+
+    def add(self, **entry: Any) -> None:
+        """Append one entry at the present virtual time."""
+        self.entries.append({"at_s": round(self.now_s(), 6), **entry})
+
+
+class WatchedWorld(World):
+    """A World that adds each change of its lamp to `trace`."""
+
+    trace = Trace()
+    _shown: Glow | None = None
+
+    @property  # type: ignore[override]
+    def glow(self) -> Glow | None:
+        """What the lamp shows now."""
+        return self._shown
+
+    @glow.setter
+    def glow(self, glow: Glow | None) -> None:
+        if glow != self._shown:
+            self.trace.add(lamp="dark" if glow is None else f"{glow.colour} {glow.level:g}")
+        self._shown = glow
+
+
+class ScriptedClock(GateClock):
+    """A virtual clock that calls functions at given moments, in the thread that sleeps."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._script: list[tuple[float, Callable[[], Any]]] = []
+
+    def at(self, moment_s: float, act: Callable[[], Any]) -> None:
+        """Call `act` when the clock reaches `moment_s`."""
+        self._script = sorted([*self._script, (moment_s, act)], key=lambda one: one[0])
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the whole script has been played."""
+        return not self._script
+
+    def sleep(self, duration_s: float) -> None:
+        """Move the clock on, with a stop at each moment of the script."""
+        end_s = self.elapsed_s + max(0.0, duration_s)
+        while self._script and self._script[0][0] <= end_s:
+            entry = self._script[0]
+            super().sleep(entry[0] - self.elapsed_s)
+            entry[1]()
+            self._script.remove(entry)
+        super().sleep(end_s - self.elapsed_s)
+
+
+def without_figures(kind: str, data: dict[str, Any]) -> dict[str, Any]:
+    """Return an event's data without what the estimators measured: FFT plans may differ in the last digit."""
+    match kind:
+        case "calibration":
+            return {"findings": [{"name": one["name"], "ok": one["ok"]} for one in data["findings"]]}
+        case "verdict":
+            return data | {"numbers": sorted(data["numbers"])}
+        case "aim":
+            return {"code": data["code"], "keys": sorted(data)}
+    return data
+
+
+class TracedBulletin(Bulletin):
+    """A Bulletin that adds each event to a trace; `at_quick` is called once, after the first quick look."""
+
+    def __init__(self, trace: Trace) -> None:
+        super().__init__()
+        self._trace = trace
+        self.at_quick: Callable[[], Any] | None = None
+
+    def tell(self, kind: str, **data: Any) -> None:
+        """Record the event, then publish it."""
+        shown = without_figures(kind, data)
+        self._trace.add(event=kind, data=shown)
+        super().tell(kind, **data)
+        if data.get("stage") == "quick" and self.at_quick is not None:
+            act, self.at_quick = self.at_quick, None
+            act()
+
+
+@dataclass
+class Stage:
+    """One instrument in virtual time, its trace, and the answers to the presses of a scenario."""
+
+    rig: Rig
+    clock: ScriptedClock
+    trace: Trace
+    end: Callable[[], None]
+    answers: list[Any] = field(default_factory=list)
+    closing: Thread | None = None
+    aims_until_s: float = 0.0
+
+    def press(self, eye: Eye, key: str | None = None, errand: Errand | None = None) -> Any:
+        """Press, and remember the future or the refusal."""
+        try:
+            pressed = self.rig.exam.press(eye, key, *([errand] if errand else []))
+        except DiffuscopeError as error:
+            self.answers.append(refusal(error))
+            return None
+        self.answers.append(pressed)
+        return pressed
+
+    def soon(self, act: Callable[[], Any], after_s: float = 0.05) -> None:
+        """Call `act` so long after now: by default in the midst of a lit exposure."""
+        self.clock.at(self.clock.now_s() + after_s, act)
+
+    def break_(self, *faults: str) -> None:
+        """Break parts of the simulated head from now on."""
+        self.rig.world.faults.update(faults)
+
+    def add_journal(self) -> None:
+        """Add what the journal of interrupted captures holds now to the trace."""
+        notes = sorted((self.rig.store.folder / "underway").iterdir())
+        self.trace.add(journal=[json.loads(path.read_bytes()) for path in notes])
+
+    def close(self) -> None:
+        """Close as the server does after SIGTERM, from another thread, and go on once the exam knows of it."""
+        self.closing = Thread(target=self.rig.owner.close, name="closing", daemon=True)
+        self.closing.start()
+        assert self.rig.exam.preview(10**9, wait_s=PATIENCE_S) is None  # answered at once when it is closing
+
+    def settle(self) -> None:
+        """Wait until the presses are answered and the exam rests, or has ended."""
+        until(lambda: self.clock.is_done, PATIENCE_S)
+        for answer in [one for one in self.answers if hasattr(one, "exception")]:
+            answer.exception(PATIENCE_S)
+        if self.closing is not None:
+            self.closing.join(PATIENCE_S)
+            return
+        until(lambda: self.rig.died.is_set() or rests(self), PATIENCE_S)
+
+
+def rests(stage: Stage) -> bool:
+    """Return whether nothing is pressed, aimed at or looked at any more."""
+    exam, before = stage.rig.exam, stage.clock.now_s()
+    if exam.state != "aim" or exam.fitness.due or stage.rig.world.glow is not None or before < stage.aims_until_s:
+        return False
+    sleep(0.1)
+    return exam.state == "aim" and not exam.fitness.due and stage.clock.now_s() == before
+
+
+def refusal(error: BaseException) -> dict[str, Any]:
+    """Return an error as a record."""
+    assert isinstance(error, DiffuscopeError), error
+    return {"code": error.code, "message": error.message, "remedy": error.remedy}
+
+
+# Scenarios
+
+
+def press(stage: Stage) -> None:
+    """One press of the right eye; while it is exposed, the journal of interrupted captures names it."""
+    stage.soon(stage.add_journal)
+    stage.press("OD", KEY)
+
+
+def press_while_aiming(stage: Stage) -> None:
+    """Live pictures in red, then a press after one second of them."""
+    stage.soon(lambda: stage.press("OS"), 1.0)
+    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
+
+
+def aiming_ends(stage: Stage) -> None:
+    """Live pictures go on for as long as they are wanted, and end by themselves."""
+    stage.aims_until_s = 3.09  # within the pause after the last one
+    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
+
+
+def press_during_refinement(stage: Stage) -> None:
+    """A second press at the first quick look; a third one is refused."""
+
+    def more() -> None:
+        stage.press("OS")
+        stage.press("OD")
+
+    bulletin = stage.rig.bulletin
+    assert isinstance(bulletin, TracedBulletin)
+    bulletin.at_quick = more
+    stage.press("OD")
+
+
+def repeated_press(stage: Stage) -> None:
+    """The same key in the midst of the exposure is the same picture; the key for the other eye is refused."""
+
+    def again() -> None:
+        stage.press("OD", KEY)
+        stage.press("OS", KEY)
+        stage.press("OD")
+
+    stage.soon(again)
+    stage.press("OD", KEY)
+
+
+def cancel(stage: Stage) -> None:
+    """A page that goes away cancels nothing: the picture is kept."""
+    pressed = stage.press("OD")
+    stage.answers.append({"cancelled": pressed.cancel()})
+
+
+def withdrawn(stage: Stage) -> None:
+    """The consent is withdrawn between the press and its light: no light."""
+
+    def permit() -> None:
+        raise ConsentDeclined("PR 1 did not agree to pictures")
+
+    stage.press("OD", None, Errand(visit="v", slot="R-centre", permit=permit))
+
+
+def camera_lost(stage: Stage) -> None:
+    """The camera is gone in the midst of the lit exposure, and back for the next press."""
+    stage.soon(lambda: stage.break_("camera.missing"))
+    stage.press("OD")
+    stage.settle()
+    stage.rig.world.faults.clear()
+    stage.press("OD")
+
+
+def camera_stalled(stage: Stage) -> None:
+    """The lit frame never comes."""
+    stage.soon(lambda: stage.break_("camera.stalled"))
+    stage.press("OD")
+
+
+def camera_pulled(stage: Stage) -> None:
+    """The driver raises while the lamp is lit."""
+    stage.press("OD")
+
+
+def light_fault(stage: Stage) -> None:
+    """The lamp does not light up."""
+    stage.break_("light.fault")
+    stage.press("OD")
+
+
+def light_cut(stage: Stage) -> None:
+    """The exposure hangs; the guard's timer ends the light."""
+    stage.soon(lambda: until(lambda: stage.rig.world.glow is None))
+    stage.press("OD")
+
+
+def sigterm_during_exposure(stage: Stage) -> None:
+    """SIGTERM in the midst of the lit exposure: the picture is finished and kept."""
+    stage.soon(stage.close)
+    stage.press("OD")
+
+
+def sigterm_while_aiming(stage: Stage) -> None:
+    """SIGTERM in the midst of a live picture."""
+    stage.soon(stage.close, 0.02)
+    stage.rig.exam.preview(0, wait_s=PATIENCE_S)
+
+
+def head_lost(stage: Stage) -> None:
+    """Camera, chips and lamp are gone in the midst of the lit exposure; the next press fails at once."""
+    stage.soon(lambda: stage.break_("camera.missing", "bus.silent", "light.fault"))
+    stage.press("OD")
+    stage.settle()
+    stage.press("OS")
+
+
+def lamp_lost(stage: Stage) -> None:
+    """The lamp cannot be switched off any more: the exam ends the process."""
+    stage.soon(lambda: stage.break_("light.silent"))
+    stage.press("OD")
+
+
+SCENARIOS: dict[str, Callable[[Stage], None]] = {
+    one.__name__: one
+    for one in (
+        press, press_while_aiming, aiming_ends, press_during_refinement, repeated_press, cancel, withdrawn,
+        camera_lost, camera_stalled, camera_pulled, light_fault, light_cut, sigterm_during_exposure,
+        sigterm_while_aiming, head_lost, lamp_lost,
+    )
+}  # fmt: skip
+LIMITS = {"light_cut": {"max_on_s": 0.15}}  # other arguments of the instrument
+
+
+@contextmanager
+def instruments() -> Iterator[Callable[[str], Stage]]:
+    """Give a function that builds the instrument of a scenario; all share the traced light and the FFT plans."""
+    with TemporaryDirectory() as place, ExitStack() as undo:
+        folder = Path(place)
+        (folder / "small.toml").write_text(SMALL_HEAD)
+        world, calibration = watched(load_head(folder / "small.toml"))
+
+        def built(name: str) -> Stage:
+            trace, clock = Trace(), ScriptedClock()
+            trace.now_s = clock.now_s
+            options: dict[str, Any] = {"head": equipped, "bulletin": TracedBulletin(trace), "clock": clock}
+            pulled = Event()
+            if name == "camera_pulled":
+                pulled.set()
+                del options["head"]  # whose chips are those of a simulated camera's world
+                options["camera"] = lambda camera: Astonishing(camera, pulled, CameraMissing("the cable is out"))
+            build = builder((world, calibration), folder / "plans")
+            own = undo.enter_context(ExitStack())
+            rig = build(folder / name, own, **options, **LIMITS.get(name, {}))
+            own.callback(rig.world.faults.clear)
+            assert isinstance(rig.world, WatchedWorld)
+            rig.world.trace = trace  # nothing was lit before
+            return Stage(rig, clock, trace, own.close)
+
+        yield built
+
+
+def watched(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """Return a coarse world of the head whose light is traced already, and its calibration."""
+    coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
+    world = WatchedWorld(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}), VirtualClock())
+    for colour in (spec.light.colour, spec.light.preview_colour):
+        world.electrons_per_s(colour)
+    return world, simulated_calibration(world)
+
+
+def play(stage: Stage, name: str) -> dict[str, Any]:
+    """Run one scenario and return its trace and the state after it; captures are named by their order."""
+    until(lambda: bool(stage.trace.entries), PATIENCE_S)  # its first state: the exam is ready a little before
+    SCENARIOS[name](stage)
+    stage.settle()
+    rig = stage.rig
+    found = {
+        "what": SCENARIOS[name].__doc__,
+        "trace": stage.trace.entries,
+        "answers": [answered(one) for one in stage.answers],
+        "after": {
+            "state": rig.exam.state,
+            "problem": None if rig.exam.problem is None else refusal(rig.exam.problem),
+            "died": rig.died.is_set(),
+            "lamp": "dark" if rig.world.glow is None else "lit",
+            "captures": [[one.id, one.eye, one.simulated, sorted(one.files)] for one in rig.store.captures()],
+            "underway": sorted(path.name for path in (rig.store.folder / "underway").iterdir()),
+            "spent_j_per_cm2": {
+                eye: float(f"{rig.exam.head.light.ledger.spent_j_per_cm2(eye):.6g}") for eye in ("OD", "OS")
+            },
+        },
+    }
+    played = numbered(found)
+    stage.end()
+    return played
+
+
+def answered(answer: Any) -> Any:
+    """Return what a press was answered: the capture's name, or the refusal."""
+    if isinstance(answer, dict):
+        return answer
+    error = answer.exception(0)
+    return answer.result().id if error is None else refusal(error)
+
+
+def numbered(value: Any) -> Any:
+    """Return the same with the names of captures replaced, in the order in which they first appear."""
+    text = json.dumps(value)
+    for number, name in enumerate(dict.fromkeys(CAPTURE.findall(text)), 1):
+        text = text.replace(name, f"capture-{number}")
+    return json.loads(text)
+
+
+def write() -> Path:
+    """Write the record of all scenarios."""
+    with instruments() as built:
+        compare.write("exam", {name: play(built(name), name) for name in SCENARIOS})
+    return compare.RECORDS / "exam.json"

@@ -1,0 +1,15 @@
+"""The shipped scenes give the same frames, PSFs and plans as when their record was written."""
+
+import pytest
+
+from tests.golden import compare, scenes
+
+
+def test_the_record_holds_every_shipped_scene() -> None:
+    assert sorted(compare.read("scenes")) == scenes.names()
+
+
+@pytest.mark.parametrize("name", scenes.names())
+def test_a_scene_is_as_recorded(name: str) -> None:
+    difference = compare.difference(compare.read("scenes")[name], scenes.record(name))
+    assert not difference, difference
