@@ -56,7 +56,7 @@ def test_a_picture_that_was_moved_still_answers_the_press_that_made_it(tmp_path:
     clock = VirtualClock()
     with Store(tmp_path, reserve_bytes=0) as store:
         people = People(store.engine, load_protocol(), clock)
-        visit = people.answer("2" * 16, people.begin("1" * 16).id, "consent", "agreed").id
+        visit = people.answer("3" * 16, people.begin("1" * 16).id, "consent", "agreed").id
         keep(store, people, "c1", "OD", visit)
         people.move("2" * 16, "c1", "OS", None)
         assert store.get("c1").eye == "OS"
