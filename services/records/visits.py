@@ -131,7 +131,8 @@ def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, A
     """The answers of each visit, and what tells who its person is, as they are kept."""
     out: dict[str, dict[str, Any]] = {row.id: {} for row in rows}
     for field in session.scalars(select(FieldRow).where(FieldRow.visit.in_(out))):
-        out[field.visit][field.name] = field.value
+        if field.visit in out:  # found by an index that may still hold what the row no longer does
+            out[field.visit][field.name] = field.value
     known: dict[str, dict[str, Any]] = defaultdict(dict)
     for one in session.scalars(select(IdentifierRow).where(IdentifierRow.person.in_({row.person for row in rows}))):
         known[one.person][one.name] = one.value

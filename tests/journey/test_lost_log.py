@@ -25,6 +25,7 @@ def killed(server: Server) -> list[str]:
     """Press, and kill: what was acknowledged."""
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
+        server.ask("PATCH", f"/api/visits/{visit}", {"key": "f" * 16, "field": "consent", "value": "agreed"})
         presses: list[dict[str, Any]] = [
             {"eye": "OD"},
             {"eye": "OS"},

@@ -8,6 +8,7 @@ from services.records.people import People
 from services.records.protocol import load_protocol
 from services.records.store import Store
 from services.records.underway import Lost, Underway
+from tests.journey.asking import agreed_visit
 from tests.journey.conftest import Rig
 
 KEY, OTHER_KEY = "0123456789abcdef", "fedcba9876543210"
@@ -18,7 +19,7 @@ def pressed(rig: Rig, **body: Any) -> Any:
 
 
 def begun(rig: Rig, key: str) -> str:
-    return str(rig.request("POST", "/api/visits", json={"key": key}).json()["id"])
+    return str(agreed_visit(rig, key)["id"])
 
 
 def test_the_key_of_a_press_for_another_eye_visit_or_slot_is_refused_and_shines_no_light(rig: Any) -> None:
@@ -55,7 +56,7 @@ def test_a_picture_that_was_moved_still_answers_the_press_that_made_it(tmp_path:
     clock = VirtualClock()
     with Store(tmp_path, reserve_bytes=0) as store:
         people = People(store.engine, load_protocol(), clock)
-        visit = people.begin("1" * 16).id
+        visit = people.answer("3" * 16, people.begin("1" * 16).id, "consent", "agreed").id
         keep(store, people, "c1", "OD", visit)
         people.move("2" * 16, "c1", "OS", None)
         assert store.get("c1").eye == "OS"

@@ -23,6 +23,7 @@ def test_told_to_stop_it_exits_with_0_and_leaves_every_row_in_the_main_file(
     server, data = Server(head_file, tmp_path / "data", environment), tmp_path / "data"
     with server.running() as process:
         visit = server.ask("POST", "/api/visits", {"key": "0" * 16})["id"]
+        server.ask("PATCH", f"/api/visits/{visit}", {"key": "f" * 16, "field": "consent", "value": "agreed"})
         press = {"eye": "OD", "key": "1" * 16, "visit": visit, "slot": "R-centre"}
         kept = server.ask("POST", "/api/captures", press)["id"]
         assert stop(process, number) == 0, server.said()

@@ -50,6 +50,7 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
         people, light = People(store.engine, load_protocol(), clock), LightBook(store.engine, clock, 86_400.0, "boot")
         for number in range(3):
             visit = people.begin(next(keys)).id
+            people.answer(next(keys), visit, "consent", "agreed")
             people.answer(next(keys), visit, "complaints", ["flashes", "red"])
             people.answer(next(keys), visit, "name", f"Name{number}")
             errand = people.errand("OD", next(keys), visit, "R-centre")
