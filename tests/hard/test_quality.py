@@ -80,7 +80,7 @@ def test_what_this_psf_did_not_make_is_said_so(case: str, world: World, calibrat
         mirrored = Psf(np.ascontiguousarray(calibration.psfs[0].pixels[::-1]))
         calibration = Calibration((mirrored,), calibration.sensor, calibration.geometry, calibration.field_deg)
     report = look(calibration, counts)
-    assert report.quality["structure_sure"] < -10
+    assert report.quality["structure_sure"] is None  # no figure through a PSF that does not match
     (words,) = [words for words in report.warnings if "lit" not in words]
     assert words.startswith("No eye was seen" if case == "noise" else "The PSF does not match this frame")
 
