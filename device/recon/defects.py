@@ -238,6 +238,8 @@ def steep(image: Image, share: float, least: Image) -> Mask:
     out = np.zeros(image.shape, np.bool_)
     for axis in (0, 1):
         line, marks, limit = (np.moveaxis(array, axis, 0) for array in (image, out, least))
+        if len(line) < 4:
+            continue
         four = np.stack([line[k : len(line) - 3 + k] for k in range(4)])
         step = np.abs(four[2] - four[1])
         found = (step > np.maximum(limit[1:-2], limit[2:-1])) & (step >= share * np.ptp(four, axis=0))
