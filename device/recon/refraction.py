@@ -12,6 +12,7 @@ is fitted with the stored PSF for the coarse search, and again with the PSF that
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +125,7 @@ class Refractor:
         self.grid = self.model.grid
         self.shading = Shading(self.model)
         self.preparer = Preparer(calibration, self.grid)
-        self.defects = DefectFinder(calibration, shape, index)
+        self._calibration, self._shape, self._index = calibration, shape, index
         self.fft: RealFft = planner.plan(self.grid.window)
         self.taper = taper(self.grid.window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(self.grid.window))))
         self._choose_frequencies()
@@ -150,6 +151,11 @@ class Refractor:
         self._upper = Band.of(window, middle, self.high, n)
         self._silent = np.flatnonzero(power <= np.quantile(power, 0.25))
         self._levels = np.zeros(RINGS)
+
+    @cached_property
+    def defects(self) -> DefectFinder:
+        """The search for defective pixels, for callers that have no places of their own."""
+        return DefectFinder(self._calibration, self._shape, self._index)
 
     def find(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Refraction | None:
         """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span.
