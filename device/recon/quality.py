@@ -87,7 +87,7 @@ def banding(left: Image, noise_dn2: float, light_dn: float) -> float:
     if not light_dn > 0:
         return 0.0
     seen_dn2 = float(left.mean(axis=1, dtype=np.float64).var())
-    return max(seen_dn2 - 2 * noise_dn2 / left.shape[1], 0.0) ** 0.5 / light_dn
+    return float(max(seen_dn2 - 2 * noise_dn2 / left.shape[1], 0.0) ** 0.5 / light_dn)
 
 
 def is_banded(quality: dict[str, float | None]) -> bool:
