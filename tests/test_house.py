@@ -295,7 +295,7 @@ BROKEN: list[tuple[Finder, str]] = [
     (patches, "def test(monkeypatch): ..."),
     (patches, "from unittest import mock"),
     (patches, "import unittest.mock"),
-    (patches, "from services.records import store\nstore.RESERVE_BYTES = 0"),
+    (patches, "from services.records import disk\ndisk.RESERVE_BYTES = 0"),
     (doors_to_time, "from time import sleep"),
     (doors_to_time, "import datetime\ndatetime.datetime.now()"),
     (doors_to_time, "import asyncio\nasync def f():\n    await asyncio.sleep(1)"),

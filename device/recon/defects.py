@@ -41,7 +41,6 @@ LIT = 4.0  # in units of the largest value without light: less is no edge
 SHADOW = 0.1  # of the light around it: a narrow gap is darker
 EDGE = 0.3  # of the light around it: the step at the border of a gap is larger
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
-STEPS = np.arange(0.3, 1.01, 0.05)  # shares of a range that are tried on the PSF
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light that the field explains: more is a reflex. Overexposed eyes have 0.003 and less
 HALO_BEGINS = 0.05  # of it in the first ring; an eye of 6 dpt, seen through the stored PSF, shows 0.02
@@ -237,21 +236,32 @@ def steep(image: Image, share: float, least: Image) -> Mask:
     """
     out = np.zeros(image.shape, np.bool_)
     for axis in (0, 1):
-        line, marks, limit = (np.moveaxis(array, axis, 0) for array in (image, out, least))
-        four = np.stack([line[k : len(line) - 3 + k] for k in range(4)])
-        step = np.abs(four[2] - four[1])
-        found = (step > np.maximum(limit[1:-2], limit[2:-1])) & (step >= share * np.ptp(four, axis=0))
-        marks[1:-2] |= found
-        marks[2:-1] |= found
+        line, limit, marks = np.moveaxis(image, axis, 0), np.moveaxis(least, axis, 0), np.moveaxis(out, axis, 0)
+        if len(line) < 4:
+            continue
+        i, j, shares = _large_steps(line, np.maximum(limit[1:-2], limit[2:-1]))
+        found = shares >= share
+        marks[i[found] + 1, j[found]] = True
+        marks[i[found] + 2, j[found]] = True
     return out
 
 
 def steepest(psf: Psf) -> float:
     """The largest share of the range of four pixels in line that the PSF itself passes in one step, 0 to 1."""
-    pixels = psf.pixels
-    least = np.full_like(pixels, 0.1 * float(pixels.max()))
-    shares = [share for share in STEPS if steep(pixels, share, least).any()]
-    return max(shares, default=0.0)
+    least = 0.1 * float(psf.pixels.max())
+    lines = [line for line in (psf.pixels, psf.pixels.T) if len(line) >= 4]
+    return max((float(_large_steps(line, least)[2].max(initial=0.0)) for line in lines), default=0.0)
+
+
+def _large_steps(line: Image, least: Image | float) -> tuple[NDArray[np.intp], NDArray[np.intp], Image]:
+    """Steps along the first axis above `least`: i and j of the first of their four pixels, and the share of the range.
+
+    The step is between the second and the third of the four, the range that of all four.
+    """
+    step = np.abs(line[2:-1] - line[1:-2])
+    i, j = np.nonzero(step > least)
+    four = np.stack([line[i + k, j] for k in range(4)])
+    return i, j, np.asarray(step[i, j] / np.ptp(four, axis=0), np.float32)
 
 
 def _with_sharp_border(areas: Mask, sharp: Mask) -> Mask:

@@ -56,7 +56,7 @@ class Evidence:
         self.reference = float(np.sqrt(self.low * self.high))
         self.middles = np.log(np.sqrt(edges[1:] * edges[:-1]) / self.reference)
         self.logs = np.log(chosen / self.reference)
-        floor = np.maximum(frequency, self.low / 5)  # a power law has no end at f = 0, a picture has
+        floor = np.maximum(frequency, self.low)  # below the band the prior is flat: the low orders are the shading's
         self.all_logs: Image = np.log(floor / self.reference).astype(np.float32)
 
     def refocus(self) -> None:

@@ -6,8 +6,6 @@ from device.values import Sensor
 
 LEAST_DN2 = 1e-20  # a black frame has no noise to measure, and is still divided by; float frames may be tiny
 
-LEAST_SHARE = 0.75  # of the calibrated variance; frames of a right gain show 0.9 and more
-
 
 @dataclass(frozen=True)
 class Noise:
@@ -20,24 +18,16 @@ class Noise:
         """The variance of a sample of that value."""
         return self.per_dn * max(value_dn, 0.0) + self.floor_dn2
 
-    def scaled(self, factor: float) -> "Noise":
-        """The same shape, its variance multiplied."""
-        return Noise(self.per_dn * factor, self.floor_dn2 * factor)
-
     @classmethod
     def of(cls, sensor: Sensor, n: int, measured_dn2: float, mean_dn: float) -> "Noise":
         """Noise of means over n x n pixels (optics.md 3.9): from gain and read noise where they are known.
 
-        A frame cannot be quieter than its sensor: where it is, the gain is another one, and the noise that was seen
-        counts. Louder it may be, by the fine detail of the picture. Without a gain `measured_dn2` counts, the variance
-        that the empty part of the OTF shows: four fifths of it are taken for shot noise, so that bright samples count
-        less than dark ones, as they do on any sensor that sees well.
+        Otherwise from `measured_dn2`, the variance that the empty part of the OTF shows: four fifths of it are taken
+        for shot noise, so that bright samples count less than dark ones, as they do on any sensor that sees well.
         """
         pixels = n * n
         if sensor.gain_e_per_dn is not None:
             read_dn = (sensor.read_noise_e or 0.0) / sensor.gain_e_per_dn
-            calibrated = cls(1 / sensor.gain_e_per_dn / pixels, (read_dn**2 + 1 / 12) / pixels)
-            quieter = measured_dn2 / max(calibrated.variance_dn2(mean_dn), LEAST_DN2)
-            return calibrated if quieter > LEAST_SHARE else calibrated.scaled(max(quieter, 1e-6))
+            return cls(1 / sensor.gain_e_per_dn / pixels, (read_dn**2 + 1 / 12) / pixels)
         shot = 0.8 * measured_dn2 if mean_dn > 0 else 0.0
         return cls(shot / mean_dn if mean_dn > 0 else 0.0, max(measured_dn2 - shot, LEAST_DN2))

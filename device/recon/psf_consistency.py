@@ -161,12 +161,12 @@ class PsfConsistency:
         return np.asarray(spectrum / max(float(spectrum[0, 0].real), 1e-12), np.complex64)
 
     def _ask(self, spectra: list[Spectrum], psf: Image) -> Consistency | None:
-        otf, mirror = self._otf(psf), psf[:, ::-1]
+        otf = self._otf(psf)
         score, sd = self._score(spectra[0], otf)
         if not np.isfinite(sd):
             return None
-        images = [psf, mirror]
-        images += [ndimage.rotate(p, angle, reshape=False, order=1) for p in (psf, mirror) for angle in ANGLES_DEG]
+        turned = (ndimage.rotate(psf, angle, reshape=False, order=1) for angle in ANGLES_DEG)
+        images = [view for image in (psf, *turned) for view in (image, image[:, ::-1])]
         amplitudes = [self._deconvolved_amplitude(spectrum, otf) for spectrum in spectra]
         preferred = np.array([self._preferences(amplitudes, self._otf(image)) for image in images])
         spread = np.sqrt((preferred[2:] ** 2).mean(axis=0))

@@ -14,6 +14,7 @@ LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 SURELY = 3.0  # standard errors
 LEAST_LIT = 0.75  # share of the field
 MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
+MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
 PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
 FAINT_DN = 1e-9
 MISMATCHES = {
@@ -76,15 +77,35 @@ def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
     return float((inside > bright).mean())
 
 
+def banding(left: Image, noise_dn2: float, light_dn: float) -> float:
+    """Flicker: the rms of the row means of what a picture leaves unexplained, as a share of the mean light.
+
+    Rows are read one after the other, so a lamp that flickers draws bands across a frame that no retina explains.
+    `left` (rows, cols) in DN is 0 where a sample is missing. Twice the variance that noise of `noise_dn2` gives to the
+    means is taken off: less than that is no proof.
+    """
+    if not light_dn > 0:
+        return 0.0
+    seen_dn2 = float(left.mean(axis=1, dtype=np.float64).var())
+    return float(max(seen_dn2 - 2 * noise_dn2 / left.shape[1], 0.0) ** 0.5 / light_dn)
+
+
+def is_banded(quality: dict[str, float | None]) -> bool:
+    """Whether the light flickered; false where that is not known."""
+    share = quality.get("banding")
+    return share is not None and share > MOST_BANDING
+
+
 def explains(quality: dict[str, float | None], match: Match | None, misfit: float | None) -> bool:
     """Whether the model explains the frame, so that what was estimated through the PSF means anything.
 
     Not so if the PSF does not match, the light did not come through the eye, or the picture leaves a `misfit` (rms, in
-    units of the noise) above MOST_MISFIT.
+    units of the noise) above MOST_MISFIT, or bands of flickering light.
     """
     through = quality.get("through")
     seen = through is None or through >= LEAST_THROUGH
-    return seen and match not in MISMATCHES and (misfit is None or misfit <= MOST_MISFIT)
+    fits = (misfit is None or misfit <= MOST_MISFIT) and not is_banded(quality)
+    return seen and match not in MISMATCHES and fits
 
 
 def is_lit(quality: dict[str, float | None]) -> bool:
@@ -115,7 +136,7 @@ def complaints(quality: dict[str, float | None], match: Match, misfit: float | N
         found.append("No eye was seen: the light came from everywhere. Centre the ring on the pupil.")
     elif match in MISMATCHES:
         found.append(MISMATCHES[match])
-    elif misfit is not None and misfit > MOST_MISFIT:
+    elif not explains(quality, match, misfit):
         found.append(
             "The picture does not explain this frame: parts of it may be false. Take it again in steady light."
         )

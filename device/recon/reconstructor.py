@@ -125,7 +125,7 @@ class Reconstructor:
     """Plans once for a calibration and a sensor shape; then turns frames into pictures within a deadline.
 
     `recipes` run in order; the last is the wanted picture, those before it are quick looks. One thread at a time.
-    `timed` runs it on noise first, so that every cost is known before the first deadline; without a deadline leave it.
+    `timed` measures on noise what every step costs, before the first deadline; without deadlines leave it.
     `consistency` is asked about each frame's PSF, outside the deadline: for files, where seconds do not matter.
     With `refract`, where geometry and field are known, the frame tells the eye's refraction after the quick look, and
     what follows is solved with the PSF of that eye.
@@ -148,14 +148,15 @@ class Reconstructor:
         self._sharp = self.rungs[min(1, len(self.rungs) - 1) :]  # what is solved with the eye's own PSF
         self._find_cost, self._refocus_cost = Cost(), Cost()
         self._consistency: PsfConsistency | None = None
-        if timed:
-            self._warm_up()
+        self._warm_up(timed)
         self._consistency = consistency  # noise needs no check
 
-    def _warm_up(self) -> None:
-        """Run on noise, so that the first press meets compiled code, touched memory and a known cost."""
+    def _warm_up(self, timed: bool) -> None:
+        """Run on noise, so that the first frame meets compiled code and touched memory and, `timed`, a known cost."""
         noise = np.random.default_rng(0).integers(100, 200, self.shape, dtype=np.uint16)
         self(noise, rounds=1)  # compiles, where no compiled code is kept
+        if not timed:
+            return
         self(noise, np.zeros_like(noise), quick=True)  # with a dark frame it is other code
         for rung in self.rungs:
             rung.start_cost, rung.round_cost, rung.finish_cost = Cost(), Cost(), Cost()

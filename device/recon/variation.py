@@ -222,7 +222,7 @@ class Variation(EvidenceWiener):
     def finish(self, out: Image) -> None:
         """Hand the picture over, and say how well it explains the frame."""
         super().finish(out)
-        noise = self.noise
-        self.facts["residual"] = sweeps.chi(
-            self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, self.model.grid.at
-        )
+        noise, grid = self.noise, self.model.grid
+        self.facts["residual"] = sweeps.chi(self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, grid.at)
+        left, light_dn = (self._y - self.blurred[grid.slices]) * self._good, self.facts["mean_dn"]
+        self.facts["quality"]["banding"] = quality.banding(left, noise.variance_dn2(light_dn), light_dn)

@@ -15,7 +15,6 @@ from starlette.concurrency import run_in_threadpool
 from device.clock import Clock
 from device.errors import InputError, UpdateBusy, UpdateFailed, UpdateNoRoom, UpdateWrongDevice
 from services.records import disk
-from services.records.store import RESERVE_BYTES
 from services.records.update_notes import (
     FOR_EVERYBODY,
     TABLET,
@@ -146,7 +145,7 @@ class UpdateDesk:
     @staticmethod
     def _refuse_without_room(folder: Path, length_bytes: int) -> None:
         """Twice: the updater makes a copy of its own, which nobody else can change."""
-        free, needed = disk.free_bytes(folder), 2 * length_bytes + RESERVE_BYTES
+        free, needed = disk.free_bytes(folder), 2 * length_bytes + disk.RESERVE_BYTES
         if free < needed:
             raise UpdateNoRoom(f"{free} bytes are free, and {needed} are needed")
 

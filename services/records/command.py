@@ -9,7 +9,6 @@ from device.clock import SystemClock
 from device.errors import NotKept
 from services.records import disk
 from services.records.snapshots import Snapshots
-from services.records.store import told
 
 app = typer.Typer(help="The tables as they were before each migration, and the way back.", no_args_is_help=True)
 Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
@@ -35,6 +34,8 @@ def restore(
     sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Put a snapshot in the place of the tables; stop the instrument first."""
+    from services.records.store import told  # the database library, which the other commands do not need
+
     snapshots = _snapshots(data)
     with told(), disk.alone(data / ".lock"):
         if name in snapshots.names() and (missing := snapshots.missing_from(name, data / "captures")):

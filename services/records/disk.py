@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
 # EFBIG is a limit on one file's length: to the operator the same as a full disk.
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 

@@ -37,7 +37,6 @@ from services.records.snapshots import Snapshots
 
 log = logging.getLogger(__name__)
 
-RESERVE_BYTES = 200_000_000  # the computer's own logs and updates must fit beside us, or it will not start again
 WHOLE = frozenset({"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"})  # of every release's captures
 LATELY = 100  # visits by which the next ones are judged
 ESTIMATE_BYTES = 10_000_000  # a capture before there was one to measure: 4 megapixels of raw, pressed, and a picture
@@ -57,7 +56,7 @@ class Store:
         self,
         folder: Path,
         *,
-        reserve_bytes: int = RESERVE_BYTES,
+        reserve_bytes: int = disk.RESERVE_BYTES,
         free_bytes: Callable[[Path], int] = disk.free_bytes,
         clock: Clock | None = None,
     ) -> None:

@@ -18,7 +18,6 @@ from urllib.error import HTTPError
 from device.clock import Clock
 from device.errors import UpdateDamaged, UpdateNoRoom, UpdateNowhere, UpdateSourceGone, UpdateUnreachable
 from services.records import disk
-from services.records.store import RESERVE_BYTES
 from services.records.update_notes import PLAINLY, UPLOAD, Found
 from services.update.channel import Offer
 
@@ -209,8 +208,8 @@ def _gone() -> Iterator[None]:
 def _refuse_without_room(folder: Path, need_bytes: int) -> None:
     """Captures keep their reserve: an update never takes the room of the next picture."""
     free = disk.free_bytes(folder)
-    if free < need_bytes + RESERVE_BYTES:
-        raise UpdateNoRoom(f"{free} bytes are free; {need_bytes} and a reserve of {RESERVE_BYTES} are needed")
+    if free < need_bytes + disk.RESERVE_BYTES:
+        raise UpdateNoRoom(f"{free} bytes are free; {need_bytes} and a reserve of {disk.RESERVE_BYTES} are needed")
 
 
 def _sha256(path: Path) -> str:

@@ -27,7 +27,7 @@ from device.errors import (
     UpdateUnreachable,
     UpdateWrongDevice,
 )  # fmt: skip
-from services.records.store import RESERVE_BYTES
+from services.records.disk import RESERVE_BYTES
 from services.update import gate
 from services.update.engine import Rauc
 from tests.appliance import bench as benches

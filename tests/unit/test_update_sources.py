@@ -172,9 +172,20 @@ def test_settings_refuse_what_they_do_not_know(tmp_path: Path) -> None:
 
 
 def test_what_judges_a_version_loads_none_of_what_it_judges() -> None:
-    asks = "import sys, services.update.command; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, check=True, capture_output=True, text=True).stdout
-    assert not {"numba", "scipy", "pyfftw", "fastapi", "device.head", "device.recon"} & set(loaded.split())
+    assert not {"numba", "scipy", "pyfftw", "fastapi", "device.head", "device.recon"} & loaded_by(
+        "services.update.command"
+    )
+
+
+def test_the_command_line_loads_neither_database_nor_web_server() -> None:
+    assert not {"sqlalchemy", "alembic", "fastapi", "uvicorn", "picamera2"} & loaded_by("services.cli")
+
+
+def loaded_by(module: str) -> set[str]:
+    """Every module that is loaded once `module` is imported in a new process."""
+    asks = f"import sys, {module}; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, check=True, capture_output=True, text=True)
+    return set(found.stdout.split())
 
 
 def test_a_journal_that_cannot_be_written_is_said_and_hides_no_refusal(

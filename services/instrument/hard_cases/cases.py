@@ -82,6 +82,11 @@ def offset(more_dn: float) -> Build:
     return build
 
 
+def flicker(share: float) -> Build:
+    """A lamp whose light swings by a share while the rows are read."""
+    return lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, share))
+
+
 def gain(factor: float) -> Build:
     """A camera that collects `factor` times the electrons per count that the head file says, in as many counts."""
 
@@ -203,8 +208,7 @@ CASES: tuple[Case, ...] = (
         _case(f"motion {deg:g} deg", "light", motion(deg), "", BLURRED)
         for deg in (0.5, 1.5)
     ),
-    _case("flicker 10 %", "light",
-          lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, 0.1)), "misfit", BANDS),
+    *(_case(f"flicker {100 * share:g} %", "light", flicker(share), "misfit", BANDS) for share in (0.02, 0.1)),
     _case("1 % NaN", "what is no frame", not_numbers(0.01), "pixels", MISSING),
     _case("all NaN", "what is no frame", not_numbers(1.01), "pixels"),
     _case("all zeros", "what is no frame", no_light, "signal eye"),

@@ -70,7 +70,8 @@ class Solvers:
     def __call__(self, order: Order, files: tuple[object, ...]) -> Reconstruction:
         """What `diffuscope reconstruct` makes of an order; `files` names the content of all files but the raw."""
         raw = as_raw(read_image(order.raw))
-        key = (*files, order.method, order.budget_s, raw.white_dn, raw.bad.tobytes() if raw.bad.any() else b"")
+        known = raw.stored_bits, raw.white_dn, raw.bad.tobytes() if raw.bad.any() else b""
+        key = (*files, order.method, order.budget_s, *known)
         if key not in self._kept:
             self._kept[key] = self._planned(order, raw)
         self._kept.move_to_end(key)
