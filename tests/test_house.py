@@ -256,7 +256,7 @@ def workplace_words_in_prose(source: str) -> Iterator[Offence]:
 
 def test_nothing_of_the_workshop_is_left_in_the_house() -> None:
     """Marks of unfinished work, paths of one machine, words of whoever was here: of no use to any reader."""
-    binary = {".png", ".jpg", ".npy", ".tiff", ".gz", ".zip", ".sqlite", ".copy", ".calibration"}
+    binary = {".png", ".jpg", ".npy", ".tiff", ".gz", ".zip", ".sqlite", ".copy", ".calibration", ".npz"}
     readable = [name for name in files() if Path(name).suffix not in binary]
     readable.remove("tests/golden/records/tests.json")  # names of tests, with the examples that break this rule
     judge(leftovers, readable, {}, "clear it away")

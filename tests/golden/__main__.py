@@ -9,7 +9,18 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.golden import bus, collected_tests, command_line, error_codes, exam, files, http_transcript, mutants, scenes
+from tests.golden import (
+    bus,
+    collected_tests,
+    command_line,
+    error_codes,
+    exam,
+    files,
+    http_transcript,
+    mutants,
+    reconstructions,
+    scenes,
+)
 
 RECORDS: dict[str, Callable[[], Path]] = {
     "http": http_transcript.write,
@@ -17,6 +28,7 @@ RECORDS: dict[str, Callable[[], Path]] = {
     "errors": error_codes.write,
     "tests": collected_tests.write,
     "scenes": scenes.write,
+    "reconstructions": reconstructions.write,
     "exam": exam.write,
     "bus": bus.write,
     "files": files.write,

@@ -1,0 +1,26 @@
+"""Every method gives the picture and the report that were recorded."""
+
+import numpy as np
+import pytest
+
+from device.values import Reconstruction
+from tests.golden import compare, reconstructions
+
+TOLERANCE = 1e-5  # of the largest value: other processors order the sums of an FFT differently
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, Reconstruction]:
+    return dict(reconstructions.cases())
+
+
+def test_the_record_holds_every_method(made: dict[str, Reconstruction]) -> None:
+    assert sorted(compare.read("reconstructions")) == sorted(made)
+
+
+@pytest.mark.parametrize("name", sorted(compare.read("reconstructions")))
+def test_a_picture_and_its_report_are_as_recorded(made: dict[str, Reconstruction], name: str) -> None:
+    recorded = reconstructions.picture(name)
+    assert float(np.abs(made[name].picture - recorded).max()) <= TOLERANCE * float(np.abs(recorded).max())
+    difference = compare.difference(compare.read("reconstructions")[name], reconstructions.report(made[name]))
+    assert not difference, difference
