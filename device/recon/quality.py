@@ -114,6 +114,15 @@ def is_lit(quality: dict[str, float | None]) -> bool:
     return share is None or share >= LEAST_LIT
 
 
+def is_measured(name: str, quality: dict[str, float | None]) -> bool:
+    """Whether one of the PRESUMED figures of a frame that the model explains means something.
+
+    `coverage` always does; the figures of the spectrum only where the field is lit, and at most MOST_MISSING of the
+    frame is missing.
+    """
+    return name == "coverage" or (is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_MISSING)
+
+
 def matched(quality: dict[str, float | None]) -> Match:
     """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF.
 

@@ -17,7 +17,7 @@ from device.recon.model import field_radius_px
 from device.recon.plan import Planner, Spectrum
 from device.recon.prepare import Preparer
 from device.recon.psf_consistency import Match, PsfConsistency
-from device.recon.quality import PRESUMED, complaints, explains, is_lit, matched
+from device.recon.quality import PRESUMED, complaints, explains, is_lit, is_measured, matched
 from device.recon.refraction import Refraction, Refractor, can_refract
 from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
 from device.recon.upsample import to_sensor
@@ -239,8 +239,7 @@ class Reconstructor:
         explained = not dark and explains(quality, match, misfit)
         if not (explained and is_lit(quality)):
             eye = None
-        if not explained:
-            quality |= {key: None for key in PRESUMED if key in quality}
+        quality |= {key: None for key in PRESUMED if key in quality and not (explained and is_measured(key, quality))}
         if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
