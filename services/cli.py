@@ -17,6 +17,7 @@ from device.recon.geometry import Grid
 from device.recon.methods import DEFAULT, METHODS
 from device.spec import InstrumentSpec, load_head
 from device.values import Colour
+from services import resources
 from services.instrument import calibrations
 from services.instrument.once import Order, reconstruct_file, written
 from services.records.command import app as snapshots
@@ -31,7 +32,7 @@ app.add_typer(calibrations.app, name="calibrations")
 app.add_typer(update_app, name="update")
 app.add_typer(snapshots, name="snapshots")
 
-SIM_HEAD = Path(__file__).parent.parent / "hardware" / "heads" / "sim.toml"
+SIM_HEAD = resources.HEADS / "sim.toml"
 
 
 def _default_data() -> Path:

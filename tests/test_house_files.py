@@ -98,17 +98,42 @@ def test_make_clean_removes_all_that_git_ignores() -> None:
     assert not [line for line in text(".gitignore").split() if line.rstrip("/") not in recipe]
 
 
-def test_the_wheel_holds_what_the_instrument_needs_at_run_time(tmp_path: Path) -> None:
-    """Page, migrations, scenes and heads are not Python, and are easily left behind."""
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the wheel lays into site-packages."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
-    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
-        held = set(wheel.namelist())
-    needed = {
-        name for name in files() if re.match(r"(device|services|web)/(?!pictures/)|hardware/(heads/|optics.toml)", name)
-    }
-    needed |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
-    assert needed - held == set()
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as packed:
+        packed.extractall(folder / "site-packages")
+    return folder / "site-packages"
+
+
+def test_the_wheel_holds_what_the_instrument_needs_at_run_time(wheel: Path) -> None:
+    """Page, migrations, scenes and heads are not Python, and are easily left behind."""
+    held = {path.relative_to(wheel).as_posix() for path in wheel.rglob("*")}
+    code = {name for name in files() if re.match(r"(device|services)/(?!pictures/)", name)} - {"services/package.py"}
+    beside = {name for name in files() if re.match(r"web/|hardware/(heads/|optics.toml)|CHANGELOG.md", name)}
+    beside |= {f"web/vendor/{path.name}" for path in (ROOT / "web" / "vendor").glob("*.js")}
+    assert (code | {f"diffuscope/{name}" for name in beside}) - held == set()
+
+
+def test_the_wheel_lays_no_common_name_into_site_packages(wheel: Path) -> None:
+    """`web` is a library of others, and `hardware` or a changelog belongs to nobody there."""
+    assert {path.name for path in wheel.iterdir() if not path.name.endswith(".dist-info")} == {
+        "device", "services", "diffuscope",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("installed", ["wheel", "editable"])
+def test_diffuscope_is_imported_and_finds_its_page(wheel: Path, installed: str) -> None:
+    first = f"import sys; sys.path.insert(0, {str(wheel)!r}); " if installed == "wheel" else ""
+    asked = "import diffuscope; from services import resources as r; print(diffuscope.__version__, r.ROOT)\n"
+    there = "assert all(p.exists() for p in (r.WEB / 'index.html', r.HEADS / 'sim.toml', r.LIGHT_PATH, r.CHANGELOG))"
+    command = [sys.executable, "-c", first + asked + there]
+    answer = subprocess.run(command, cwd=wheel.parent, check=True, capture_output=True, text=True).stdout.split()
+    version = tomllib.loads(text("pyproject.toml"))["project"]["version"]
+    assert answer == [version, str(wheel / "diffuscope" if installed == "wheel" else ROOT)]
 
 
 def test_a_release_holds_what_the_program_needs_and_nothing_that_was_not_tested() -> None:

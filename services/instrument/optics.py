@@ -9,8 +9,8 @@ from device.optics.eye import Relay, size_mm
 from device.optics.light_path import LightPath, load_light_path, relay_of
 from device.sensors import SENSORS
 from device.spec import load_head
+from services import resources
 
-LIGHT_PATH = Path(__file__).parents[2] / "hardware" / "optics.toml"
 FIELDS_DEG = (33.4, 45.0, 48.3, 50.0, 51.2)
 MODEL_EYE_MM = 25.0  # behind which the paper's rulers and screens stand
 ENOUGH = 0.5  # of the light at the field's edge, where the solver knows what lies beyond the sensor (optics.md 1.5)
@@ -18,7 +18,7 @@ ENOUGH = 0.5  # of the light at the field's edge, where the solver knows what li
 
 def design(head: Path | None, sensor: str | None, eye_mm: float | None, pupil_mm: float | None) -> Design:
     """What is asked for: a head or a sensor, and the eye of `hardware/optics.toml` unless another one is said."""
-    path = load_light_path(LIGHT_PATH)
+    path = load_light_path(resources.LIGHT_PATH)
     if head is not None:
         found = design_of_head(path, load_head(head))
     elif sensor in SENSORS:
@@ -107,7 +107,7 @@ def _light(chosen: Design, budget: OpticalBudget) -> list[Row]:
 
 def comparison() -> str:
     """The tables of optics.md 1.2 and 1.5: the extent of five fields, and every sensor behind three designs."""
-    path = load_light_path(LIGHT_PATH)
+    path = load_light_path(resources.LIGHT_PATH)
     relay = relay_of(path, path.optics)
     return "\n".join([*_extents(relay), "", *_sensors(path, relay)])
 

@@ -8,10 +8,9 @@ from fastapi import FastAPI, Request
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
-import web
+from services import resources
 from services.instrument.joined import joined, joined_sheet
 
-FOLDER = Path(web.__file__).parent
 MEDIA = {
     ".css": "text/css", ".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript",
     ".svg": "image/svg+xml",
@@ -23,7 +22,7 @@ FOR_EVER = "public, max-age=31536000, immutable"  # other files have another add
 class Files:
     """What each page is made of, by address, plain and compressed; the addresses change when any file does."""
 
-    def __init__(self, folder: Path = FOLDER) -> None:
+    def __init__(self, folder: Path = resources.WEB) -> None:
         paths = sorted(path for path in folder.rglob("*") if path.suffix in MEDIA)
         texts = {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
         mark = hashlib.sha256(repr(texts).encode()).hexdigest()[:12]

@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from device.clock import Clock
 from device.errors import InputError, UpdateBusy, UpdateFailed, UpdateNoRoom, UpdateWrongDevice
+from services import resources
 from services.records import disk
 from services.records.update_notes import (
     FOR_EVERYBODY,
@@ -31,7 +32,6 @@ from services.records.update_notes import (
 
 MOST_BYTES = 2_000_000_000  # of a tablet's file; a bundle has some 350 MB
 PATIENCE_S = 90.0  # for whoever takes wishes to take one, on a computer that has much to do
-NEWS = Path(__file__).parents[2] / "CHANGELOG.md"
 NOT_HERE = "Updates are for the device. On another computer, put the new version in as its README says."
 
 
@@ -158,7 +158,7 @@ def _put(part: Path, whole: Path) -> None:
     disk.settle(whole.parent)
 
 
-def news(version: str, file: Path = NEWS) -> list[str]:
+def news(version: str, file: Path = resources.CHANGELOG) -> list[str]:
     """What is new in a version, without marks: its own list of changes, else the newest one; [] without a file."""
     try:
         said = file.read_text(encoding="utf-8")

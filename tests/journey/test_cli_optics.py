@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 
 import pytest
 
+from services import resources
 from services.cli import main
-from services.instrument import optics
 from tests.house import ROOT
 
 HEADS = ROOT / "hardware" / "heads"
@@ -109,4 +109,4 @@ def test_a_recording_without_optics_has_no_budget(capsys: pytest.CaptureFixture[
 
 
 def test_the_light_path_is_where_the_command_looks() -> None:
-    assert optics.LIGHT_PATH == ROOT / "hardware" / "optics.toml"
+    assert resources.LIGHT_PATH == ROOT / "hardware" / "optics.toml"

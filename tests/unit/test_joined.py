@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from services.instrument.joined import joined, joined_sheet
-from services.instrument.page import FOLDER, PAGES
+from services.instrument.page import PAGES
+from services.resources import WEB
 
 SMALL = {
     "app.js": """import "./side.js";
@@ -55,7 +56,7 @@ def test_what_cannot_be_joined_is_refused_by_name(change: dict[str, str], words:
 @pytest.mark.parametrize(("module", "sheet"), PAGES.values())
 def test_the_pages_lose_no_line(module: str, sheet: str) -> None:
     def read(name: str) -> str:
-        return Path(FOLDER / name).read_text()
+        return Path(WEB / name).read_text()
 
     parts = joined(module, read)
     whole = parts[module]

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,9 @@ from device.sim.staged import Staged
 from device.sim.world import World
 from device.spec import InstrumentSpec, load_head
 from device.values import Glow, Image, Mask, Shot
+from services import resources
 from services.instrument.paper.bench import Take, changed, merged
 
-HEADS = Path(__file__).parents[3] / "hardware" / "heads"
 SOFT_DEG = 0.5  # over which a lid's edge or the edge of the light falls off
 Pixels = NDArray[Any]
 Floats = NDArray[np.float64]
@@ -62,7 +61,9 @@ class Eye:
     def spec(self) -> InstrumentSpec:
         """The head with its scene."""
         backends = {"camera.backend": "sim", "light.backend": "sim"}
-        return merged(changed(load_head(HEADS / f"{self.head}.toml"), backends | dict(self.changes)), self.merged)
+        return merged(
+            changed(load_head(resources.HEADS / f"{self.head}.toml"), backends | dict(self.changes)), self.merged
+        )
 
     @cached_property
     def clean(self) -> HardFrame:

@@ -6,7 +6,6 @@ sensor. The brightest pixel comes from a rendered frame, whose peak over that me
 
 from collections.abc import Iterable
 from math import pi
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from device.clock import VirtualClock
@@ -15,12 +14,12 @@ from device.sim.render import blurred, psf
 from device.sim.world import World
 from device.spec import InstrumentSpec, load_head
 from device.values import Image
+from services import resources
 from services.instrument.optics import design
 from services.instrument.paper.bench import SCENES, Bench, Take, changed
 from services.instrument.paper.outcome import Experiment, Outcome, Sheet, above, within
 from services.instrument.paper.pictures import plane, side_by_side
 
-HEADS = Path(__file__).parents[3] / "hardware" / "heads"
 SCENE, HEAD = "human_eye_imx296", "imx296"
 OF_SCENES_E = 15000.0  # the brightest pixel of sim.toml and of most scenes
 NEARLY_FULL_E = 8000.0  # of the 10000 that a pixel of the IMX296 holds
@@ -58,7 +57,7 @@ def peak_over_mean(spec: InstrumentSpec) -> float:
 
 def human_light(name: str) -> HumanLight:
     """The light of a human eye with a shipped head, by its file's name without the ending."""
-    path = HEADS / f"{name}.toml"
+    path = resources.HEADS / f"{name}.toml"
     spec = load_head(path)
     mean_e = optical_budget(design(path, None, None, None)).electrons_per_px
     n = max(1, round(PIXEL_UM / spec.camera.pitch_um))
@@ -70,12 +69,12 @@ def human_light(name: str) -> HumanLight:
 
 def shipped_heads() -> list[str]:
     """The names of the head files, without their ending."""
-    return sorted(path.stem for path in HEADS.glob("*.toml"))
+    return sorted(path.stem for path in resources.HEADS.glob("*.toml"))
 
 
 def on_the_simulated_head() -> dict[str, Any]:
     """The changes that put the scene's eye before the simulated head, in the light of the other scenes."""
-    spec = load_head(HEADS / "sim.toml")
+    spec = load_head(resources.HEADS / "sim.toml")
     keys = ("rows", "cols", "pitch_um", "bit_depth", "black_dn", "full_well_e", "read_noise_e")
     return {f"camera.{key}": getattr(spec.camera, key) for key in keys} | {"sim.peak_e": OF_SCENES_E}
 
