@@ -225,7 +225,9 @@ class DefectFinder:
         sharp = steep(light, 0.5 * (1 + self._steepest), np.maximum(lit_dn, EDGE * around))
         narrow = (light < np.maximum(SHADOW * around, dark_dn)) & (around > lit_dn)
         wide = (light <= dark_dn) & ~narrow
-        return _with_sharp_border(narrow, sharp) | _with_sharp_border(wide, sharp)
+        shadows = _with_sharp_border(narrow, sharp)
+        # An area of 25 to 60 pixels is narrow along its border only: its middle borders on that.
+        return shadows | _with_sharp_border(wide, sharp | ndimage.binary_dilation(shadows))
 
 
 def steep(image: Image, share: float, least: Image) -> Mask:

@@ -15,6 +15,7 @@ SURELY = 3.0  # standard errors
 LEAST_LIT = 0.75  # share of the field
 MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
+MOST_UNSEEN = 0.1  # share of the pixels: without more, the figures of the spectrum rise while the picture gets worse
 PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
 FAINT_DN = 1e-9
 MISMATCHES = {
@@ -117,10 +118,10 @@ def is_lit(quality: dict[str, float | None]) -> bool:
 def is_measured(name: str, quality: dict[str, float | None]) -> bool:
     """Whether one of the PRESUMED figures of a frame that the model explains means something.
 
-    `coverage` always does; the figures of the spectrum only where the field is lit, and at most MOST_MISSING of the
+    `coverage` always does; the figures of the spectrum only where the field is lit, and at most MOST_UNSEEN of the
     frame is missing.
     """
-    return name == "coverage" or (is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_MISSING)
+    return name == "coverage" or (is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_UNSEEN)
 
 
 def matched(quality: dict[str, float | None]) -> Match:

@@ -8,6 +8,7 @@ within three standard deviations or none, and no false message.
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from device.recon.reconstructor import Reconstructor
@@ -88,3 +89,34 @@ def test_warm_pixels_that_nobody_marked_cost_nothing(
 ) -> None:
     frame = EYE.clean.with_raw(defects.warm(EYE.clean.raw, EYE.spec.camera, share, more_dn / 4095))
     judge(look(frame), clean, 0.01, "pixel", within)
+
+
+# Other eyes: the stored PSF is not theirs
+
+HYPEROPIC = Eye("hyperopic eye", "sim", {"sim.seed": 261, "sim.eye.m_dpt": -3.14})
+
+
+@pytest.fixture(scope="module")
+def hyperopic() -> Reconstructor:
+    take = HYPEROPIC.clean.take
+    return Reconstructor(take.calibration, take.shape, scenes.PLANNER, scenes.VirtualClock())
+
+
+def test_a_large_saturated_disc_of_a_hyperopic_eye_is_no_structure(hyperopic: Reconstructor, within: Within) -> None:
+    """A prior that rises below its band amplified what the edge of the disc leaves there: it lost .07."""
+    take = HYPEROPIC.clean.take
+    clean, full = (hyperopic(frame.raw) for frame in (HYPEROPIC.clean, saturated(0.043)(HYPEROPIC)))
+    within(take.likeness(take.sampled(clean.picture)) - take.likeness(take.sampled(full.picture)), 0.02)
+
+
+def test_a_scratch_does_not_pull_the_refraction_towards_the_stored_psf(
+    hyperopic: Reconstructor, within: Within
+) -> None:
+    """The gap is filled through the PSF of the last estimate, so the fit is repeated; fitted once it was 7 sd off."""
+    rows, cols = np.indices(HYPEROPIC.clean.raw.shape)
+    scratched = HYPEROPIC.clean.raw.copy()
+    scratched[np.abs(0.8 * (rows - 560) + 0.6 * (cols - 900)) < 6] = 0
+    clean, found = (hyperopic(counts).report.refraction_dpt for counts in (HYPEROPIC.clean.raw, scratched))
+    assert clean is not None
+    assert found is not None
+    within(abs(found["sphere"] - clean["sphere"]) / found["sd"], 2.0)

@@ -79,8 +79,13 @@ def rows(mask: Mask) -> None:
     mask[70:76] = True
 
 
+def blob(mask: Mask) -> None:
+    """As wide as narrow gaps may be along its border, and wider in its middle."""
+    mask[np.hypot(*(np.mgrid[: SHAPE[0], : SHAPE[1]] - np.array([80, 100])[:, None, None])) < 22] = True
+
+
 @pytest.mark.parametrize("value_dn", [0, int(BLACK_DN)])
-@pytest.mark.parametrize("put", [square, columns, rows])
+@pytest.mark.parametrize("put", [square, columns, rows, blob])
 def test_a_gap_without_light_is_found_whole(put: Callable[[Mask], None], value_dn: int) -> None:
     where = np.zeros(SHAPE, np.bool_)
     put(where)
