@@ -224,5 +224,6 @@ class Variation(EvidenceWiener):
         super().finish(out)
         noise, grid = self.noise, self.model.grid
         self.facts["residual"] = sweeps.chi(self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, grid.at)
-        left, light_dn = (self._y - self.blurred[grid.slices]) * self._good, self.facts["mean_dn"]
-        self.facts["quality"]["banding"] = quality.banding(left, noise.variance_dn2(light_dn), light_dn)
+        if isfinite(grid.radius_samples):  # else light from outside the frame leaves bands too
+            left, light_dn = (self._y - self.blurred[grid.slices]) * self._good, self.facts["mean_dn"]
+            self.facts["quality"]["banding"] = quality.banding(left, noise.variance_dn2(light_dn), light_dn)

@@ -148,4 +148,4 @@ def test_the_command_is_silent_about_right_psfs_and_names_a_rotation(tmp_path: P
 def said(folder: Path, raw: Path, *psfs: Path) -> tuple[str, ...]:
     """The warnings of `diffuscope reconstruct`, but for those about brightness."""
     order = Order(raw, psfs, folder / "out.npy", None, None, None, None, None, None, False, folder)
-    return tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)
+    return tuple(words for words in reconstruct_file(order).report.warnings if "too bright" not in words)
