@@ -6,11 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from device.recon.quality import LEAST_THROUGH
+from device.recon.quality import LEAST_THROUGH, MOST_SATURATED
 from device.recon.verdict import (
     LEAST_COVERAGE,
     LEAST_WIDE,
-    MOST_SATURATED,
     MOST_WIDE,
     ONE_SIDED,
     Reading,

@@ -1,17 +1,18 @@
 """Pixels of one frame that do not hold the light of the eye: saturated, dead, warm, or hit by a reflex.
 
-Calibrated dark frames and bad-pixel masks know the stable ones. This module finds the rest in the frame itself, from
-what the optics cannot do: the PSF is the sharpest picture that the diffuser can make, so a pixel that differs from its
-surroundings by more than the noise and the sharpest edge of the PSF holds something else than light.
+Calibrated dark frames and bad-pixel masks list the permanent defects. This module finds the others in the frame. The
+PSF has the highest local contrast that the optics can pass. A pixel whose local contrast exceeds the PSF's by more than
+the noise is not an image of light: it is a defect.
 
-* saturated pixels, and those around them whose noise the converter clips;
-* values below the black level that no noise explains;
+* saturated pixels, and the pixels around them whose noise the converter clips (CLIPPED_SD, CLIPPED_SHARE,
+  SATURATED_REACH_PX);
+* values below the black level by more than the noise and LOW_SHARE of that level;
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
-  deviations plus the PSF's own sharpness times the ring's range;
-* gaps without light (dead columns, rows, areas) behind a sharp edge;
-* the halo of a reflex: around a saturated area, light beyond what the blurred smooth field explains.
+  deviations plus `ring_ranges` of the PSF times the ring's range; none above MOST_OUTLIERS;
+* gaps without light (dead columns, rows, areas) with a sharp border (NARROW_PX, SHADOW, EDGE, EDGE_SHARE);
+* the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_SD).
 
-A frame without a suspect costs one pass over its pixels.
+A frame without a candidate pixel costs one pass over its pixels.
 """
 
 from dataclasses import dataclass, replace
@@ -49,9 +50,9 @@ HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo spoils the first fit of the field that shows it
 HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
 LEAST_AREA = 2  # samples of a saturated area that may have a halo
-PSF_NOISE_SD = (
-    1.0  # of a PSF's measured noise, in which its own lines count, taken off before its sharpness is measured
-)
+PSF_NOISE_SD = 1.0  # subtracted from the PSF's ring excess; the measured noise includes the PSF's own fine lines
+LOW_SHARE = 0.5  # of the black level: the lowest value of a working pixel is so far below it, plus the noise limit
+BLACK_PER_LIMIT = 4  # least black level over the noise limit; with a lower one, values below black are not tested
 FEW = 200  # suspects at the calibrated noise, which is right then
 PASSES = 3  # an outlier hides its neighbour until it is left out
 SAMPLES, LEVELS = 6_000, 6
@@ -67,15 +68,19 @@ class PixelNoise:
     floor_dn2: float
 
     def at_least(self, other: "PixelNoise") -> "PixelNoise":
-        """The larger of both at every brightness: a frame that is mostly dark shows little of its shot noise."""
+        """Return the larger `per_dn` with the larger `floor_dn2`: an upper bound of both models at every brightness.
+
+        A frame that is mostly dark determines its shot noise poorly.
+        """
         return PixelNoise(max(self.per_dn, other.per_dn), max(self.floor_dn2, other.floor_dn2))
 
     @classmethod
     def measured(cls, counts: Pixels, dark: Image, white_dn: float = float("inf")) -> "PixelNoise":
-        """The noise of a frame (rows, cols), from what a scatter of pixels differs by from their four neighbours.
+        """Estimate the noise of `counts` (rows, cols) from about SAMPLES pixels and their four neighbours.
 
-        A line is fitted through the trimmed variances of LEVELS groups of equal brightness, so the fine structure that
-        most pixels have counts as noise. Pixels at `white_dn` have none and are left out.
+        A line is fitted to the trimmed variances, in LEVELS groups of similar brightness, of a pixel minus the mean of
+        its neighbours; fine structure that most pixels have counts as noise. `dark` is (rows, cols) or (1, cols) in DN.
+        Pixels at `white_dn` are left out. With fewer than 3 rows or columns `floor_dn2` is infinite.
         """
         rows, cols = counts.shape
         if min(rows, cols) < 3:
@@ -135,10 +140,10 @@ class DefectFinder:
         self._suspect: Mask = np.zeros(shape, np.bool_)
 
     def __call__(self, counts: Pixels, dark: Pixels | None = None) -> Places | None:
-        """The defective pixels of a frame (rows, cols), uint16 or float32, as flat indices; None where there are none.
+        """Return the defective pixels of a frame (rows, cols), uint16 or float32, as flat indices; None if none.
 
-        `dark` is this shot's own dark frame. Pixels that the calibration marks are not searched. FrameError for another
-        shape than the calibration's.
+        `dark` is this shot's own dark frame. Pixels in the calibration's bad mask are skipped by the outlier test only.
+        FrameError for another shape than the calibration's.
         """
         fitting("frame", counts, self._shape)
         offset = self._dark if dark is None else fitting("dark frame", np.asarray(dark, np.float32), self._shape)
@@ -168,7 +173,10 @@ class DefectFinder:
         return np.flatnonzero(defective) if defective.any() else None
 
     def _mark_suspects(self, counts: Pixels, offset: Image, noise: PixelNoise) -> int:
-        """Mark in `_suspect` what lies apart from its neighbours or beyond black and white; the number of pixels."""
+        """Mark the candidate pixels in `_suspect` and return their number.
+
+        A candidate is saturated, below `_least_dn`, or off the mean of its four neighbours by more than NOISE_SD.
+        """
         limit = NOISE_SD**2 * float(LINE)
         return kernels.mark_suspects(
             counts, offset, limit * noise.per_dn, limit * noise.floor_dn2, self._white_dn,
@@ -192,19 +200,19 @@ class DefectFinder:
 
     @cached_property
     def _halo(self) -> "HaloFinder | None":
-        """Planned at the first saturated frame; None where no field is known."""
+        """Return the halo search, planned at the first saturated frame; None if the field radius is unknown."""
         if not isfinite(field_radius_px(self._calibration)):
             return None
         return HaloFinder(self._calibration, self._shape, self._index)
 
     def _least_dn(self, offset: Image, noise: PixelNoise) -> float:
-        """The lowest value above dark that a working pixel gives: half the black level below it."""
+        """Return the lowest value of a working pixel, in DN above dark; -3e38 if the black level is too low to test."""
         black_dn = float(offset.mean(dtype=np.float64))
         margin_dn = NOISE_SD * noise.floor_dn2**0.5
-        return -(0.5 * black_dn + margin_dn) if black_dn > 4 * margin_dn else -3e38
+        return -(LOW_SHARE * black_dn + margin_dn) if black_dn > BLACK_PER_LIMIT * margin_dn else -3e38
 
     def _outliers(self, counts: Pixels, offset: Image, noise: PixelNoise, places: Places) -> Places:
-        """The outliers among `places`; none if they are so many that they are the structure of the frame."""
+        """Return the outliers among `places` (flat indices); none if they exceed MOST_OUTLIERS of the pixels."""
         limit = NOISE_SD**2
         slope_dn, floor_dn2 = limit * noise.per_dn, limit * noise.floor_dn2
         odd, known = np.zeros(places.size, np.bool_), self._known.ravel()
@@ -216,9 +224,10 @@ class DefectFinder:
         return places[odd] if np.count_nonzero(odd) <= MOST_OUTLIERS * counts.size else places[:0]
 
     def _gaps(self, light: Image, dark_dn: float) -> Mask:
-        """Areas without light behind a sharp edge: what no blur by the PSF can leave dark.
+        """Return the areas without light (rows, cols) whose border is sharper than the PSF permits.
 
-        Narrow ones (NARROW_PX) are far darker than their surroundings; wider ones hold no light at all.
+        Areas up to NARROW_PX wide are below SHADOW times their surroundings or below `dark_dn`; wider ones are at most
+        `dark_dn`. `light` is in DN above dark.
         """
         lit_dn = LIT * dark_dn
         around = ndimage.grey_closing(light, (NARROW_PX, NARROW_PX))
@@ -231,10 +240,10 @@ class DefectFinder:
 
 
 def steep(image: Image, share: float, least: Image) -> Mask:
-    """Pixels beside a step, along a row or a column, of at least `least` and of `share` of its surroundings' range.
+    """Mark both pixels of every large step |b - c| between the neighbours b and c in a line a, b, c, d of `image`.
 
-    The range is that of four pixels in line, two on either side of the step; `least` (rows, cols) counts where it is
-    larger of the two sides.
+    Lines are rows and columns. A step is large if it exceeds `least` at b and at c and is at least `share` (0 to 1)
+    times the range of a, b, c, d. `image` and `least` are (rows, cols) in DN.
     """
     out = np.zeros(image.shape, np.bool_)
     for axis in (0, 1):
@@ -249,7 +258,7 @@ def steep(image: Image, share: float, least: Image) -> Mask:
 
 
 def steepest(psf: Psf) -> float:
-    """The largest share of the range of four pixels in line that the PSF itself passes in one step, 0 to 1."""
+    """Return the largest step of the PSF as a share (0 to 1) of the range of four pixels in line; see `steep`."""
     least = 0.1 * float(psf.pixels.max())
     lines = [line for line in (psf.pixels, psf.pixels.T) if len(line) >= 4]
     return max((float(_large_steps(line, least)[2].max(initial=0.0)) for line in lines), default=0.0)
@@ -287,9 +296,10 @@ class HaloFinder:
         self._smooth: Image = np.zeros(self._model.grid.shape, np.float32)
 
     def mask(self, counts: Pixels, dark: Pixels | None, defective: Mask) -> Mask:
-        """The pixels of halos, (rows, cols): rings around saturated areas with more light than the field explains.
+        """Return the halo pixels as a mask (rows, cols).
 
-        The field is fitted outside the halos that are known so far, and their rings measured again, HALO_TURNS times.
+        A halo is a set of rings around a masked area in which the light exceeds the fitted smooth illumination plus
+        stray light. Fit and ring test are repeated, without the halos found so far, at most HALO_TURNS times.
         """
         frame = self._prepare(counts, dark, np.flatnonzero(defective))
         lost = frame.good < 0.5
@@ -348,11 +358,11 @@ def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64]
 
 
 def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
-    """Saturated pixels, and those where the light is so near `white_dn` that the converter clips its noise.
+    """Mark saturated pixels, and pixels where the light is so near `white_dn` that the converter clips its noise.
 
-    `noise_dn` is the standard deviation there. Where the mean of a pixel's surroundings is within CLIPPED_SD of it from
-    the white level, only the lower part of the noise is left, and it draws the outline of the overexposed area. A hot
-    pixel has dark surroundings and stays alone.
+    The second kind has a local mean within CLIPPED_SD times `noise_dn` (standard deviation) of `white_dn`, at most
+    CLIPPED_SHARE of it. There the converter clips the upper part of the noise, so the remaining values are too low and
+    would form a border around the overexposed area. A hot pixel has dark surroundings; only that pixel is marked.
     """
     mean = ndimage.uniform_filter(np.minimum(counts, np.float32(white_dn)), 2 * SATURATED_REACH_PX + 1)
     near: Mask = mean > white_dn - min(CLIPPED_SD * noise_dn, CLIPPED_SHARE * white_dn)
@@ -363,9 +373,10 @@ def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
 
 
 def ring_ranges(psf: Psf) -> tuple[float, float]:
-    """How far the PSF itself goes beyond the range of its rings, in units of that range, for both rings of `outliers`.
+    """Return the largest excess of the PSF over its rings at distance 1 and 2 px, in units of the rings' ranges.
 
-    The PSF is the frame of one point, the sharpest that there is; its own noise is taken off.
+    The excess is (|pixel - ring median| - noise) / trimmed ring range, over pixels of at least 10 % of the peak. It is
+    the argument `ranges` of `kernels.outliers`; infinite for a PSF with fewer than 5 rows or columns.
     """
     pixels = psf.pixels
     if min(pixels.shape) < 5:

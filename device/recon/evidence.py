@@ -1,7 +1,7 @@
-"""The prior that the frame itself supports: empirical Bayes over a power law, no knob (optics.md 5.2, 6.2).
+"""Empirical-Bayes prior: a power law fitted to the frame's spectrum, without a user parameter (optics.md 5.2, 6.2).
 
-A retina's residual power falls like g(f) = A f^-k. The frame's spectrum then is |H|^2 g + s2, with the noise s2 known;
-A and k are those under which the spectrum that was seen is most likely. s2/g is the Wiener filter's regularisation.
+A retina's residual power falls like g(f) = A f^-k. The frame's power spectrum then is |H|^2 g + s2, with the OTF H and
+the known noise s2; A and k maximise the likelihood of the measured one. s2/g is the Wiener filter's regularisation.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,10 @@ STEPS = 5
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """g(f) = exp(log_power) (f / reference)^-slope, in the square of the residual spectrum's units."""
+    """g(f) = exp(log_power) (f / reference)^-slope, in the square of the residual spectrum's units.
+
+    `reference` is `Evidence.reference` in cycles per sample; `slope` is k.
+    """
 
     log_power: float
     slope: float
@@ -28,7 +31,10 @@ class PowerLaw:
 
 @dataclass(frozen=True)
 class Fit:
-    """The law, and what it was fitted to: |spectrum|^2 in the band, and the level of each ring."""
+    """The fitted power law and its data.
+
+    `seen` is |spectrum|^2 of the band's frequencies, (frequencies,); `levels` the estimate of g per ring, (BINS,).
+    """
 
     law: PowerLaw
     seen: NDArray[np.float64]
@@ -36,10 +42,10 @@ class Fit:
 
 
 class Evidence:
-    """The frequencies of one model on which a prior can be judged, and the fit itself.
+    """The frequency band used for the prior of one model, and the fit.
 
-    Band: from 16 cycles across the window, below which crop and shading live, to where the mean |H|^2 has fallen to a
-    twentieth of its best; at most 0.45 cycles per sample. f is in cycles per sample.
+    Lower limit: 16 cycles across the window; lower frequencies contain the crop edge and the shading. Upper limit: the
+    mean |H|^2 falls below 5 % of its maximum; at most 0.45 cycles per sample. f is in cycles per sample.
     """
 
     def __init__(self, model: Model) -> None:
@@ -80,14 +86,18 @@ class Evidence:
         return Fit(PowerLaw(*law), seen, levels)
 
     def regularisation(self, law: PowerLaw, noise_dn2: float) -> Image:
-        """s2 / g for every frequency of the half plane: float32."""
+        """Return s2 / g, float32 (rows, cols // 2 + 1), as the grid's rfft is laid out; constant below the band."""
         exponent = np.float32(law.slope) * self.all_logs + np.float32(np.log(noise_dn2) - law.log_power)
         reg: Image = np.exp(np.clip(exponent, -80, 80))
         return reg
 
 
 def band(frequency: NDArray[np.float64], power: NDArray[np.float64], samples: int) -> tuple[float, float]:
-    """From 16 cycles across `samples` to where the mean |H|^2 is a twentieth of its best; cycles per sample."""
+    """Return the limits (low, high) of the band in cycles per sample.
+
+    low is 16 / `samples`, at most 0.1; high is the ring where the mean `power` falls below 5 % of its maximum, from
+    2 low to 0.45. `frequency` and `power` are half-plane arrays of equal shape.
+    """
     low = min(16 / samples, 0.1)
     edges = np.linspace(low, 0.45, 24)
     rings = np.digitize(frequency.ravel(), edges)

@@ -37,7 +37,7 @@ def linearise(
     """Counts to linear DN from pixel `first` on, n x n to one: out = mean of s(counts - dark) * gain over good pixels.
 
     s takes the sensor's bend b out: s (1 + b s) = counts - dark, to the third order.
-    `gain` is 1/flat, and 0 where a pixel is not to be believed; NaN is not either, nor what has reached `white_dn`.
+    `gain` is 1/flat, and 0 for bad pixels. NaN counts, and counts at or above `white_dn`, are ignored too.
     A `dark` or a `gain` of one row holds for all rows. `good` becomes the good share of each block, 0 to 1; a block
     without a good pixel becomes 0. Returns the numbers of saturated and of good pixels, and the light on these in DN.
     """
@@ -252,7 +252,7 @@ def stretch(
 def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Image) -> None:
     """The mean light of the four neighbours of inner pixels, and what each differs by from it.
 
-    `places` count the pixels that have four neighbours, row by row.
+    `places` are flat indices into the image without its one-pixel border.
     """
     inner = counts.shape[1] - 2
     light = np.empty(5, np.float32)
@@ -272,8 +272,8 @@ def mark_suspects(
     """Mark in `out` (rows, cols) and count pixels that reach `white_dn`, or lie below `least_dn` above dark, or differ
     from the mean m of their four neighbours by more than sqrt(slope_dn m + floor_dn2).
 
-    A dark of one row holds for all rows. NaN is not marked: `linearise` leaves it out. The border is compared with
-    itself, so that only its value is judged.
+    A dark of one row holds for all rows. NaN is not marked: `linearise` leaves it out. In the first and last row the
+    pixel itself replaces the missing neighbour; in the first and last column only `white_dn` and `least_dn` apply.
     """
     rows, cols = counts.shape
     slope, floor, white, least = np.float32(slope_dn), np.float32(floor_dn2), np.float32(white_dn), np.float32(least_dn)
@@ -337,9 +337,10 @@ def outliers(
 ) -> int:  # fmt: skip
     """Mark in `odd` those of the pixels `places` (flat indices) that differ from a ring around them; their number.
 
-    A ring is the 8 pixels at distance 1 or the 16 at distance 2, without `known` defects. A pixel differs when it is
-    off the ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the ring's
-    own range, its 1 + k highest and lowest left out.
+    A ring is the 8 pixels at distance 1 (k = 0) or the 16 at distance 2 (k = 1), without `known` defects. A pixel
+    differs when it is off the ring's median by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]`
+    times the range of the ring without its 1 + k highest and 1 + k lowest values. Rings of at most 2 k + 4 values are
+    skipped.
     """
     ring = np.empty(16, np.float32)
     found = 0
@@ -364,9 +365,9 @@ def outliers(
 def ring_excess(
     image: Image, nothing: Image, none: Mask, least: float, slope_dn: float, floor_dn2: float
 ) -> tuple[float, float]:
-    """The largest `ranges` that `outliers` would need to find nothing in an image, among its pixels above `least`.
+    """The smallest `ranges` with which `outliers` marks no pixel of this image that is at least `least`.
 
-    `nothing` is a row of zeros, `none` a mask (rows, cols) that is nowhere true.
+    The two outermost rows and columns are not tested. `nothing` is a row of zeros, `none` a mask (rows, cols) of False.
     """
     rows, cols = image.shape
     ring, worst = np.empty(16, np.float32), np.zeros(2, np.float64)

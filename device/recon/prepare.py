@@ -29,7 +29,7 @@ class Linear:
 
     @property
     def has_gaps(self) -> bool:
-        """Whether a sample has lost more than half of its pixels; what is left of the others stands for the whole."""
+        """Whether a sample has lost more than half of its pixels; other samples use the mean of the remaining ones."""
         return self.missing > 0 and bool(self.good.min() < LEAST_GOOD)
 
 

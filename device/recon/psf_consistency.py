@@ -1,21 +1,21 @@
 """PSF consistency check: does a frame come through the given PSF, and in the given orientation.
 
-Two independent questions, both on one tapered spectrum Y of the frame:
+Two independent tests on tapered spectra Y of the frame; the amplitude test uses one taper, the phase test two:
 
 * amplitude: in narrow rings of frequencies |Y|^2 rises with |H|^2. `score` is the slope, 1 for an exact PSF without
-  noise, 0 for another diffuser's; light past the edge and a rough PSF lower it to 0.2. It cannot see a rotation by 180
-  degrees, which leaves |H| as it is.
+  noise, 0 for another diffuser's; light outside the sensor's edge and an inaccurate PSF lower it to 0.2. It does not
+  change under a rotation by 180 degrees, because |H| does not.
 * phase: the frame is deconvolved with conj(H) and with H, the PSF rotated by 180 degrees. Both pictures have the same
   power spectrum, so only their phases differ: the right one has sparse gradients (edges on smooth ground), the wrong
   one is noise-like. `orientation` is the difference of their sparsity,
 
       S(x) = mean log(1 + |D x|^2 / mean |D x|^2),    (S(rotated) - S(given)) / sd
 
-  with the sd from PSFs that are certainly wrong: the given one and its mirror image turned by ANGLES_DEG, and the mean
-  over two widths of the taper: the narrow one keeps more light, the wide one hides the false edge of a field that runs
-  past the sensor. Large
-  positive values prove the PSF, large negative ones prove the rotated one; near 0 nothing is proven. `mirrored` is the
-  same figure for the PSF mirrored left to right: positive for that one, negative for the PSF mirrored up to down.
+  where sd is the rms of the same difference over null PSFs: the given PSF and its mirror image, rotated by ANGLES_DEG.
+  The two tapers are averaged, and the mean is scaled by its own rms over the null PSFs. The narrow taper keeps more
+  light; the wide one hides the false edge of a field that extends past the sensor. Large positive values prove the
+  given PSF, large negative ones the rotated PSF; values near 0 prove nothing. `mirrored` is the same figure for the PSF
+  mirrored left to right: positive for that PSF, negative for the PSF mirrored top to bottom.
 
 Figures on recordings and simulated frames, and how the limits were chosen: README.md, 2026-11-22.
 """
@@ -45,7 +45,7 @@ MOST_BIN = 4
 LEAST_SAMPLES = 64  # of the short side
 MOST_SAMPLES = 400_000
 RING = 250  # frequencies: as in `witness`
-MOST_MISSING = 0.04  # share of the pixels: two frames of 48 with reflexes and 6 to 7 % missing looked foreign through the right PSF
+MOST_MISSING = 0.04  # share of the pixels: with reflexes and 6 to 7 % missing, two frames of 48 scored as foreign
 LEAST_SIGNAL = 1.3  # over the noise: below, right PSFs score as low as foreign ones (500 electrons at the peak: 1.2)
 AXIS = 3  # cycles across the frame: bad columns, bad rows and the false edge of a cut-off field are below
 PSF_ERROR = 0.02  # of the mean |H|^2: a frequency that the PSF does not pass is not amplified
@@ -57,7 +57,7 @@ Spectrum = NDArray[np.complex64]
 
 
 class Match(Enum):
-    """What a frame says about the PSF; UNKNOWN where it cannot tell."""
+    """Result of the PSF test; UNKNOWN if the data are insufficient for a decision."""
 
     CONSISTENT = "consistent"
     UNKNOWN = "unknown"
@@ -86,7 +86,12 @@ class Consistency:
 
     @property
     def match(self) -> Match:
-        """The verdict: FOREIGN and MIRRORED only where the score is surely too low, ROTATED only where it is not."""
+        """Return the verdict from score, sd, `orientation` and `mirrored`, with the limit L of the score.
+
+        L = MATCHES - PER_SD |orientation|. If score + 2 sd < L: UNKNOWN for sd > MOST_SD, MIRRORED for |mirrored| >
+        PROVEN, else FOREIGN. Otherwise: ROTATED for orientation < -PROVEN, CONSISTENT for score - 2 sd > L, else
+        UNKNOWN.
+        """
         least = MATCHES - PER_SD * abs(self.orientation)
         if self.score + 2 * self.score_sd >= least:
             if self.orientation < -PROVEN:
@@ -100,7 +105,10 @@ class Consistency:
 
 
 class PsfConsistency:
-    """Asks frames of one sensor shape about one PSF of a calibration; 0.4 s for 1080 x 1920, thrice that in doubt."""
+    """Test frames of one sensor shape against one PSF of a calibration.
+
+    Run time: 0.4 s for 1080 x 1920, three times that if the first result is FOREIGN.
+    """
 
     def __init__(self, calibration: Calibration, shape: Pair, index: int = 0) -> None:
         psf = calibration.psfs[index]
@@ -119,10 +127,13 @@ class PsfConsistency:
         self._tapers = [taper(self._grid.window, share) for share in TAPER_SHARES]
 
     def __call__(self, counts: Pixels, scale: float = 1.0, defects: Places | None = None) -> Consistency | None:
-        """The figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF stretched by `scale`.
+        """Return the figures of a frame (rows, cols) or (rows, cols, 3) in counts, for the PSF scaled by `scale`.
 
-        `defects` (flat indices) are filled from their surroundings, see `DefectFinder`. None where the frame or the PSF
-        is too small, too even, or too much of the frame is missing to be asked.
+        `scale` 1 is the stored size. `defects` (flat indices) are filled from their surroundings, see `DefectFinder`.
+        A FOREIGN result is tested again at the best of SCALES; ROTATED, or CONSISTENT with orientation > PROVEN, then
+        replaces it. None if a side has fewer than LEAST_SAMPLES / 2 samples, the PSF passes too few usable frequencies,
+        or a FOREIGN result comes from a frame with more than MOST_MISSING missing pixels or a mean |Y|^2 below
+        LEAST_SIGNAL times the noise.
         """
         if min(self._grid.shape) < LEAST_SAMPLES // 2:
             return None
@@ -252,7 +263,10 @@ def stretched(psf: Image, scale: float) -> Image:
 
 
 def filled(y: Image, good: Image) -> Image:
-    """The frame with every gap made up from the nearest good samples: a gap in bright light is structure of its own."""
+    """Return the frame with its gaps filled by normalised Gaussian interpolation of the good samples.
+
+    An unfilled gap would add its own spectrum. `y` and `good` are (rows, cols); `good` is 0 to 1, a gap at most 0.5.
+    """
     there = (good > 0.5).astype(np.float32)
     if there.all() or not there.any():
         return y

@@ -1,4 +1,4 @@
-"""How good a picture is, without knowing the truth: what the frame's own spectrum says (optics.md 8.3)."""
+"""Quality figures of a picture without a reference image, and the messages that follow from them (optics.md 8.3)."""
 
 from dataclasses import dataclass
 
@@ -15,9 +15,12 @@ SURELY = 3.0  # standard errors
 LEAST_LIT = 0.75  # share of the field
 MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
-MOST_UNSEEN = 0.1  # share of the pixels: without more, the figures of the spectrum rise while the picture gets worse
-PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")  # figures through the PSF
+MOST_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
+MOST_SATURATED = 0.001  # share of the pixels
+# Figures that use the PSF: set to None where the model does not explain the frame.
+PRESUMED = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")
 FAINT_DN = 1e-9
+# The words of these messages and of `complaints` are sorted by KINDS in services/instrument/hard_cases/judgement.py.
 MISMATCHES = {
     Match.FOREIGN: "The PSF does not match this frame. Give the PSF of this diffuser and camera, or measure it again.",
     Match.ROTATED: "The PSF is rotated by 180 degrees against this frame. Rotate the PSF by 180 degrees; run it again.",
@@ -36,9 +39,11 @@ class Limit:
 
 
 def cutoff(evidence: Evidence, law: PowerLaw, noise_dn2: float, n: int, geometry: Geometry | None) -> Limit:
-    """Q3: the frequency at which |H|^2 g falls to the noise s2; the single best number about a frame.
+    """Q3: return the lowest frequency at which the ring mean of |H|^2 g / s2 is below 1.
 
-    Searched outwards over rings of the band, so that one lucky frequency far out does not count; 0 if none is above.
+    The rings are tested from low to high frequency, so an isolated frequency of high SNR beyond is ignored. The result
+    is 0 if the first ring fails. `noise_dn2` (s2) is the noise power per frequency of the unnormalised DFT, not the
+    variance of a pixel; `n` is the bin in pixels.
     """
     snr = evidence.power * np.exp(law.log_power - law.slope * evidence.logs) / noise_dn2
     sums = np.bincount(evidence.bins, snr, BINS)
@@ -54,11 +59,11 @@ def cutoff(evidence: Evidence, law: PowerLaw, noise_dn2: float, n: int, geometry
 
 
 def structure(evidence: Evidence, seen: Series, levels: Series, noise_dn2: float) -> tuple[float, float]:
-    """Q7: how much better the PSF's own speckle explains the spectrum than a smooth one, and how sure that is.
+    """Q7: return the mean log-likelihood gain of the PSF's |H|^2 over a smooth spectrum, in nats and standard errors.
 
-    The first in nats per frequency, the second in its standard errors. Surely below zero where the PSF is not this
-    head's. Near zero says nothing: in little light the whole of a good picture is in the lowest frequencies, and their
-    share of all falls with the light. The rival is the ring mean of what was seen: any smooth spectrum.
+    The smooth spectrum is the ring mean of `seen`. A second value below -SURELY indicates the PSF of another head; a
+    value near 0 is inconclusive: at low light only the lowest frequencies, a small part of the band, have an SNR above
+    1, so the mean is near 0 also for a correct PSF. `seen` is |spectrum|^2, (frequencies,); `levels` is (BINS,).
     """
     rings = np.bincount(evidence.bins, minlength=BINS)
     smooth = (np.bincount(evidence.bins, seen, BINS) / np.maximum(rings, 1))[evidence.bins]
@@ -98,10 +103,10 @@ def is_banded(quality: dict[str, float | None]) -> bool:
 
 
 def explains(quality: dict[str, float | None], match: Match | None, misfit: float | None) -> bool:
-    """Whether the model explains the frame, so that what was estimated through the PSF means anything.
+    """Whether the forward model fits the frame; figures that use the PSF are valid only then.
 
-    Not so if the PSF does not match, the light did not come through the eye, or the picture leaves a `misfit` (rms, in
-    units of the noise) above MOST_MISFIT, or bands of flickering light.
+    False if the PSF does not match, the light did not come through the eye, `misfit` (rms residual in units of the
+    noise) is above MOST_MISFIT, or the light flickered.
     """
     through = quality.get("through")
     seen = through is None or through >= LEAST_THROUGH
@@ -139,7 +144,7 @@ def complaints(quality: dict[str, float | None], match: Match, misfit: float | N
     `misfit` is the rms of what the picture leaves unexplained in units of the noise; None where no field is known.
     """
     found = []
-    if (quality["saturated"] or 0) > 0.001:
+    if (quality["saturated"] or 0) > MOST_SATURATED:
         found.append(f"{quality['saturated']:.1%} of the pixels are too bright. Move back a little; take it again.")
     through = quality.get("through")
     if through is not None and through < LEAST_THROUGH:

@@ -1,13 +1,13 @@
 """The eye's refraction from the frame itself: the stretch of the stored PSF under which the frame is most likely.
 
-A defocused eye stretches the caustic (see `warp`), and with it the speckle of |H|^2 that is stamped on the spectrum of
-every frame. The spectral evidence of optics.md 6.2 is maximised over the stretch:
+Defocus scales the PSF about its axis (see `warp`). The fine structure of |H|^2 scales inversely; it modulates the power
+spectrum of every frame. The estimate of M minimises the negative log likelihood E (optics.md 6.2):
 
     E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
 
-R is what remains of the frame after its smooth part, blurred by the *candidate's* PSF, has been subtracted: blurred by
-one PSF for all candidates it pulls the answer a third of the way towards that PSF. The smooth part itself (`shading`)
-is fitted with the stored PSF for the coarse search, and again with the PSF that this found for the fine one.
+|H_M|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
+the smooth part is blurred by a fixed PSF, the estimate is biased by one third towards that PSF. The smooth part itself
+(`shading`) is fitted with the stored PSF for the coarse search, and with the PSF found by it for the fine search.
 """
 
 from collections.abc import Callable
@@ -52,11 +52,12 @@ SD_FACTOR = 1.4  # neighbouring frequencies are not independent; with it 23 fram
 
 @dataclass(frozen=True)
 class Refraction:
-    """What a frame says about the eye: mean sphere M in dpt (positive: myopia), its standard deviation, and the curve.
+    """Refraction estimate: mean sphere M in dpt (positive: myopia), its standard deviation, and the search curve.
 
-    `psf_scale` is the stretch of the stored PSF; `curve` holds (M in dpt, minus the log evidence) of every candidate of
-    the coarse search, sorted; `nats` is how much likelier its best is than its median. `noise_sd_dpt` is what the
-    photons alone explain, `disagreement_dpt` how far the upper half of the band is from all of it.
+    The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
+    (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
+    the coarse grid. `noise_sd_dpt` is the sd from the noise, with SD_PER_MISSING_DPT times the missing share in
+    quadrature; `disagreement_dpt` is |M of the upper half of the band - M of the full band|.
     """
 
     sphere_dpt: float
@@ -68,19 +69,29 @@ class Refraction:
 
     @property
     def sd_dpt(self) -> float:
-        """The standard deviation of M: one smooth but wrong valley shows where two parts of the band disagree."""
+        """Return the standard deviation of M in dpt: `noise_sd_dpt` and the excess disagreement in quadrature.
+
+        The excess is `disagreement_dpt` above UPPER_BIAS_DPT; it detects a false minimum of the likelihood.
+        """
         more_dpt = max(0.0, self.disagreement_dpt - UPPER_BIAS_DPT)
         return float(np.hypot(self.noise_sd_dpt, more_dpt))
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the stored PSF is as good: the eye is relaxed, as far as anyone can tell, or nobody can tell."""
+        """Whether the stored PSF is to be used: M is not significant, or the two parts of the band disagree.
+
+        That is |M| < max(0.12 dpt, 2 `noise_sd_dpt`), or `disagreement_dpt` > DISAGREED_DPT.
+        """
         return abs(self.sphere_dpt) < max(0.12, 2 * self.noise_sd_dpt) or self.disagreement_dpt > DISAGREED_DPT
 
 
 @dataclass(frozen=True)
 class Band:
-    """Frequencies that decide: where in the window's spectrum, in which ring, and what samples of n pixels pass."""
+    """The K frequencies of a search band; every array is (K,).
+
+    `where`: flat index into the window's rfft spectrum. `ring`: 0 to RINGS - 1. `rows`, `cols`: frequency in cycles per
+    sample. `share`: transfer of the n x n binning. `energy`, `power`: work arrays.
+    """
 
     where: NDArray[np.int64]
     ring: NDArray[np.int64]
@@ -92,7 +103,10 @@ class Band:
 
     @classmethod
     def of(cls, window: Pair, low: float, high: float, n: int) -> "Band":
-        """All frequencies of a window's spectrum between two, cycles per sample, in rings."""
+        """Select the frequencies between `low` and `high` (cycles per sample) of the rfft spectrum of `window`.
+
+        `window` is (rows, cols) in samples of n x n pixels; the RINGS rings are equally wide.
+        """
         down = np.fft.fftfreq(window[0]).astype(np.float64)
         across = np.fft.rfftfreq(window[1]).astype(np.float64)
         frequency = np.hypot(down[:, None], across[None])
@@ -106,7 +120,7 @@ class Band:
 
 
 def can_refract(calibration: Calibration) -> bool:
-    """Whether dioptres mean anything: the geometry and the illuminated field are known."""
+    """Whether the refraction can be estimated: geometry and field radius are known."""
     return calibration.geometry is not None and np.isfinite(field_radius_px(calibration))
 
 
@@ -156,13 +170,14 @@ class Refractor:
 
     @cached_property
     def defects(self) -> DefectFinder:
-        """The search for defective pixels, for callers that have no places of their own."""
+        """The defect search, for callers of `find` that have no `defects` of their own."""
         return DefectFinder(self._calibration, self._shape, self._index)
 
     def find(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Refraction | None:
-        """The refraction behind a frame (rows, cols) in counts; None where it does not tell, or is beyond the span.
+        """Estimate the refraction of a frame (rows, cols) in counts; None if it cannot be determined.
 
-        `defects` (flat indices) are left out, see `DefectFinder`.
+        None: the band has fewer than LEAST_FREQUENCIES, the fitted level is not positive, the minimum is less than
+        LEAST_NATS below the median, or |M| >= SPAN_DPT. `defects` (flat indices) are left out, see `DefectFinder`.
         """
         if self.band.where.size < LEAST_FREQUENCIES:
             return None
@@ -211,7 +226,7 @@ class Refractor:
         return upper.parabola(sphere_dpt, self.step_dpt / 2)[0]
 
     def scale(self, m_dpt: float) -> float:
-        """How an eye with mean sphere M stretches the PSF."""
+        """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
         return 1 - self.geometry.scale_per_dpt * m_dpt
 
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
@@ -219,7 +234,10 @@ class Refractor:
         return self.elastic.on(grid.shape, grid.n, transform(self.geometry, m_dpt))
 
     def fit_smooth(self, frame: Linear, otf: Spectrum) -> float:
-        """The spectrum of the frame's smooth part before the blur, fitted through this OTF; returns its mean level."""
+        """Set the model's OTF, fit the smooth object (before the blur) to the frame, and keep its spectrum.
+
+        The spectrum is used by `residual`. Return the mean level in DN.
+        """
         self.model.refocus(otf)
         self.shading.refocus()
         level, stray = self.shading.fit(frame, self._smooth)
@@ -244,7 +262,7 @@ class Refractor:
     def residual(self, frame: Linear, m_dpt: float) -> float:
         """Into the window's spectrum: the frame minus its smooth part through the candidate's PSF, tapered.
 
-        Returns the even light that never met the diffuser, in DN.
+        Return the constant stray light in DN.
         """
         model, grid = self.model, self.grid
         stretch = transform(self.geometry, m_dpt)
@@ -260,7 +278,10 @@ class Refractor:
         return stray
 
     def unlikelihood(self, frame: Linear, noise_dn2: float, m_dpt: float, part: Band) -> float:
-        """Minus the log evidence of a candidate in a part of the band; leaves |H|^2 in the part's `power`."""
+        """Return the negative log likelihood (nats, up to a constant) of the candidate M over `part` of the band.
+
+        Write |H|^2 + SMEAR times its ring mean to `part.power`, and |R|^2 to `part.energy`.
+        """
         self.residual(frame, m_dpt)
         stretch = transform(self.geometry, m_dpt)
         otf = self.elastic.at(part.rows, part.cols, part.share, self.grid.n, stretch)
@@ -278,7 +299,10 @@ class Refractor:
         )
 
     def noise_power(self, frame: Linear) -> float:
-        """Noise per frequency of the tapered window, from the sensor's gain or from the silent frequencies."""
+        """Return the noise power per frequency of the tapered window's DFT in DN^2.
+
+        It comes from the sensor's gain, or from the quarter of the frequencies with the lowest |H|^2.
+        """
         silent = np.abs(self.fft.spectrum.ravel()[self._silent].astype(np.complex128)) ** 2
         weight = float(np.vdot(self.seen, self.seen))
         noise = Noise.of(self.sensor, self.grid.n, float(np.median(silent)) / np.log(2) / weight, frame.mean_dn)
@@ -287,7 +311,7 @@ class Refractor:
 
 
 class Search:
-    """The search for a minimum on a line that costs one evaluation per new candidate."""
+    """One-dimensional minimum search over M; the value of each candidate is computed once."""
 
     def __init__(self, value: Callable[[float], float]) -> None:
         self._value = value
@@ -295,14 +319,17 @@ class Search:
         self.relief = 0.0
 
     def __call__(self, m_dpt: float) -> float:
-        """Minus the log evidence of a candidate inside the span."""
+        """Return the negative log likelihood of the candidate M, clipped to the span."""
         m_dpt = round(float(np.clip(m_dpt, -SPAN_DPT, SPAN_DPT)), 4)
         if m_dpt not in self.known:
             self.known[m_dpt] = self._value(m_dpt)
         return self.known[m_dpt]
 
     def ladder(self, step_dpt: float) -> float:
-        """The best of an even ladder over the whole span; `relief` is its median minus its least."""
+        """Evaluate an equidistant grid over +-SPAN_DPT, and return its point with the lowest value.
+
+        `relief` becomes the median minus the minimum of these values, in nats.
+        """
         rungs = np.linspace(-SPAN_DPT, SPAN_DPT, 2 * max(int(np.ceil(SPAN_DPT / step_dpt)), 2) + 1)
         values = [self(m_dpt) for m_dpt in rungs]
         self.relief = float(np.median(values) - min(values))

@@ -1,8 +1,8 @@
 """The low orders of a picture: an evenly bright field, its shading, and stray light, fitted through the blur.
 
-What is smooth over the whole field is what a cropped sensor determines worst by iteration and best by a small least
-squares: 45 Zernike polynomials on the field's disc, blurred once per PSF, and a constant for light that never
-passed the diffuser. Without it a small sensor needs 160 rounds for what 10 then do.
+On a cropped sensor an iterative solver converges slowly in the low spatial frequencies; a small least-squares fit
+determines them directly: 45 Zernike polynomials on the field's disc, blurred once per PSF, and a constant for light
+that did not pass the diffuser. Without this fit a small sensor needs 160 solver iterations, with it 10.
 """
 
 from collections.abc import Iterator
@@ -100,7 +100,8 @@ class Shading:
     def fit(self, frame: Linear, out: Image) -> tuple[float, float]:
         """Write the smooth picture into `out` (the grid); return the field's mean level and the stray light, in DN.
 
-        Missing pixels have weight 0: fitted to the zeros that stand in a gap, 45 modes would draw the gap.
+        `out` is float32 of the grid's shape. Missing samples have weight 0: otherwise the fit would follow the zeros in
+        a gap.
         """
         if frame.has_gaps:
             coefficients = self._fitted_around_gaps(frame)
@@ -133,7 +134,11 @@ def blocks(image: Image, n: int) -> Image:
 
 
 def modes(model: Model) -> Iterator[Image]:
-    """Zernike polynomials up to DEGREE on the field's disc, the even field first; computed only where the disc is."""
+    """Yield the Zernike polynomials up to radial degree DEGREE on the field's disc, not normalised.
+
+    The constant mode is first; the order is n, then m, ascending (m < 0: sine). Each is float32 of the grid's shape and
+    0 outside the disc.
+    """
     top, bottom, left, right = model.box
     v = (np.arange(top, bottom)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
     u = (np.arange(left, right)[None] - model.grid.centre[1]) / model.grid.radius_samples

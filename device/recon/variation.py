@@ -2,10 +2,11 @@
 
     min_x  1/2 sum W (y - b - crop(h * x))^2 + tau sum |D x|,   x >= 0 in the field, 0 outside
 
-W is one over the noise variance of each sample, 0 where the sensor saw nothing; tau is the rms, in the dual of D, of
-the noise that the evidence-prior Wiener filter would reject, so neither is chosen by eye. ADMM with three splits
-(Antipa et al. 2018 for the crop; here weighted): v = h * x, z = D x, w = x; two real FFT pairs a round. Its start is
-the shading fit plus the Wiener solution of what that leaves, so eight rounds do what a hundred do from zero.
+y is the frame in DN above dark, h the PSF, b the constant stray light. W is one over the noise variance of each sample,
+0 for missing samples. tau is KAPPA (fixed and tuned, 1.8) times the rms, in the dual norm of D, of the noise that the
+Wiener filter rejects. ADMM with three splits (Antipa et al. 2018 for the crop; here weighted): v = h * x, z = D x,
+w = x; two real FFT pairs a round. It starts from the shading fit plus the Wiener solution of the residual: eight rounds
+then reach what a hundred reach from zero.
 """
 
 from math import isfinite
@@ -31,7 +32,7 @@ FILLS = 2  # of a frame with gaps; see `_fill_gaps`
 
 
 class EvidenceWiener:
-    """Shading fit plus Wiener filter with the prior that the frame's evidence supports. One round; no knob."""
+    """Shading fit plus Wiener filter with the fitted empirical-Bayes prior: closed form, no user parameter."""
 
     rounds = 1
     inbox: Image | None = None
@@ -133,7 +134,10 @@ class EvidenceWiener:
         """Nothing more to do: it is a closed form."""
 
     def finish(self, out: Image) -> None:
-        """Hand the picture over: positive, dark outside the field."""
+        """Write the picture to `out` (grid, float32): clipped at 0, zero outside the field.
+
+        Add `coverage` to the quality figures if the field radius is known.
+        """
         np.maximum(self.x, 0, out=out)
         out *= self.model.mask
         noise_dn = float(self.noise.variance_dn2(self.level) ** 0.5)
@@ -142,7 +146,10 @@ class EvidenceWiener:
 
 
 class Variation(EvidenceWiener):
-    """The ADMM rounds on top of that start; `step` is public, so the caller owns the loop and the clock."""
+    """ADMM iterations from the Wiener solution of `EvidenceWiener`.
+
+    `step` runs one iteration; the caller controls their number and the time limit.
+    """
 
     rounds = 12
 
@@ -176,7 +183,10 @@ class Variation(EvidenceWiener):
         return np.asarray(np.abs(model.otf) ** 2 / gradient * weights / model.grid.size, np.float32)
 
     def start(self, frame: Linear) -> None:
-        """The evidence solution, then weights, tau and stiffness from it."""
+        """Compute the Wiener solution, and from it the data weights W, tau and the ADMM penalties.
+
+        `rho` is the penalty parameter for z and w, `stiffness` for v.
+        """
         super().start(frame)
         model, grid = self.model, self.model.grid
         typical = 1 / self.noise.variance_dn2(0.5 * float(frame.y.max()))
@@ -220,7 +230,10 @@ class Variation(EvidenceWiener):
         self.blurred[:] = data.inverse()
 
     def finish(self, out: Image) -> None:
-        """Hand the picture over, and say how well it explains the frame."""
+        """Write the picture to `out` (grid, float32), and its misfit to `facts`.
+
+        `residual` is the rms residual in units of the noise, `banding` the flicker figure in `facts["quality"]`.
+        """
         super().finish(out)
         noise, grid = self.noise, self.model.grid
         self.facts["residual"] = sweeps.chi(self.blurred, self._y, self._good, noise.per_dn, noise.floor_dn2, grid.at)

@@ -2,8 +2,8 @@
 
 A coarse, linear solution of the frame answers what can be asked of one frame: is it too bright or too dark, did the
 light come through the field or from everywhere, is a part of the field dark, does anything shine that is not the
-retina, is there less detail along one direction. What one frame cannot tell is not guessed: a smear of more than some
-degrees leaves nothing that points anywhere, and a lid looks like a wall.
+retina, is there less detail along one direction. Causes that one frame cannot show are not reported: motion blur of
+more than some degrees leaves no directional detail, and a closed lid gives the same frame as a wall.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -18,7 +18,7 @@ from device.recon.kernels import Pixels, Places
 from device.recon.model import Model, field_radius_px, tight_model
 from device.recon.plan import Planner
 from device.recon.prepare import Preparer
-from device.recon.quality import LEAST_THROUGH
+from device.recon.quality import LEAST_THROUGH, MOST_SATURATED
 from device.recon.reconstructor import plane
 from device.recon.variation import EvidenceWiener
 from device.values import Calibration, Image
@@ -29,8 +29,7 @@ Code = Literal[
     "shot.poor", "make.failed",
 ]  # fmt: skip
 
-# Limits. How often they hit and how often they cry wolf is measured in tests/hard/test_verdict.py.
-MOST_SATURATED = 0.001  # share of pixels, as in `quality.complaints`
+# Limits. Detection and false-alarm rates: tests/hard/test_verdict.py.
 # `wide` of a saturated frame: too much light flattens its middle, a reflex, which is small, does not.
 LARGEST_SPOT, SPOT, SPOT_PER_SHARE = 0.15, 0.975, 0.6
 LEAST_E_PER_UM2 = 0.5  # a human eye's photon budget gives 3.0, and a PCC of 0.91; 0.3 gives 0.81, 0.1 gives 0.67
@@ -78,9 +77,9 @@ def judge(reading: Reading, eye_before: bool = False) -> Verdict:
 
 
 def after(first: Verdict, residual: float | None, coverage: float | None, tries: int, retakes: int) -> Verdict:
-    """The verdict once the picture is made with the eye's own PSF; after `retakes` a bad one is simply not clear.
+    """Return the verdict after the reconstruction; after `retakes` tries any bad verdict becomes `shot.poor`.
 
-    The residual is told and decides nothing: stray light and worn pixels double it in pictures that are good.
+    The residual is recorded and does not affect the verdict: stray light and worn pixels double it in good pictures.
     """
     numbers = first.numbers | _rounded({"residual": residual, "lit": coverage})
     code = first.code

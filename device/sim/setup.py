@@ -1,6 +1,6 @@
 """One exposure as data: what every part of the light's way does. As made it is ideal; effects change it.
 
-    Scene    a head that says what it looks at, in one colour: what every effect is asked about
+    Scene    a head with its [optics] and [sim], in one colour: the input of every effect's size
     Size     an effect's answer: how much it would change the picture
     Setup    the way of the light from the object to the counts: effects change it, `render` follows it
 
@@ -66,7 +66,7 @@ class Scene:
 
     @property
     def seed(self) -> int:
-        """Where this head's chance begins."""
+        """Seed of this head's random numbers."""
         return self.sim.seed % 2**32
 
     @property

@@ -22,7 +22,7 @@ EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # nobody had this instrument before
 class Check:
     """One line of the list; `of_release` says that another version could be the cause, so an update is judged by it.
 
-    Not `known`: nothing is wrong as far as can be told, but there was nothing to look at.
+    Not `known`: the check is ok, but there were no data to judge by.
     """
 
     name: str
@@ -39,10 +39,9 @@ class Facts:
     """What an instrument knows of itself at one moment; None where it has no such part.
 
     `battery` is a share; `newest` when the last capture was; `presses` how long the last presses took, and by how much
-    each was later than it was allowed to be; `torn_bytes` what half-kept captures hold, one by one; `orphans` how many
-    captures are on the disk without an entry in the database; `damaged` how many captures and visits have an entry that
-    cannot be read; `unsent` how many visits wait to be sent, and how many of them need somebody (None: nothing is sent
-    from here).
+    each was later than it was allowed to be; `torn_bytes` the size of each incomplete capture; `orphans` the number of
+    capture folders without a row; `damaged` the number of captures and visits whose row cannot be read; `unsent` the
+    number of visits that wait to be sent, and how many of them need manual help (None: sending is not set up).
     """
 
     state: str
@@ -78,7 +77,7 @@ def camera(facts: Facts) -> Check:
 
 
 def lamp(facts: Facts) -> Check:
-    """It is dark at least once in as long as it may shine."""
+    """The lamp is dark at least once within 2 `max_on_s`."""
     value = "dark" if facts.lamp_is_dark else "does not go out"
     return Check("lamp", facts.lamp_is_dark, value, "dark when nobody looks", STAY_AWAY, of_release=True)
 
@@ -92,7 +91,7 @@ def calibration(facts: Facts) -> Check:
 
 
 def captures(facts: Facts) -> Check:
-    """The shelf takes a new file, gives the newest capture back as it was kept, and every capture has its entry."""
+    """The store accepts a file and returns the newest capture; no capture folder without a row, no damaged row."""
     limit = "can be written and read"
     if facts.store is not None:
         return _unless(facts.store, "captures", "", limit, of_release=True)
@@ -168,7 +167,7 @@ def clock(facts: Facts) -> Check:
 
 
 def speed(facts: Facts) -> Check:
-    """By how much the last hundred presses were later than their budgets, the slowest but one in a hundred."""
+    """The 99th percentile of the lateness of the last hundred presses, over their time budget, is at most LATE_S."""
     limit = f"99 of 100 at most {LATE_S:g} s over their budget"
     if not facts.presses:
         return Check("speed", True, "no pictures yet", limit, "", known=False)
@@ -186,7 +185,7 @@ def _of(ordered_s: Sequence[float], share: float) -> float:
 
 
 def sending(facts: Facts) -> Check:
-    """Whoever was finished gets to the receiver by himself."""
+    """No finished visit needs manual help to reach the receiver."""
     limit = "nobody needs help to be sent"
     if facts.unsent is None:
         return Check("sending", True, "not set up", limit, "", known=False)

@@ -1,6 +1,6 @@
-"""Rows go from the log of the database into its main file while nobody takes a picture.
+"""Checkpoints of the SQLite write-ahead log (WAL) into the main database file while no picture is taken.
 
-In the log alone, one wrong byte loses every row behind it.
+In the WAL, one wrong byte loses every row behind it.
 """
 
 import logging
@@ -13,14 +13,15 @@ from services.records.store import Store
 
 log = logging.getLogger(__name__)
 
-IDLE_S = 30.0  # without a press and without aiming, then the log is emptied
+IDLE_S = 30.0  # without a press and without aiming, before a checkpoint
 LOOK_S = 2.0
 
 
 class Checkpoints:
-    """A thread that empties the log: at the first moment without a press after `soon`, else after IDLE_S of rest.
+    """Background thread that checkpoints the WAL.
 
-    `is_idle` says that nobody presses or aims, `takes_none` that no picture is being taken.
+    After `soon`: as soon as no picture is being taken (`takes_none`); otherwise: after IDLE_S without a press or aiming
+    (`is_idle`).
     """
 
     def __init__(self, store: Store, is_idle: Callable[[], bool], takes_none: Callable[[], bool], clock: Clock) -> None:
@@ -30,25 +31,25 @@ class Checkpoints:
         self._thread: Thread | None = None
 
     def begin(self) -> None:
-        """Look every LOOK_S from now on."""
+        """Start the thread, which calls `step` every LOOK_S."""
         self._closing.clear()
         self._thread = Thread(target=self._watch, name="checkpoints", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more; the store empties its log when it is closed."""
+        """Stop the thread and wait for its end; `Store.close` makes the last checkpoint."""
         self._closing.set()
         self._wake.set()
         if self._thread is not None:
             self._thread.join()
 
     def soon(self) -> None:
-        """A visit was finished: its rows are to be in the main file."""
+        """Request a checkpoint; called after a visit is finished."""
         self._soon.set()
         self._wake.set()
 
     def step(self) -> bool:
-        """Empty the log if now is the time for it; whether it was emptied."""
+        """Checkpoint the WAL if a condition for it holds; return whether it was emptied."""
         now_s = self._clock.now_s()
         if not self._is_idle():
             self._idle_since_s = None

@@ -82,7 +82,7 @@ class Exam:
 
     @property
     def state(self) -> str:
-        """`starting`; `busy` while no press is taken; `making` while one is made and a press is welcome; else `aim`."""
+        """`starting`; `busy`: presses are refused; `making`: a picture is made, presses are accepted; else `aim`."""
         if not self.ready.is_set():
             return "starting"
         if self._is_busy():
@@ -118,7 +118,7 @@ class Exam:
     def preview(self, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
         """The next live picture after number `after` as it is `wanted`; None when none comes in `wait_s`.
 
-        Its light counts for both eyes while nobody knows which one looks.
+        Its light counts for both eyes unless `wanted` names one.
         """
         with self._turn:
             self._wanted = wanted

@@ -65,7 +65,7 @@ class Exposed:
 
 
 class Keys:
-    """The last presses by the names that pages gave them; whoever uses it holds the exam's turn."""
+    """The last presses by their idempotency keys. The caller must hold `Exam._turn`."""
 
     def __init__(self) -> None:
         self._presses: OrderedDict[str, Press] = OrderedDict()

@@ -26,7 +26,7 @@ PRESSES = 100
 
 
 def facts(owner: Owner, people: People, sender: Sender | None = None) -> Facts:
-    """Everything that the checks judge, as it is now; while the head is calibrated, nothing of its parts."""
+    """Collect the current inputs of the checks; without those of the head's parts while the head is calibrated."""
     house, head = owner.house, owner.head
     chips, bus = head.chips if head is not None else Chips(), house.spec.bus
     newest, orphans, damaged, store = _shelf(house.store, people)
@@ -54,7 +54,7 @@ def _told(read: Callable[[], float]) -> DiffuscopeError | float:
 
 
 def _goes_dark(head: Head, clock: Clock) -> bool:
-    """Seen dark once within as long as it may shine at a stretch; while somebody aims it is lit half of the time."""
+    """Whether the lamp is dark at least once within 2 `max_on_s`; while aiming it is lit half of the time."""
     begin_s = clock.now_s()
     while head.light.glow is not None:
         if clock.now_s() - begin_s > 2 * head.light.max_on_s:
@@ -64,7 +64,7 @@ def _goes_dark(head: Head, clock: Clock) -> bool:
 
 
 def _calibration(owner: Owner) -> DiffuscopeError | None:
-    """Why no picture should rest on it."""
+    """Return the error that forbids captures with this calibration; None if it is valid."""
     if owner.needed is not None:
         return owner.needed
     try:
@@ -75,9 +75,9 @@ def _calibration(owner: Owner) -> DiffuscopeError | None:
 
 
 def _shelf(store: Store, people: People) -> tuple[list[Capture], int, int, StoreError | None]:
-    """The last captures, how many have no entry, how many entries cannot be read, and what is wrong with the shelf.
+    """Return the last captures, the numbers of capture folders without a row and of damaged rows, and an error.
 
-    It must take a file and give the newest capture back.
+    The StoreError is None if the store accepts a file and returns the newest capture.
     """
     try:
         newest = store.captures(PRESSES)

@@ -1,9 +1,10 @@
 """A second copy of the dose ledger beside the database, so that a damaged log or an older database lowers no dose.
 
-    light.copy      two blocks of BLOCK_BYTES, written in turn: length, CRC-32, JSON; the newer one that is whole counts
+    light.copy      two blocks of BLOCK_BYTES, written alternately: length (u32 LE), CRC-32 (u32 LE), JSON
 
-It is written in place after each commit and never synced: the database is what outlives a power cut. The system writes
-the copy within seconds, no press waits for it, and it is read where the database may have lost rows.
+The block with the highest `number` among those with a valid CRC is used. The file is overwritten after each commit
+without fsync: only the database is durable across a power cut. The operating system writes the copy within seconds; no
+exposure waits for it. It is read where the database may have lost rows.
 """
 
 import json
@@ -28,7 +29,10 @@ class DoseCopy:
         self._number = max((number for number, _ in self._blocks()), default=0)
 
     def higher(self, page: Page) -> None:
-        """Raise what is lower in `page` than in the copy: each dose, and the time that was seen."""
+        """Raise each dose (J/cm2) and the observed time (s) in `page`, in place, to at least the copy's value.
+
+        No effect without a valid block.
+        """
         newest = max(self._blocks(), key=lambda block: block[0], default=None)
         if newest is None:
             return
@@ -52,7 +56,7 @@ class DoseCopy:
             os.close(descriptor)
 
     def _blocks(self) -> list[tuple[int, Page]]:
-        """The blocks that are whole."""
+        """Return number and state of each block with a valid CRC."""
         file = self._path.read_bytes() if self._path.exists() else b""
         blocks = (file[start : start + BLOCK_BYTES] for start in (0, BLOCK_BYTES))
         return [found for block in blocks if (found := _read(block)) is not None]

@@ -18,7 +18,7 @@ def permit_test_picture() -> None:
 
 @dataclass(frozen=True)
 class Errand:
-    """A slot of a visit and its part, how often it was tried and may be tried, and what `beside` writes with it.
+    """Target of a capture: visit, slot, field, tries so far, permitted retakes; `beside` writes rows with it.
 
     `permit` is called right before the light: it raises ConsentMissing or ConsentDeclined where the visit does not
     allow any. Without a visit the picture is a test picture.

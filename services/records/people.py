@@ -79,7 +79,7 @@ class People:
     def answer(self, key: str, id: str, name: str, value: Any) -> Visit:
         """Write one answer down; None is none. InputError if it cannot be one, VisitFinished if too late.
 
-        Of what tells who somebody is nothing stays when it is taken back.
+        Clearing an identifying field deletes it; no history is kept.
         """
         value = answers.checked(name, value)
 

@@ -1,7 +1,7 @@
-"""Values of one row, checked one by one: a row that cannot be read is one damaged record, and no failed list.
+"""Validation of the values of one row: an unreadable row is one damaged record, and the other rows are still listed.
 
-Connections hand text over with `surrogateescape` (schema.py), so bytes that are no UTF-8 arrive here, and are no error
-of the driver. Whatever passes here can be written as JSON: text without half characters, numbers that are finite.
+Connections decode text with `surrogateescape` (schema.py): bytes that are not UTF-8 arrive here without an error of the
+driver. Values that pass can be written as JSON: text without lone surrogates, and finite numbers.
 """
 
 import json
@@ -25,7 +25,10 @@ Value = TypeVar("Value")
 
 @contextmanager
 def one_record(name: object) -> Iterator[None]:
-    """StoreDamaged, with the name of the record, for whatever in its rows cannot be read."""
+    """Convert errors of reading a row to StoreDamaged with the record's name; a context manager.
+
+    Converted: ValueError, TypeError, KeyError, OverflowError and RecursionError.
+    """
     try:
         yield
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
@@ -92,7 +95,7 @@ def report(value: object) -> dict[str, Any]:
 
 
 def verdict(value: object) -> dict[str, Any]:
-    """A verdict; ValueError if it has another shape."""
+    """Return a verdict: a mapping whose optional `word` is text; ValueError otherwise."""
     text(_mapping(value).get("word", ""))
     return dict(_mapping(value))
 

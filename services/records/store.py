@@ -4,7 +4,7 @@
     shelf.sqlite-wal              rows that are not in the main file yet (`checkpoint`)
     captures/<id>/<name>          and their files
     captures/.<id>.part/          being written; no row yet
-    torn/<id>/                    found half-kept at an opening: never listed, for the technician; gives its room up
+    torn/<id>/                    incomplete at an opening: not listed, kept for the technician until space is needed
     snapshots/                    the tables as they were before each migration (snapshots.py)
 
 The row is the promise: it is written last, when every file it names is on the disk. A folder that has all files of a
@@ -197,14 +197,14 @@ class Store:
         return self._room_bytes() * number // total_bytes if total_bytes else self.space_left() // pictures
 
     def torn(self) -> dict[str, int]:
-        """The half-kept in `torn/`, the oldest first, with its bytes: it goes when a new capture needs the room."""
+        """Return the incomplete captures in `torn/` and their bytes, oldest first; deleted if a capture needs space."""
         places = [place for place in sorted(self._torn.iterdir()) if not _is_whole(place)]
         return {place.name: disk.size_bytes(place) for place in places}
 
     def orphans(self) -> list[str]:
-        """The captures whose folder has all its files and which have no row: not listed, and never removed.
+        """Return the names of the capture folders without a row that have all files: not listed, and never removed.
 
-        Those that an earlier release moved to `torn/` are among them.
+        Those that an earlier release moved to `torn/` are included.
         """
         with told(), disk.alone(self._lock):  # one that is being kept gets its row
             folders = [*self._strays(), *self._torn.iterdir()]
@@ -246,13 +246,13 @@ class Store:
             raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
 
     def _strays(self) -> list[Path]:
-        """Every folder without a row."""
+        """Return every capture folder without a row."""
         with Session(self.engine) as session:
             kept = set(session.scalars(select(CaptureRow.id)))
         return sorted(path for path in self._captures.iterdir() if path.is_dir() and path.name not in kept)
 
     def _sweep(self) -> tuple[str, ...]:
-        """Move every half-kept folder without a row aside."""
+        """Move every incomplete capture folder without a row to `torn/`; return the names."""
         half = [stray for stray in self._strays() if stray.name.startswith(".") or not _is_whole(stray)]
         swept = tuple(disk.move_aside(stray, self._torn) for stray in half)
         if swept:

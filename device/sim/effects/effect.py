@@ -16,4 +16,4 @@ class Effect(Protocol):
         """How much it would change the picture of this scene: a closed form, nothing is rendered."""
 
     def apply(self, setup: Setup) -> None:
-        """Put it into a setup. Harmless where it is nothing."""
+        """Change the setup; no change if the size is 0."""

@@ -2,15 +2,16 @@
 
 With f1 and f2 the lenses, a = f1 / f2, the relay is afocal: a ray that leaves an LED at rho (mm off the axis) under
 the slope psi enters the eye under theta = -psi / a, whatever its LED. At the pupil it is a (rho - a b theta) off the
-axis, b being how far the ring stands from the plane that is conjugate to the pupil. The cap's hole in front of each LED
-passes the cone of the field, one and the same disc on the retina; of that disc LED i lights what the pupil passes,
+axis, b (`sim.light.ring_offset_um`) being the distance of the ring from the plane that is conjugate to the pupil.
+Through its hole in the cap each LED could light the same disc of the retina (the field); it lights only the part whose
+rays pass the pupil. For LED i this is
 
     |a rho_i - a^2 b theta - c| <= P / 2,   a disc around (a rho_i - c) / (a^2 b) of radius P / (2 a^2 b),
 
-with c the pupil's decentration and P its diameter; the emitter's width makes the edge soft. The field is lit by the sum
-of these discs. For b = 0 every LED lights the whole field: spread and a dead LED change the common gain only, which the
-exposure takes out (optics.md 3.5). This is how the paper trims its field by moving the ring along the axis.
-The eye's pupil is taken to stand in the relay's focus.
+with c the pupil's decentration (`decentred_um`) and P its diameter (`pupil_um`); the emitter's width softens the edge.
+The field is lit by the sum of these discs. For b = 0 every LED lights the whole field: spread and a dead LED change the
+common gain only, which the exposure takes out (optics.md 3.5). This is how the paper trims its field by moving the ring
+along the axis. The eye's pupil is taken to stand in the relay's focus.
 """
 
 from math import cos, hypot, pi, radians, sin
@@ -43,7 +44,7 @@ def leds_mm(scene: Scene) -> list[Place]:
 
 
 def drives(scene: Scene) -> NDArray[np.float64]:
-    """The light of each LED over the mean of them all: spread by the scene's seed, 0 for the dead one."""
+    """Return each LED's share of the ring's total light, (LEDs,); the shares sum to 1, and the dead LED has 0."""
     light, count = scene.sim.light, len(leds_mm(scene))
     draws = np.random.default_rng((scene.seed, 9)).standard_normal(count)
     drive = np.maximum(1 + light.led_spread * draws, 0.0)
@@ -63,7 +64,7 @@ def clearance_mm(scene: Scene) -> float:
 
 
 def uneven(scene: Scene) -> bool:
-    """Whether the pupil cuts the light of an LED somewhere in the field, and not the same everywhere."""
+    """True if the ring is offset and the pupil cuts at least one ray; then the field is unevenly lit."""
     lit = scene.sim.eye.shown_by != "screen"
     return lit and scene.sim.light.ring_offset_um != 0 and clearance_mm(scene) < 0
 

@@ -36,7 +36,7 @@ def size(scene: Scene) -> Size:
 
 
 def apply(setup: Setup) -> None:
-    """Let only that part of the iris shine which the beam of each place covers."""
+    """Register how far the beam's middle is from the iris's, in um, for each place in the field."""
     scene = setup.scene
     eye, m = scene.sim.eye, 1 / scene.optics.angular_magnification
 

@@ -59,7 +59,7 @@ def saturated(share: float) -> Build:
 
 
 def undeclared(where: Callable[[tuple[int, int]], Mask]) -> Build:
-    """Dead pixels that read 0, which nothing but their value tells."""
+    """Dead pixels that read 0 and are in no calibration mask."""
     return lambda eye: eye.clean.with_raw(defects.read_as(eye.clean.raw, where(_shape(eye)), 0))
 
 
@@ -74,7 +74,7 @@ def declared(where: Callable[[tuple[int, int]], Mask]) -> Build:
 
 
 def warm(share: float, more: float) -> Build:
-    """Warm pixels that no dark frame shows."""
+    """Warm pixels without a matching dark frame: a `share` of the pixels, raised by `more` times the white level."""
     return lambda eye: eye.clean.with_raw(defects.warm(eye.clean.raw, eye.spec.camera, share, more))
 
 
@@ -89,12 +89,15 @@ def offset(more_dn: float) -> Build:
 
 
 def flicker(share: float) -> Build:
-    """A lamp whose light swings by a share while the rows are read."""
+    """A lamp with sinusoidal flicker (100 Hz) of relative amplitude `share`, read row by row in 32 ms."""
     return lambda eye: eye.clean.with_raw(defects.flicker(eye.clean.raw, eye.spec.camera, share))
 
 
 def gain(factor: float) -> Build:
-    """A camera that collects `factor` times the electrons per count that the head file says, in as many counts."""
+    """A camera whose true gain (e-/DN) is `factor` times the gain in the head file.
+
+    The mean counts are unchanged; the noise in DN differs.
+    """
 
     def build(eye: Eye) -> HardFrame:
         well_e = eye.spec.camera.full_well_e * factor
@@ -104,7 +107,7 @@ def gain(factor: float) -> Build:
 
 
 def of_eye(more_dpt: float) -> Build:
-    """The eye is so far from the one of the PSF, which is this head's."""
+    """An eye with `more_dpt` more mean sphere (positive: myopia) than the clean frame's, and the same stored PSF."""
 
     def build(eye: Eye) -> HardFrame:
         sim = eye.spec.sim
@@ -115,7 +118,7 @@ def of_eye(more_dpt: float) -> Build:
 
 
 def psf_of_eye(more_dpt: float) -> Build:
-    """The PSF was taken with an eye so far from the model eye's rest."""
+    """A stored PSF that was measured through a model eye with mean sphere `more_dpt` instead of 0."""
     return lambda eye: eye.frame({"sim.calibration.m_dpt": more_dpt})
 
 
@@ -125,12 +128,12 @@ def peak(peak_e: float) -> Build:
 
 
 def stray(share: float) -> Build:
-    """Even light that comes with the lamp, as a share of the mean signal."""
+    """Uniform stray light from the lamp; `share` is its ratio to the mean signal."""
     return lambda eye: eye.frame({"sim.light.stray": share})
 
 
 def motion(way_deg: float) -> Build:
-    """The eye drifts so far within one exposure."""
+    """An eye that rotates by `way_deg` (degrees in the field) at constant speed during one exposure."""
     return lambda eye: eye.frame({"sim.eye.drift_deg_per_s": way_deg / eye.spec.camera.exposure_s})
 
 

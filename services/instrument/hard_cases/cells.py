@@ -1,7 +1,8 @@
-"""The columns of the grid: each hard frame through `diffuscope reconstruct` with every method, and as the instrument.
+"""The columns of the grid: each hard frame, reconstructed with every method and with the instrument's default sequence.
 
-A frame becomes the files that a user gives (raw, PSF, head file, flat frame), and the command's own functions read
-them. Only the planned solver is kept from one frame to the next of the same files; a command plans it every time.
+A frame is written as the files that a user gives (raw, PSF, head file, flat frame), and the functions of
+`diffuscope reconstruct` read them. The planned solver is kept for frames with the same other files; the command plans
+it every time.
 """
 
 from collections import OrderedDict
@@ -22,21 +23,21 @@ from services.instrument.hard_cases.cases import CLEAN, Case
 from services.instrument.hard_cases.frames import Eye, HardFrame, head_toml
 from services.instrument.once import Order, calibrated, planned
 
-LADDER = "ladder"  # as the instrument: the quick look, the refraction, then the rounds
+LADDER = "ladder"  # the instrument's default sequence: quick look, refraction, iterations
 COLUMNS = (LADDER, *METHODS)
 PATIENT_S = 600.0  # a deadline that cuts nothing off
-CRASHES = (ArithmeticError, ValueError, LookupError, TypeError)  # what no user may ever see; a column of its own
+CRASHES = (ArithmeticError, ValueError, LookupError, TypeError)  # no user may see these; reported as `Cell.crashed`
 KEPT = 8  # planned solvers at a time: each of a full sensor holds about 300 MB at most
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What one method made of one frame.
+    """The result of one method on one frame.
 
-    `pcc` is the correlation with the truth inside the lit field, `lost` what it is below the same method's clean frame
-    there; both None where the frame was refused with `refused`, or the solver `crashed` with these words. `sphere_dpt`
-    with `sd_dpt` is the refraction given, None where none is; `true_dpt` is the one that the frame holds, None where it
-    holds none.
+    `pcc` (-1 to 1) is the correlation with the truth inside the lit field, `lost` the clean picture's `pcc` of the same
+    method minus it. Both are None if the frame was refused with the message `refused`, or if the solver `crashed`.
+    `sphere_dpt` with `sd_dpt` is the estimated, `true_dpt` the true spectacle correction (negative: myopia), relative
+    to the eye of the PSF: minus `Refraction.sphere_dpt`. None: not estimated, or undefined for the frame.
     """
 
     eye: str
@@ -99,7 +100,7 @@ class Grid:
                 raise AssertionError(f"the clean frame of {eye.name} is refused: {cell.refused}")
 
     def cells(self, case: Case) -> list[Cell]:
-        """One row."""
+        """Reconstruct the frame of `case` with every column; return one `Cell` per column, in their order."""
         frame = case.build(self.eye)
         return [self._cell(case, frame, column) for column in self.columns]
 
@@ -129,7 +130,10 @@ class Grid:
         return self._inside & (frame.take.sampled(frame.seen.astype(np.float32)) > 0.99)
 
     def files(self, frame: HardFrame, column: str) -> tuple[Order, tuple[object, ...]]:
-        """The files of a frame, written, and the order of a column; and what the files but the raw hold."""
+        """Write raw, PSF, head file and flat; return the order for `column`, and a cache key of all files but the raw.
+
+        The key holds the hashes of the PSF and of the flat's NaN mask, and the head file's text.
+        """
         raw, psf, head = (self.folder / name for name in ("raw.npy", "psf.npy", "head.toml"))
         np.save(raw, frame.raw)
         np.save(psf, frame.psf)

@@ -1,7 +1,7 @@
 """Defects that the simulator does not have, put into the raw counts: one function each.
 
-Counts are uint16 (rows, cols); `white_dn` is where the converter ends, `black_dn` the level without light. Sizes are
-shares of the sensor's short side, so that merged pixels meet the same defect.
+Counts are uint16 (rows, cols); `white_dn` is the full-scale count, `black_dn` the count without light. Sizes are shares
+of the rows, positions shares of rows or columns, so that merged pixels have the same defect.
 """
 
 from typing import Any
@@ -80,7 +80,7 @@ def glare(counts: Counts, camera: CameraSpec, share: float) -> Counts:
 
 
 def flicker(counts: Counts, camera: CameraSpec, share: float) -> Counts:
-    """The lamp's light swings by a share with the mains while rows are read one after the other."""
+    """Multiply the light above black by 1 + `share` sin(2 pi FLICKER_HZ t), with t = 0 to READ_S over the rows."""
     swing = 1 + share * np.sin(2 * np.pi * FLICKER_HZ * READ_S * np.linspace(0, 1, counts.shape[0]))
     return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
 

@@ -30,9 +30,10 @@ Shade = Callable[[Floats, Floats], Floats]  # degrees to the right and down -> s
 class HardFrame:
     """A raw frame (rows, cols) with its truth, and what the user hands over with it.
 
-    `take` holds truth, region and geometry; `raw` is what the file holds; `head` is what the head file says, which may
-    be wrong; `flat` marks declared bad pixels with NaN. `sphere_dpt` is the spectacle correction that the frame holds,
-    relative to the eye of the PSF; None where the frame holds none. `seen` is the part of the field that is lit.
+    `take` holds truth, region and geometry; `raw` is the content of the raw file; `head` that of the head file, which
+    may be wrong; `flat` marks declared bad pixels with NaN. `sphere_dpt` is the true spectacle correction of the
+    frame's eye, relative to the eye of the PSF (negative: myopia); None if undefined. `seen` is the lit part of the
+    field.
     """
 
     take: Take
@@ -72,7 +73,7 @@ class Eye:
 
     @cached_property
     def expected_e(self) -> Image:
-        """The electrons that the clean frame expects, without a well's end: (rows, cols)."""
+        """Expected electrons per pixel of the clean frame, float32 (rows, cols), without noise and without clipping."""
         spec = self.spec
         return World(spec, VirtualClock()).electrons_per_s(spec.light.colour) * np.float32(spec.camera.exposure_s)
 
@@ -84,7 +85,10 @@ class Eye:
         return sim.peak_e
 
     def frame(self, changes: Mapping[str, Any] | None = None, shade: Shade | None = None) -> HardFrame:
-        """The frame of this eye with keys of its head or scene changed, and a part of the field shaded."""
+        """Expose a frame with `changes` to keys of the head or scene, and with `shade` applied to the field.
+
+        The PSF is that of the changed head; the returned `head` is the unchanged one.
+        """
         spec = changed(self.spec, changes or {})
         assert spec.sim is not None
         exposed, seen = _exposed(spec, shade)
@@ -135,13 +139,16 @@ def above_dark(down_deg: float) -> Shade:
 
 
 def crescent_dark(moved_deg: float, radius_deg: float) -> Shade:
-    """A pupil that is missed: only what lies within a disc moved to the left is lit."""
+    """Return the shade of a decentred pupil: light only in a disc of `radius_deg`, shifted left by `moved_deg`.
+
+    Its edge is SOFT_DEG wide.
+    """
     return lambda right, down: np.clip((radius_deg - np.hypot(right + moved_deg, down)) / SOFT_DEG + 0.5, 0, 1)
 
 
 @cache
 def head_toml(spec: InstrumentSpec) -> str:
-    """The head file of a spec: its camera, light and optics as a person would write them."""
+    """Return the TOML text of a head file with the spec's camera and optics, light backend "sim" and seed 1."""
     assert spec.optics is not None
     camera = spec.camera.model_dump(exclude_none=True, exclude={"sensor"})
     tables = {"camera": camera, "light": {"backend": "sim"}, "optics": spec.optics.model_dump(), "sim": {"seed": 1}}

@@ -25,7 +25,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class HardCases:
-    """All cells of a run, and what must not be among them."""
+    """All cells of a run, and the violations found in them."""
 
     columns: tuple[str, ...]
     cells: tuple[Cell, ...]
@@ -85,7 +85,7 @@ def write(folder: Path, found: HardCases) -> None:
 
 
 def markdown(found: HardCases) -> str:
-    """The table, what explains its losses, and what must not be."""
+    """Return the Markdown report: table, explained losses, violations."""
     share, count = covered(found.cells)
     lines = [
         "# Hard cases", "", "PCC inside the lit field, in brackets its change against the same method's clean frame.",

@@ -2,9 +2,10 @@
 
 crash       an exception that is no refusal
 hidden      a picture more than LOST below clean, no message, no refusal, no explanation
-refraction  a number more than SIGMAS standard deviations off, or one of a frame that holds none, without a message
+refraction  an error above SIGMAS standard deviations, even with a message; or a value, without a message, for a frame
+            whose refraction is undefined
 message     words that are not true of the frame
-quality     a quality figure better than the clean frame's where the picture is LOST below it
+quality     a PCC more than LOST below clean, and a quality figure better than the clean frame's by more than SLACK
 coverage    over the grid: fewer than COVERED of the refractions within two standard deviations
 """
 
@@ -37,7 +38,7 @@ ALWAYS = frozenset({"refraction"})  # that a refraction is uncertain is no claim
 
 @dataclass(frozen=True)
 class Violation:
-    """One thing that must not be: its rule, where, and the figures in words."""
+    """One violation: rule, eye, case, method, and a description with the figures."""
 
     rule: str
     eye: str
@@ -53,7 +54,7 @@ def kind(message: str) -> str:
 
 
 def violations(cells: Sequence[Cell], cases: Mapping[str, Case] = NAMED) -> list[Violation]:
-    """Everything in a grid that must not be, in the order of the cells; at the end the coverage of the refractions."""
+    """Return the violations of all cells, in cell order; the one of the coverage rule is last."""
     clean = {(cell.eye, cell.method): cell for cell in cells if cell.case == CLEAN.key}
     found = []
     for cell in cells:
@@ -77,7 +78,7 @@ def covered(cells: Sequence[Cell]) -> tuple[float, int]:
 
 
 def lost(cell: Cell) -> bool:
-    """Whether the picture is clearly worse than the clean one."""
+    """Whether `cell.lost` is above LOST or NaN; False without a picture."""
     return cell.lost is not None and not cell.lost <= LOST
 
 

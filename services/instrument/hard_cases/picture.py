@@ -96,7 +96,7 @@ def _words(x: float, y: float, words: str, ink: str) -> str:
 
 
 def table(cells: Sequence[Cell], columns: Sequence[str]) -> str:
-    """The same as Markdown, an eye after the other."""
+    """Return one Markdown table per eye: cases by columns, refraction error, messages."""
     lines: list[str] = []
     for eye in dict.fromkeys(cell.eye for cell in cells):
         mine = {(cell.case, cell.method): cell for cell in cells if cell.eye == eye}
