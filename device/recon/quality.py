@@ -15,6 +15,7 @@ SURELY = 3.0  # standard errors
 LEAST_LIT = 0.75  # share of the field
 MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
+NOISE_PARTS = 5  # frames without flicker have up to 3.6, at 250 electrons; 2 % of flicker there 17
 MOST_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the spectrum rise as the picture gets worse
 MOST_SATURATED = 0.001  # share of the pixels
 # Figures that use the PSF: set to None where the model does not explain the frame.
@@ -87,13 +88,13 @@ def banding(left: Image, noise_dn2: float, light_dn: float) -> float:
     """Flicker: the rms of the row means of what a picture leaves unexplained, as a share of the mean light.
 
     Rows are read one after the other, so a lamp that flickers draws bands across a frame that no retina explains.
-    `left` (rows, cols) in DN is 0 where a sample is missing. Twice the variance that noise of `noise_dn2` gives to the
-    means is taken off: less than that is no proof.
+    `left` (rows, cols) in DN is 0 where a sample is missing. From the variance of the means NOISE_PARTS times that of
+    noise of `noise_dn2` is taken off: less than that is no proof.
     """
     if not light_dn > 0:
         return 0.0
     seen_dn2 = float(left.mean(axis=1, dtype=np.float64).var())
-    return float(max(seen_dn2 - 2 * noise_dn2 / left.shape[1], 0.0) ** 0.5 / light_dn)
+    return float(max(seen_dn2 - NOISE_PARTS * noise_dn2 / left.shape[1], 0.0) ** 0.5 / light_dn)
 
 
 def is_banded(quality: dict[str, float | None]) -> bool:
@@ -132,10 +133,13 @@ def is_measured(name: str, quality: dict[str, float | None]) -> bool:
 def matched(quality: dict[str, float | None]) -> Match:
     """The verdict on the PSF from `structure_sure` alone, where the frame was not checked against the PSF.
 
-    UNKNOWN where more than MOST_MISSING of the frame is missing: gaps have a spectrum of their own.
+    UNKNOWN where more than MOST_MISSING of the frame is missing, because gaps have a spectrum of their own, and where
+    no ring of frequencies stands above the noise: below 250 electrons at the peak the right PSF has -5 to 1.
     """
     sure, missing = quality.get("structure_sure"), quality.get("missing") or 0.0
-    return Match.FOREIGN if sure is not None and sure < -SURELY and missing <= MOST_MISSING else Match.UNKNOWN
+    is_seen = (quality.get("cutoff_per_px") or 0.0) > 0
+    surely_foreign = sure is not None and sure < -SURELY and is_seen and missing <= MOST_MISSING
+    return Match.FOREIGN if surely_foreign else Match.UNKNOWN
 
 
 def complaints(quality: dict[str, float | None], match: Match, misfit: float | None) -> tuple[str, ...]:

@@ -13,6 +13,8 @@ from device.sim.light import SimLight
 from device.sim.world import World
 from device.spec import load_head
 from device.values import Calibration, Glow, Psf, Shot
+from services.instrument.hard_cases.cases import peak
+from services.instrument.hard_cases.frames import Eye
 from tests import scenes
 from tests.simulated import SCENES, coarse, exposed, having
 
@@ -66,6 +68,15 @@ def test_flickering_light_is_reported_and_gives_no_refraction(
     assert any("steady light" in warning for warning in flickered.warnings)
     assert flickered.refraction_dpt is None
     assert flickered.quality["resolution_um"] is None
+
+
+@pytest.mark.parametrize(("seed", "m_dpt", "peak_e"), [(338, 0.8, 50), (14, 4.0, 250)])
+def test_little_light_is_neither_a_foreign_psf_nor_flicker(seed: int, m_dpt: float, peak_e: float) -> None:
+    """Two frames that had these messages, through the instrument's ladder at full size."""
+    eye = Eye("dim eye", "sim", {"sim.seed": seed, "sim.eye.m_dpt": m_dpt})
+    take, frame = eye.clean.take, peak(peak_e)(eye)
+    made = Reconstructor(take.calibration, take.shape, scenes.PLANNER, VirtualClock(), timed=False)(frame.raw)
+    assert all("refraction" in words for words in made.report.warnings)
 
 
 def test_less_light_resolves_less(good, world: World, calibration: Calibration) -> None:
