@@ -24,14 +24,14 @@ SOURCES = ("device/", "services/")
 def errors() -> dict[str, Any]:
     """Return every error by its code: its parent's code, built-in bases, default remedy, HTTP status, templates."""
     kinds = {kind.__name__: kind for kind in _kinds(DiffuscopeError)}
-    said = _templates(kinds)
+    templates = _templates(kinds)
     return {
         kind.code: {
             "parent": next((base.code for base in kind.__bases__ if issubclass(base, DiffuscopeError)), None),
             "also": sorted(base.__name__ for base in kind.__bases__ if not issubclass(base, DiffuscopeError)),
             "remedy": kind.default_remedy,
             "status": refusal(kind("message")).status_code,
-            "templates": [list(one) for one in sorted(said[kind.code])],
+            "templates": [list(one) for one in sorted(templates[kind.code])],
         }
         for kind in kinds.values()
     }
@@ -78,7 +78,7 @@ def _templates(kinds: dict[str, type[DiffuscopeError]]) -> defaultdict[str, set[
             if isinstance(node, ast.Call) and (called := ast.unparse(node.func).split(".")[-1]) in kinds and node.args:
                 given = node.args[1:2] + [one.value for one in node.keywords if one.arg == "remedy"]
                 remedies = _texts(given[0], known) if given else [""]
-                found[kinds[called].code] |= {(said, do) for said in _texts(node.args[0], known) for do in remedies}
+                found[kinds[called].code] |= {(words, do) for words in _texts(node.args[0], known) for do in remedies}
     return found
 
 
@@ -94,8 +94,8 @@ def _constants(name: str) -> dict[str, str]:
 def _texts(node: ast.expr, known: Mapping[str, str]) -> list[str]:
     """Return the template of an expression, names looked up in `known`; of a conditional one both branches."""
     match node:
-        case ast.Constant(value=str(said)):
-            return [said]
+        case ast.Constant(value=str(words)):
+            return [words]
         case ast.JoinedStr(values=parts):
             return ["".join(_texts(one, known)[0] for one in parts)]
         case ast.BinOp(left=left, op=ast.Add(), right=right):
