@@ -1,19 +1,20 @@
-# Every word sets up .venv by itself when requirements.lock or pyproject.toml is newer, and is quiet when it is there.
+# Every target sets up .venv when a lock file, pyproject.toml or services/package.py (which the installation copies) is
+# newer, and prints nothing when it is ready.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-mutants bundle browser buses strace lint bench bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts lock clean
+.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-mutants bundle browser buses strace lint release bench bench-data bench-kills bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
-help: ## List the words that make knows.
+help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
 
 # The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
 PI_LOCK := tests/ports/emulators/requirements.lock
 
-.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml
+.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml services/package.py services/__main__.py
 	@echo "Setting up .venv (a minute, once)"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Diffuscope needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
 	@$(PYTHON) -m venv .venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
@@ -25,18 +26,26 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
-# What a health worker does, on the real server and with every interruption; the rest of the page has a word of its own.
-JOURNEYS := tests/browser/test_page.py tests/browser/test_visit.py
+# A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
+JOURNEYS := tests/browser/test_page.py
+# What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below nine minutes.
+FAULTS := tests/hard tests/physics tests/property
+NOT_HERE := not bench and not rig and not systemd and not paper and not site
+# Many tests wait for a clock, a process or a browser: three workers keep two cores busy.
+WORKERS := -n 3 --dist loadfile
 
 # A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
 # the summary names it, because it is then the test or the page that has to be mended.
-test: .venv/ready browser buses strace ## Run every test that needs no Raspberry Pi.
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m "not bench and not rig and not systemd and not paper" --ignore tests/browser --ignore tests/ports --ignore tests/parts --ignore tests/golden
-	@umockdev-wrapper $(BIN)/python -m pytest -m "not rig" tests/ports
+test: .venv/ready browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
+	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
+	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 	@$(BIN)/python -m pytest $(JOURNEYS) --reruns 1 -rR
 
-test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, voice and technician's rooms.
-	@$(BIN)/python -m pytest tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
+test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
+	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
+
+test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
+	@$(BIN)/python -m pytest $(WORKERS) tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics
@@ -47,14 +56,17 @@ test-hard: .venv/ready ## Run the whole grid of hard cases and write it to out/h
 test-systemd: .venv/ready ## Boot a real systemd in a container and try the units in it; needs root.
 	@tests/systemd/install
 	@$(BIN)/python -m pytest tests/systemd -rP
-	@$(BIN)/python -m pytest tests/test_house_files.py -k "systemd_has_nothing_to_say or exposed_as_little"
+	@$(BIN)/python -m pytest tests/test_project_files.py -k "systemd_analyze_accepts or low_exposure_score"
 
 # verity needs device-mapper where it is installed; FORMAT=plain is for trying out, on devices that were built with it.
 FORMAT ?= verity
 KEYS ?= out/keys
 
-test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files and scenes with their golden records; not in CI yet.
-	@umockdev-wrapper $(BIN)/python -m pytest tests/golden
+test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files and scenes with their golden records.
+	@umockdev-wrapper $(BIN)/python -m pytest -n auto --dist loadfile tests/golden
+
+test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults and signals on the exam; N=count.
+	@$(BIN)/python -m tests.property.exam_sequences $(N)
 
 test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store and exam against seeded mutants; ten minutes, not in CI.
 	@$(BIN)/python -m tests.golden mutants
@@ -86,7 +98,7 @@ OTHER_PYTHON ?= python3.13
 	@touch $@
 
 test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.
-	@umockdev-wrapper .other-venv/bin/python -m pytest -m "not rig" tests/ports
+	@umockdev-wrapper .other-venv/bin/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
 strace: ## Install strace (Debian package) where it is missing.
 	@tests/hard/install
@@ -100,6 +112,20 @@ lint: .venv/ready ## Check style, types, and who imports whom.
 	@$(BIN)/mypy --no-error-summary
 	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
+VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+
+# The version is written, not computed from tags (services/decisions/0004-version-in-pyproject.md); the tag must equal it.
+release: lint ## Check version, changelog and citation, build wheel and source archive into dist, tag this commit.
+	@[ -z "$$(git status --porcelain)" ] || { echo "Commit the changes first: a release is one commit"; exit 1; }
+	@! sed -n '/^## Unreleased/,/^## [0-9]/p' CHANGELOG.md | grep -q '^\*' || \
+		{ echo "Move the lines under Unreleased in CHANGELOG.md to a section with version and date"; exit 1; }
+	@$(BIN)/python -m pytest -q tests/test_publication.py
+	@git rev-parse -q --verify "refs/tags/v$(VERSION)" >/dev/null || git tag -a "v$(VERSION)" -m "Diffuscope $(VERSION)"
+	@[ "$$(git rev-parse "v$(VERSION)^{commit}")" = "$$(git rev-parse HEAD)" ] || \
+		{ echo "v$(VERSION) is another commit: raise the version in pyproject.toml, CITATION.cff and CHANGELOG.md"; exit 1; }
+	@rm -rf dist && $(BIN)/python -m hatchling build -d dist
+	@echo "dist/ holds $(VERSION); to publish: git push origin v$(VERSION)"
+
 bench: .venv/ready browser ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
 
@@ -111,6 +137,10 @@ bench-sides: .venv/ready ## Print how often left and right eyes are told apart, 
 
 bench-psf: .venv/ready ## Print what the PSF consistency check finds in recordings and simulated frames; DATA=folder has recordings.
 	@$(BIN)/python -m tests.bench.psf_consistency "$(DATA)"
+
+bench-data: .venv/ready ## Compare all methods and LenslessPiCam on the pairs of a data set; DATA=folder has it.
+	@mkdir -p out
+	@$(BIN)/diffuscope bench "$(DATA)" --json out/bench-data.json
 
 bench-retinas: .venv/ready ## Print the acceptance figures on real photographs and recordings; DATA=folder says where.
 	@$(BIN)/python -m tests.bench.retinas --data "$(DATA)"
@@ -149,16 +179,34 @@ part-pictures: .parts-venv/ready ## Draw the pictures of the assembly guide anew
 test-parts: .parts-venv/ready ## Measure the printed parts: closed, thick enough, clear of one another and of the light.
 	@.parts-venv/bin/python -m pytest tests/parts
 
+# Sphinx and matplotlib are needed by the documentation only: an environment of its own.
+SITE_LOCK := services/lab/site/requirements.lock
+
+.site-venv/ready: $(SITE_LOCK) pyproject.toml
+	@echo "Setting up .site-venv (a minute, once)"
+	@$(PYTHON) -m venv .site-venv
+	@.site-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r $(SITE_LOCK)
+	@.site-venv/bin/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+site: .site-venv/ready ## Build the documentation with its gallery into out/site; GALLERY=0 leaves the scripts unrun.
+	@services/lab/site/build
+
+test-site: .venv/ready browser site ## Build the documentation, then test its links, its search and the snippets of its pages.
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m site tests/documentation
+
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready ## Write requirements.lock anew, the part of it that a release needs, and that of the printed parts.
+lock: .venv/ready ## Write requirements.lock anew, the part of it that a release needs, those of the printed parts and the documentation.
 	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
-		--extra test --group lock pyproject.toml -o requirements.lock
+		--extra instrument --extra test --group lock pyproject.toml -o requirements.lock
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
-		--constraints requirements.lock pyproject.toml -o systemd/image/requirements.lock
+		--constraints requirements.lock --extra instrument pyproject.toml -o systemd/image/requirements.lock
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		hardware/parts/requirements.in -o $(PARTS_LOCK)
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+		--constraints requirements.lock --extra instrument --extra docs --group lock pyproject.toml -o $(SITE_LOCK)
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .bench-venv .other-venv .parts-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .bench-venv .other-venv .parts-venv .site-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

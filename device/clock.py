@@ -1,84 +1,96 @@
-"""The only door to time: a clock that can be real or virtual, and a deadline made from it."""
+"""Clocks, real and virtual, deadlines on them, and the id of the boot; all other modules take the time from here."""
 
 import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Protocol
+from uuid import uuid4
 
 from device.errors import SettingError
 
+_BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")
+
 
 class Clock(Protocol):
-    """Where the time comes from."""
+    """Source of monotonic and wall-clock time."""
 
     def now_s(self) -> float:
-        """Seconds since some fixed moment; never goes back."""
+        """Return monotonic seconds since a fixed moment."""
 
     def wall(self) -> datetime:
-        """The date and time of day, with a time zone."""
+        """Return date and time of day, with a time zone."""
 
     def sleep(self, duration_s: float) -> None:
-        """Do nothing for `duration_s` seconds."""
+        """Sleep for `duration_s` seconds."""
 
 
 class SystemClock:
-    """The computer's own clock."""
+    """Clock of the computer."""
 
     def now_s(self) -> float:
-        """Seconds since some fixed moment; never goes back."""
+        """Return monotonic seconds since a fixed moment."""
         return time.monotonic()  # as cameras stamp their frames
 
     def wall(self) -> datetime:
-        """The date and time of day in UTC."""
+        """Return date and time of day in UTC."""
         return datetime.now(UTC)
 
     def sleep(self, duration_s: float) -> None:
-        """Do nothing for `duration_s` seconds."""
+        """Sleep for `duration_s` seconds; return at once for a negative duration."""
         time.sleep(max(0.0, duration_s))
+
+
+def boot_id() -> str:
+    """Return the kernel's id of the current boot; monotonic times are comparable within one boot only.
+
+    If the kernel has none, a random id at each call, as if each call were in another boot.
+    """
+    return _BOOT_ID_FILE.read_text(encoding="ascii").strip() if _BOOT_ID_FILE.is_file() else uuid4().hex
 
 
 @dataclass
 class VirtualClock:
-    """A clock that moves only when told: sleeping takes no time, and hours pass in microseconds."""
+    """Simulated clock for tests: `sleep` advances it at once, without waiting."""
 
     start: datetime = datetime(2026, 1, 1, tzinfo=UTC)
     elapsed_s: float = field(default=0.0)
 
     def now_s(self) -> float:
-        """Virtual seconds since the clock was made."""
+        """Return virtual seconds since the clock was made."""
         return self.elapsed_s
 
     def wall(self) -> datetime:
-        """The virtual date and time."""
+        """Return the virtual date and time: `start` plus the elapsed seconds."""
         return self.start + timedelta(seconds=self.elapsed_s)
 
     def sleep(self, duration_s: float) -> None:
-        """Move the clock on by `duration_s`."""
+        """Advance the clock by `duration_s` seconds; a negative duration does not change it."""
         self.elapsed_s += max(0.0, duration_s)
 
 
 @dataclass(frozen=True)
 class Deadline:
-    """A moment by which an answer is due, on a given clock."""
+    """Deadline on a given clock."""
 
     clock: Clock
     due_s: float
 
     @classmethod
     def after(cls, clock: Clock, budget_s: float) -> "Deadline":
-        """The moment `budget_s` seconds from now; a budget must be a positive, finite number of seconds."""
+        """Return the deadline `budget_s` seconds from now; SettingError unless the budget is positive and finite."""
         if not 0 < budget_s < float("inf"):
             raise SettingError(f"a budget of {budget_s} s is not a time", "Give a positive number of seconds.")
         return cls(clock, clock.now_s() + budget_s)
 
     def left_s(self) -> float:
-        """Seconds until it is due; negative once it has passed."""
+        """Return the seconds until the deadline; negative after it."""
         return self.due_s - self.clock.now_s()
 
     def fits(self, cost_s: float) -> bool:
-        """Whether something that takes `cost_s` would be done in time."""
+        """Return true if a step of `cost_s` seconds that begins now would end by the deadline."""
         return cost_s <= self.left_s()
 
     def later(self, delay_s: float) -> "Deadline":
-        """The same, put off by `delay_s` that somebody else used."""
+        """Return a new deadline, later by `delay_s` seconds, to compensate for time that another task used."""
         return Deadline(self.clock, self.due_s + delay_s)

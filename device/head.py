@@ -1,4 +1,4 @@
-"""The one place that chooses: a head file becomes a camera, a guarded light and a calibration. Never a fallback."""
+"""Factory of heads: opens camera, guarded light, chips and calibration that a head file names, without any fallback."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -8,115 +8,121 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from device.calibration.admission import refuse_old, refuse_other_mode
-from device.calibration.archive import Archive, Kept, Provenance
-from device.calibration.leds import with_measured_light
+from device.calibration.archive import Archive, Provenance, StoredCalibration
+from device.calibration.calibration_validity import refuse_expired, refuse_other_mode
+from device.calibration.led_radiometry import with_led_radiometry
+from device.calibration.procedure.calibration_sequence import (
+    AXIAL_OFFSETS_MM,
+    COLOUR_TARGETS,
+    TARGET_FILL_SHARE,
+    CalibrationTarget,
+)
 from device.clock import Clock
-from device.dose import FIELD_DEG, NO_LIGHT, Hazard, light_limits, radiometry
+from device.config.head_file import ChainSpec, InstrumentSpec, ReplaySpec, load_head
+from device.config.operating_limits import is_battery_low, is_too_hot
+from device.config.radiometry import FIELD_DEG
 from device.drivers.button import GpioButton
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
 from device.drivers.gpio import InputLine, OutputLine
 from device.drivers.guardian import Guardian
 from device.drivers.heartbeat import Heartbeat
 from device.drivers.pi_camera import PiCamera
+from device.drivers.probe import ProbeFinding, probe_parts
 from device.drivers.ring import Apa102Ring
 from device.drivers.v4l2_camera import V4l2Camera
-from device.errors import HeadMismatch, PowerLow, SpecError, TooHot
-from device.guard import GuardedLight
-from device.ledger import Ledger
+from device.errors import HeadMismatch, PowerLow, SettingError, SpecError, TooHot
+from device.light_safety.dose_ledger import Ledger
+from device.light_safety.guard import GuardedLight
+from device.light_safety.hazard import NO_LIGHT, Hazard, light_limits, radiometry
 from device.optics.matrix import chain_of, ring
-from device.ports import Battery, Button, Camera, HeadMemory, Light, Thermometer
-from device.sim.calibrate import simulated_calibration
+from device.ports import NO_CHIPS, Button, Camera, Chips, HeadMemory, Light
+from device.sim import calibration_targets, fault_injection
 from device.sim.camera import SimCamera
 from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermometer
-from device.sim.light import Mirrored, SimLight
+from device.sim.light import MirroredLight, SimLight
 from device.sim.replay import ReplayCamera, ReplayLight, find_recording, recorded_calibration, recorded_head
+from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.values import Calibration, Eye
 
-LEASE_MARGIN_S = 0.05  # the guard's own timer comes first; the other process is for when it does not come
+LEASE_MARGIN_S = 0.05  # so that the guard's timer ends first; the guardian process acts only if the timer fails
 
 
-def by_hand(eye: Eye) -> None:
-    """A real head is held before an eye by a person, whom nobody can move."""
-
-
-@dataclass(frozen=True)
-class Chips:
-    """The chips of a head, as far as it has them."""
-
-    thermometer: Thermometer | None = None
-    battery: Battery | None = None
-    memory: HeadMemory | None = None
+def no_repositioning(eye: Eye) -> None:
+    """Do nothing: `present_eye` of a head without simulated camera, which the operator positions by hand."""
 
 
 @dataclass(frozen=True)
 class Head:
-    """An opened head: what it is, its camera, its guarded light, its chips, and what the factory measured about it.
+    """Opened head: specification, camera, guarded light, chips and calibration.
 
-    `provenance` is where that comes from; None where nobody measured it. `facing` is told which eye is asked for next,
-    while it is dark: whoever stands before a simulated head brings it.
+    `provenance` describes the origin of an archived calibration; None without an archive. `present_eye` is called with
+    the next eye while the lamp is dark; a simulated head then shows that eye.
     """
 
     spec: InstrumentSpec
     camera: Camera
     light: GuardedLight
     calibration: Calibration
-    chips: Chips = Chips()
+    chips: Chips = NO_CHIPS
     button: Button | None = None
-    held: ExitStack = field(default_factory=ExitStack)  # what ends with it, the last first
+    resources: ExitStack = field(default_factory=ExitStack)  # closes the opened parts in reverse order
     provenance: Provenance | None = None
-    facing: Callable[[Eye], None] = by_hand
+    present_eye: Callable[[Eye], None] = no_repositioning
 
     @property
     def kind(self) -> str:
-        """What the page must say about every picture."""
+        """`simulated`, `recording` or `real`; the page shows it with every picture."""
         return kind_of(self.spec)
 
     def check(self) -> None:
-        """Before every picture: TooHot or PowerLow if the head had better rest, BusFault if it cannot say."""
-        said = self.spec.bus
-        if said is None:
+        """Raise TooHot or PowerLow beyond the limits of the head file, BusFault if a chip does not answer."""
+        bus = self.spec.bus
+        if bus is None:
             return
-        if self.chips.thermometer is not None and (warm_c := self.chips.thermometer.read_c()) > said.warmest_c:
-            raise TooHot(f"the head is {warm_c:.0f} C warm, more than {said.warmest_c:.0f}")
-        if self.chips.battery is not None and (charge := self.chips.battery.read()).fraction < said.emptiest:
+        thermometer, battery = self.chips.thermometer, self.chips.battery
+        if thermometer is not None and is_too_hot(warm_c := thermometer.read_c(), bus.warmest_c):
+            raise TooHot(f"the head is {warm_c:.0f} C warm, more than {bus.warmest_c:.0f}")
+        if battery is not None and is_battery_low((charge := battery.read()).fraction, bus.emptiest):
             raise PowerLow(f"the battery is at {charge.fraction:.0%}, {charge.volts:.2f} V")
 
     def close(self) -> None:
-        """Be dark, then let every part go."""
+        """Turn the lamp off, then close all parts."""
         try:
             self.light.off()
         finally:
-            self.held.close()
+            self.resources.close()
 
 
 def kind_of(spec: InstrumentSpec) -> str:
-    """`simulated`, `recording` or `real`."""
+    """Return `recording` for a replayed head, `simulated` if any part or the calibration is simulated, else `real`."""
     if spec.camera.backend == "replay":
         return "recording"
     return "simulated" if is_simulated(spec) else "real"
 
 
 def is_simulated(spec: InstrumentSpec) -> bool:
-    """Whether any part of it, or what is known about it, is made up: then all of it counts as simulated."""
+    """Return true if any backend is "sim" or the table [sim] exists; then the whole head counts as simulated."""
     backends = {spec.camera.backend, spec.light.backend, *(part.backend for part in (spec.bus, spec.gpio) if part)}
     return "sim" in backends or spec.sim is not None
 
 
-def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
-    """Refuse what this head cannot have: CalibrationOtherMode; HeadMismatch for a simulated one, or one of others."""
-    found, said = kept.calibration, kept.provenance
-    refuse_other_mode(found, said, spec.camera)
+def refuse_unsuitable_calibration(kept: StoredCalibration, spec: InstrumentSpec) -> None:
+    """Raise an error if a calibration cannot be used by this head.
+
+    CalibrationModeMismatch for another sensor mode. HeadMismatch for a simulated calibration on a real head, for an
+    imported PSF without `imported = true`, and for one without black or white level.
+    """
+    found, provenance = kept.calibration, kept.provenance
+    refuse_other_mode(found, provenance, spec.camera)
     if found.simulated and not is_simulated(spec):
-        raise HeadMismatch(f"{found.id}, of {said.serial}, was measured on a simulated head")
-    if said.origin == "imported" and not (spec.calibration and spec.calibration.imported):
+        raise HeadMismatch(f"{found.id}, of {provenance.serial}, was measured on a simulated head")
+    if provenance.origin == "imported" and not (spec.calibration and spec.calibration.imported):
         raise HeadMismatch(
-            f"{found.id} is a PSF from {said.source}, not measured on this head",
+            f"{found.id} is a PSF from {provenance.source}, not measured on this head",
             "Calibrate the head. To try this PSF all the same, write `imported = true` under [calibration].",
         )
-    if missing := {"black_dn", "white_dn"} & set(said.unknown):
+    if missing := {"black_dn", "white_dn"} & set(provenance.unknown):
         raise HeadMismatch(
             f"{found.id} does not say {' and '.join(sorted(missing))}, without which no head can use it",
             "Import the PSF again with --black-dn and --white-dn.",
@@ -124,41 +130,41 @@ def refuse_unfit(kept: Kept, spec: InstrumentSpec) -> None:
 
 
 def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any = None) -> Head:
-    """Open the parts that the head file names; a part that is missing is an error, never replaced by another.
+    """Return the opened head; a part that the head file names and that is missing is an error, never replaced.
 
-    `ledger` keeps the book of light; only what shows light to no eye may use a MemoryLedger. `allocator` is where a
-    camera driver takes its buffers from; None: where its library does. Whatever was opened before an error is dark and
-    closed after it.
+    `ledger` stores the light dose; a MemoryLedger is for lights that reach no eye. `allocator` gives the camera driver
+    its buffers (None: the library's own). HeadMismatch if the head's memory contradicts the calibration. After an error
+    all opened parts are dark and closed.
     """
     if spec.calibration is not None:
         kept = Archive(spec.calibration.archive).load()
-        spec = with_measured_light(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
+        spec = with_led_radiometry(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
-    with Opening(spec, clock, allocator) as opening:
+    with HeadOpener(spec, clock, allocator) as opening:
         head = _replayed(opening, ledger) if spec.camera.backend == "replay" else _opened(opening, ledger)
-        refuse_another_head(head)
-        return replace(head, held=opening.undo.pop_all())
+        refuse_mismatched_head(head)
+        return replace(head, resources=opening.resources.pop_all())
 
 
-class Opening:
-    """A head that is being opened part by part; inside its context, and what was opened is closed at the end of it."""
+class HeadOpener:
+    """Opens the parts of a head one by one; on exit of its context the opened parts are closed in reverse order."""
 
     def __init__(self, spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> None:
-        self.spec, self.clock, self.undo = spec, clock, ExitStack()
+        self.spec, self.clock, self.resources = spec, clock, ExitStack()
         self._allocator = allocator
 
-    def __enter__(self) -> "Opening":
+    def __enter__(self) -> "HeadOpener":
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.undo.close()
+        self.resources.close()
 
     @cached_property
     def world(self) -> World:
-        """What simulated parts share, and what a calibration that is not measured yet is taken from."""
+        """Simulated world that the simulated parts share; SpecError without the table [sim]."""
         if self.spec.sim is None:
             raise SpecError(
                 f"{self.spec.name} has no calibration: without its PSF no picture can be made",
@@ -168,52 +174,60 @@ class Opening:
         return World(self.spec, self.clock)
 
     def calibration(self) -> Calibration:
-        """The one in force in the archive that the head file names; without a name that of the simulated world."""
-        return self.kept.calibration if self.kept is not None else simulated_calibration(self.world)
+        """Return the calibration of the head file's archive, else a simulated one; SpecError without either table."""
+        return (
+            self.archived_calibration.calibration
+            if self.archived_calibration is not None
+            else simulated_calibration(self.world)
+        )
 
     @cached_property
-    def kept(self) -> Kept | None:
-        """What the archive holds, if it fits the head's file and is not too old; None if the file names no archive."""
+    def archived_calibration(self) -> StoredCalibration | None:
+        """Active calibration of the archive, checked against the head file and the validity period.
+
+        None without an archive.
+        """
         if self.spec.calibration is None:
             return None
         kept = Archive(self.spec.calibration.archive).load()
-        refuse_unfit(kept, self.spec)
-        refuse_old(kept.provenance, self.clock.wall())
+        refuse_unsuitable_calibration(kept, self.spec)
+        refuse_expired(kept.provenance, self.clock.wall())
         return kept
 
     def lamp(self, chain: ChainSpec | None = None) -> Light:
-        """The lamp, without its guard; of `chain` instead of the head file's if one is given."""
+        """Return the lamp without light guard; a real one with `chain`, if given, instead of the head file's LEDs."""
         if self.spec.light.backend == "sim":
             return SimLight(self.world)
         chain = chain or chain_of(self.spec)
         assert chain is not None
         guardian = Guardian(chain.device, chain.rows * chain.cols)
-        self.undo.callback(guardian.close)
+        self.resources.callback(guardian.close)
         ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S, self._pulse())
-        self.undo.callback(ring.close)
-        return Mirrored(ring, self.world) if self.spec.camera.backend == "sim" else ring
+        self.resources.callback(ring.close)
+        return MirroredLight(ring, self.world) if self.spec.camera.backend == "sim" else ring
 
     def _pulse(self) -> Heartbeat | None:
-        said = self.spec.gpio
-        if said is None or said.heartbeat is None or said.backend == "sim":
+        """Return the opened heartbeat of the lamp's hardware watchdog; None without one, or with simulated GPIO."""
+        gpio = self.spec.gpio
+        if gpio is None or gpio.heartbeat is None or gpio.backend == "sim":
             return None
-        pulse = Heartbeat(OutputLine(said.chip, said.heartbeat))
-        self.undo.callback(pulse.close)
+        pulse = Heartbeat(OutputLine(gpio.chip, gpio.heartbeat))
+        self.resources.callback(pulse.close)
         return pulse
 
     def button(self) -> Button | None:
-        """The shutter's button, if the head file names one."""
-        said = self.spec.gpio
-        if said is None or said.button is None:
+        """Return the shutter button; None if the head file names none."""
+        gpio = self.spec.gpio
+        if gpio is None or gpio.button is None:
             return None
-        if said.backend == "sim":
+        if gpio.backend == "sim":
             return SimButton(self.world)
-        button = GpioButton(InputLine(said.chip, said.button), self.clock)
-        self.undo.callback(button.close)
+        button = GpioButton(InputLine(gpio.chip, gpio.button), self.clock)
+        self.resources.callback(button.close)
         return button
 
     def camera(self, light: Light) -> Camera:
-        """The camera; its frames say what `light` shows."""
+        """Return the camera, which marks its frames with the state of `light`; SpecError for a recording."""
         camera: Camera
         match self.spec.camera.backend:
             case "sim":
@@ -225,112 +239,168 @@ class Opening:
                 camera = V4l2Camera(self.spec.camera, light, self.clock, simulated=is_simulated(self.spec))
             case "replay":
                 raise SpecError("a recording is opened with the folder that it is in")
-        self.undo.callback(camera.close)
+        self.resources.callback(camera.close)
         return camera
 
     def chips(self) -> Chips:
-        """The chips that the head file names."""
-        said = self.spec.bus
-        if said is None:
-            return Chips()
-        if said.backend == "sim":
+        """Return the chips that the table [bus] names, real or simulated; none without the table."""
+        bus = self.spec.bus
+        if bus is None:
+            return NO_CHIPS
+        if bus.backend == "sim":
             return Chips(
-                SimThermometer(self.world) if said.thermometer is not None else None,
-                SimBattery(self.world) if said.battery is not None else None,
-                SimHeadMemory(self.world) if said.memory is not None else None,
+                SimThermometer(self.world) if bus.thermometer is not None else None,
+                SimBattery(self.world) if bus.battery is not None else None,
+                SimHeadMemory(self.world) if bus.memory is not None else None,
             )
-        bus = I2cBus(said.device)
-        self.undo.callback(bus.close)
+        i2c = I2cBus(bus.device)
+        self.resources.callback(i2c.close)
         return Chips(
-            Tmp117(bus, said.thermometer) if said.thermometer is not None else None,
-            Max17048(bus, said.battery) if said.battery is not None else None,
-            Eeprom24(bus, said.memory, self.clock) if said.memory is not None else None,
+            Tmp117(i2c, bus.thermometer) if bus.thermometer is not None else None,
+            Max17048(i2c, bus.battery) if bus.battery is not None else None,
+            Eeprom24(i2c, bus.memory, self.clock) if bus.memory is not None else None,
         )
 
 
 @dataclass(frozen=True)
 class Bench:
-    """What a calibration needs of a head: its camera, its lamp dark, its chips; `world` is None before a real head."""
+    """Parts of a head for a calibration: camera, with the lamp dark, and chips; `world` is None with a real camera."""
 
     camera: Camera
     chips: Chips
     world: World | None
-    held: ExitStack
+    resources: ExitStack
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if the camera is simulated, so that targets are placed and faults injected by this object."""
+        return self.world is not None
+
+    def place_target(self, stand: CalibrationTarget) -> None:
+        """Place the calibration target of a step in front of a simulated head and clear its faults.
+
+        No-op for a real head.
+        """
+        if self.world is not None:
+            fault_injection.clear_faults(self.world)
+            target_placer(self.world)(stand)
+
+    def inject_fault(self, name: str) -> None:
+        """Inject one of `fault_names` into a simulated bench; SettingError for a real head or an unknown name."""
+        if self.world is None:
+            raise SettingError("faults are injected into simulated heads only", "Leave it out.")
+        fault_injection.inject_fault(self.world, name)
 
     def close(self) -> None:
-        """Let every part go."""
-        self.held.close()
+        """Close all parts."""
+        self.resources.close()
+
+
+def target_placer(world: World) -> Callable[[CalibrationTarget], None]:
+    """Return a function that places calibration targets before a simulated head, as bright as one exposure needs."""
+    e_per_s = TARGET_FILL_SHARE * world.spec.camera.full_well_e / world.spec.camera.exposure_s
+
+    def place(stand: CalibrationTarget) -> None:
+        match stand:
+            case "cap":
+                world.target = calibration_targets.cap(world)
+            case "screen":
+                world.target = calibration_targets.screen(world, e_per_s)
+            case _:
+                colour = next((colour for colour, name in COLOUR_TARGETS.items() if name == stand), None)
+                world.target = calibration_targets.point(
+                    world, e_per_s, moved_mm=AXIAL_OFFSETS_MM.get(stand, 0.0), colour=colour
+                )
+
+    return place
+
+
+def fault_names() -> tuple[str, ...]:
+    """Return the names of the faults that can be injected into a simulated bench, sorted."""
+    return tuple(sorted(fault_injection.BENCH_FAULTS))
 
 
 def refuse_recording(spec: InstrumentSpec) -> None:
-    """SpecError for a recording, which nobody can put a cap on."""
+    """Raise SpecError for a recording: it cannot be calibrated."""
     if spec.camera.backend == "replay":
         raise SpecError(f"{spec.name} is a recording: it cannot be calibrated", "Give the file of a head with --head.")
 
 
 def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Bench:
-    """Open a head that has no calibration yet; SpecError for a recording."""
+    """Open camera and chips of a head for a calibration, without loading a stored one; SpecError for a recording."""
     refuse_recording(spec)
-    with Opening(spec, clock, allocator) as opening:
+    with HeadOpener(spec, clock, allocator) as opening:
         lamp = opening.lamp()
         lamp.off()
         camera, chips = opening.camera(lamp), opening.chips()
-        return Bench(camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.undo.pop_all())
+        return Bench(
+            camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.resources.pop_all()
+        )
+
+
+def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Iterator[ProbeFinding]:
+    """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
+
+    A HardwareError of a part becomes a finding and is not raised. The lamp is dark at the end.
+    """
+    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator))
 
 
 @contextmanager
 def head_memory(spec: InstrumentSpec, clock: Clock) -> Iterator[HeadMemory | None]:
-    """The memory of a head, and nothing else of it; None if its file names none."""
-    with Opening(spec, clock) as opening:
+    """Open the chips of a head, yield its memory (None if the head file names none), and close them on exit."""
+    with HeadOpener(spec, clock) as opening:
         yield opening.chips().memory
 
 
-def _replayed(opening: Opening, ledger: Ledger) -> Head:
+def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
+    """Return the opened head of a recording: its camera, a lamp without light, and the recorded calibration."""
     spec, clock = opening.spec, opening.clock
     assert spec.replay is not None
     lamp = ReplayLight()
     camera = ReplayCamera(spec.replay, lamp, clock)
-    opening.undo.callback(camera.close)
+    opening.resources.callback(camera.close)
     light = GuardedLight(lamp, clock, spec.light.max_on_s, hazard_of(spec), ledger)
     return Head(spec, camera, light, recorded_calibration(camera, spec))
 
 
-def _opened(opening: Opening, ledger: Ledger) -> Head:
+def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
+    """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
     spec, calibration = opening.spec, opening.calibration()
-    facing: Callable[[Eye], None] = by_hand
+    facing: Callable[[Eye], None] = no_repositioning
     if spec.camera.backend == "sim":
-        facing = opening.world.meet
-        facing("OD")  # its light is traced now, not while a lamp is lit
+        facing = opening.world.present_eye
+        facing("OD")  # traces the light now, not while a lamp is on
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
-    known = opening.kept.provenance if opening.kept is not None else None
+    known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
     chips, button = opening.chips(), opening.button()
-    return Head(spec, camera, light, calibration, chips, button, provenance=known, facing=facing)
+    return Head(spec, camera, light, calibration, chips, button, provenance=known, present_eye=facing)
 
 
-def refuse_another_head(head: Head) -> None:
-    """A head that knows whose it is must be the one that the calibration was measured on."""
+def refuse_mismatched_head(head: Head) -> None:
+    """Raise HeadMismatch if the head has a memory that names another calibration or head than is loaded, or none."""
     if head.chips.memory is None:
         return
     known, loaded, bus = head.chips.memory.read(), head.calibration.id, head.spec.bus
     if known is None and (head.spec.calibration is None or (bus is not None and bus.backend == "sim")):
-        return  # never calibrated, and what is loaded is made up; or a simulated memory, which ends with its process
+        return  # never calibrated with a simulated calibration loaded, or a simulated memory, lost with its process
     if known is None or known.calibration_id != loaded:
-        knows = (
+        content = (
             f"head {known.serial} was calibrated as {known.calibration_id[:16]}" if known else "this head knows none"
         )
         raise HeadMismatch(
-            f"{knows}, loaded is {loaded}",
+            f"{content}, loaded is {loaded}",
             "Do not take pictures; call the technician. If this head was calibrated just now, `diffuscope calibrations "
             f"use {loaded} --archive DIR --head HEAD` tells it; another calibration is put in force the same way.",
         )
-    whose = head.provenance
-    if whose is not None and whose.origin == "measured" and whose.serial != known.serial:
-        raise HeadMismatch(f"this is head {known.serial}, loaded is the calibration of {whose.serial}")
+    provenance = head.provenance
+    if provenance is not None and provenance.origin == "measured" and provenance.serial != known.serial:
+        raise HeadMismatch(f"this is head {known.serial}, loaded is the calibration of {provenance.serial}")
 
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:
-    """What the light of a head does to an eye, by its own measurements or at its worst, and the limits for it."""
+    """Return the hazard and limits of a head's light, by measured radiometry, else worst case; no light in a replay."""
     if spec.light.backend == "replay":
         return Hazard(NO_LIGHT, light_limits())
     field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
@@ -341,8 +411,8 @@ def hazard_of(spec: InstrumentSpec) -> Hazard:
     return Hazard(radiometry(spec.light.radiometry, field_deg, leds=leds), light_limits())
 
 
-def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:
-    """The head that plays a folder: its `recording.toml` if there is one, else what the file names say."""
+def recording_spec(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:
+    """Return the specification of a recording: from `raws` and `psfs`, else `recording.toml`, else by file names."""
     if raws or psfs:
         if not (raws and psfs):
             raise SpecError("a recording needs both its raws and its PSFs", "Give --raw and --psf together.")
@@ -359,12 +429,12 @@ def recording(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] 
 
 
 def _name(folder: Path) -> str:
-    """What to call a recording: its folder, also when that was given as `.`"""
+    """Return the name of a recording: that of its folder, resolved first for `.`."""
     return folder.resolve().name or "recording"
 
 
 def _beside(replay: ReplaySpec, folder: Path) -> ReplaySpec:
-    """The same recording with its paths taken from the folder of its file."""
+    """Return the recording with its relative paths resolved against `folder`."""
     return ReplaySpec(
         raws=tuple(folder / path for path in replay.raws),
         psfs=tuple(folder / path for path in replay.psfs),

@@ -1,92 +1,113 @@
-"""What the instrument asks of its parts, in physical units: Protocols of a few verbs.
+"""Ports of the instrument's parts in physical units: Protocols for camera, light, sensors, memory and button.
 
-Real drivers and simulated parts fulfil the same contract, and the same tests run over both (`tests/ports/`).
+Real drivers and simulated parts fulfil the same contract; the same tests run over both (`tests/ports/`).
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from device.values import Charge, Frame, Glow, Identity, Shot
+from device.values import BatteryState, ExposureSettings, Frame, HeadIdentity, Illumination
 
 
 class Camera(Protocol):
-    """A sensor that turns light into counts."""
+    """Image sensor that returns raw counts."""
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, cols) of every frame."""
 
-    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
-        """Take one frame whose exposure began after this call; `into` (rows, cols) is filled if it is given.
+    @property
+    def facts(self) -> Mapping[str, str]:
+        """Properties of the opened sensor for a technician, such as `sensor` and `format`; empty if none are known."""
+
+    def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
+        """Return one frame whose exposure began after this call; `into` (rows, cols) is filled if given.
 
         Raises CameraMissing or CameraStalled; never returns an old frame.
         """
 
-    def prepare(self, shot: Shot) -> None:
-        """Let the exposure time of the next shot reach the sensor, in the dark: a light need not wait for it."""
+    def prepare(self, shot: ExposureSettings) -> None:
+        """Set the exposure time of the next frame on the sensor ahead of time, in the dark."""
 
     def close(self) -> None:
-        """Release the sensor; closing twice is harmless."""
+        """Release the sensor; idempotent."""
 
 
-class Lit(Protocol):
-    """A lamp that shines until this context ends."""
+class LightContext(Protocol):
+    """Context manager during which the lamp is on."""
 
-    def __enter__(self) -> "Lit":
-        """The lamp is on."""
+    def __enter__(self) -> "LightContext":
+        """Turn the lamp on."""
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The lamp is off, whatever happened."""
+        """Turn the lamp off, also after an exception."""
 
 
 class Light(Protocol):
-    """The ring of LEDs around the light path; dark unless someone holds it on."""
+    """Ring of LEDs around the light path; dark outside a context of `on`."""
 
     @property
-    def glow(self) -> Glow | None:
-        """What it shines now; None when it is dark."""
+    def illumination(self) -> Illumination | None:
+        """Present illumination; None when dark."""
 
-    def on(self, glow: Glow) -> Lit:
-        """Shine from the entry of the returned context to its end; one that is never entered stays dark.
+    def on(self, illumination: Illumination) -> LightContext:
+        """Return a context during which the lamp is on; a context that is never entered stays dark.
 
         Raises LightFault or LightLimit, here or on entry, and is then dark.
         """
 
     def off(self) -> None:
-        """Be dark; always allowed, harmless when it is dark already."""
+        """Turn the lamp off; always allowed, idempotent."""
 
 
 class Thermometer(Protocol):
-    """How warm the head is inside."""
+    """Temperature sensor inside the head."""
 
     def read_c(self) -> float:
-        """Degrees Celsius now; BusFault if it does not answer, or answers nonsense."""
+        """Return the temperature, degrees Celsius; BusFault without an answer or with an implausible one."""
 
 
 class Battery(Protocol):
-    """What the device runs on."""
+    """Battery gauge of the device."""
 
-    def read(self) -> Charge:
-        """How full it is; BusFault if it does not answer, or answers nonsense."""
+    def read(self) -> BatteryState:
+        """Return the battery's state; BusFault without an answer or with an implausible one."""
 
 
 class HeadMemory(Protocol):
-    """A few bytes that travel with the optical head: who it is, and which calibration is its own."""
+    """Non-volatile memory in the optical head: serial number and id of its calibration."""
 
-    def read(self) -> Identity | None:
-        """What it holds; None if nothing was ever written. BusFault if it does not answer, MemoryDamaged if torn."""
+    def read(self) -> HeadIdentity | None:
+        """Return the stored identity, None if never written.
 
-    def write(self, identity: Identity) -> None:
-        """Keep this from now on, also without power; it has been read back when this returns. BusFault otherwise."""
+        BusFault without an answer, MemoryDamaged if the content is incomplete.
+        """
+
+    def write(self, identity: HeadIdentity) -> None:
+        """Store the identity in non-volatile memory and verify it by reading back; BusFault on failure."""
+
+
+@dataclass(frozen=True)
+class Chips:
+    """Chips of a head; None for each that the head does not have."""
+
+    thermometer: Thermometer | None = None
+    battery: Battery | None = None
+    memory: HeadMemory | None = None
+
+
+NO_CHIPS = Chips()
 
 
 class Button(Protocol):
-    """The shutter's button on the handle."""
+    """Shutter button on the handle."""
 
     def pressed_since_s(self) -> float | None:
-        """The clock's moment since which it is pressed; None while it is not. BusFault if it cannot be read."""
+        """Return the clock time since which the button is pressed, None while released; BusFault if unreadable."""

@@ -1,9 +1,9 @@
-"""The values that travel through the instrument: frozen, their arrays read-only, checked at birth."""
+"""Frozen value types of the instrument: validated on construction, arrays read-only."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,12 @@ Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
 
 
+class SimulatedCounts(np.ndarray[tuple[int, ...], np.dtype[np.uint16]]):
+    """Counts of the simulator, uint16: views, copies and results of arithmetic keep the type, and thus the mark."""
+
+
 def _freeze(owner: object, *names: str) -> None:
-    """Replace arrays of a frozen value by read-only views, so that the lender of a buffer may use it again."""
+    """Replace the named arrays of a frozen value by read-only views; data are not copied, and None is skipped."""
     for name in names:
         array = getattr(owner, name)
         if array is not None:
@@ -30,8 +34,8 @@ def _freeze(owner: object, *names: str) -> None:
 
 
 @dataclass(frozen=True)
-class Glow:
-    """What the lamp is asked to show: one colour, at a level from just above 0 to 1 (full drive)."""
+class Illumination:
+    """Illumination by the lamp: one colour at a level above 0 and up to 1 (full drive), else SettingError."""
 
     colour: Colour
     level: float = 1.0
@@ -42,24 +46,24 @@ class Glow:
 
 
 @dataclass(frozen=True)
-class Charge:
-    """A battery's state: how full it is, 0 to 1, and its voltage."""
+class BatteryState:
+    """State of the battery: charge as a fraction, 0 to 1, and voltage."""
 
     fraction: float
     volts: float
 
 
 @dataclass(frozen=True)
-class Identity:
-    """Who an optical head is: its serial number, and the content hash of its calibration."""
+class HeadIdentity:
+    """Identity of an optical head: serial number, and content hash of its calibration."""
 
     serial: str
     calibration_id: str
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One exposure asked of the camera."""
+class ExposureSettings:
+    """Settings of one exposure: the exposure time, above 0 and up to 10 s, else SettingError."""
 
     exposure_s: float
 
@@ -70,15 +74,16 @@ class Shot:
 
 @dataclass(frozen=True)
 class Frame:
-    """What the sensor gave: counts (rows, cols) or (rows, cols, 3), uint16, in DN, and how they came to be.
+    """Raw sensor frame: uint16 counts, (rows, cols) or (rows, cols, 3), in DN, with its exposure time and number.
 
-    `glow` is what the lamp showed (None: dark); `simulated` says that no retina was there, and must never get lost.
+    `illumination` is the light during the exposure (None: not lit throughout). `simulated` marks a frame that shows no
+    real eye; it must be copied to every result. FrameError for other counts.
     """
 
     counts: Counts
     exposure_s: float
     number: int
-    glow: Glow | None
+    illumination: Illumination | None
     simulated: bool
 
     def __post_init__(self) -> None:
@@ -89,19 +94,18 @@ class Frame:
 
 
 def check_image_shape(shape: tuple[int, ...]) -> None:
-    """Refuse what is not (rows, cols) or (rows, cols, 3) with at least one pixel."""
+    """Raise FrameError unless the shape is (rows, cols) or (rows, cols, 3) with at least one pixel."""
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3) or min(shape) < 1:
         raise FrameError(f"an image has rows and columns, and three channels or none; this has the shape {shape}")
 
 
 @dataclass(frozen=True)
 class Psf:
-    """The point spread function: what one retinal point becomes on the sensor.
+    """Point spread function (PSF): image of one retinal point on the sensor.
 
-    float32 (rows, cols), sum 1, centre at (rows//2, cols//2).
-
-    Paper, section "Algorithm": the h of y = h * x. A shift of it shifts the picture and changes nothing else.
-    `colour` is the light that it was measured in; None: it stands for every colour.
+    float32 (rows, cols), sum 1, centre at (rows//2, cols//2). Paper, section "Algorithm": the h of y = h * x. A shifted
+    PSF shifts the picture and changes nothing else. `colour` is the light of the measurement; None: any colour. The
+    constructor normalises the sum. PsfError for an empty image, values that are not finite, or a sum <= 0.
     """
 
     pixels: Image
@@ -124,16 +128,16 @@ class Psf:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, cols)."""
+        """(rows, cols) of the PSF image."""
         rows, cols = self.pixels.shape
         return rows, cols
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """What the numbers of a frame mean: counts are `black_dn` + s (1 + `bend_per_dn` s), s = electrons / gain.
+    """Sensor response: counts are `black_dn` + s (1 + `bend_per_dn` s), s = electrons / gain.
 
-    The gain is `gain_e_per_dn`; what has reached `white_dn` is full.
+    The gain is `gain_e_per_dn`; a pixel of `white_dn` or more is saturated.
     """
 
     black_dn: float = 0.0
@@ -145,9 +149,10 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Geometry:
-    """How degrees at the eye become pixels: paper, section "Optical design"; optics first-order numbers.
+    """Scale between degrees at the eye and pixels; paper, section "Optical design", first-order optics.
 
-    `measured_scale_per_dpt` is what a moved point source said of this one head (`calibration/dioptres.py`), if asked.
+    `measured_scale_per_dpt` is the measured value of this head, from a moved point source (`calibration/dioptres.py`);
+    None if not measured.
     """
 
     pitch_um: float
@@ -162,23 +167,23 @@ class Geometry:
 
     @property
     def scale_per_dpt(self) -> float:
-        """Relative shrinking of the caustic per dioptre of myopia: as measured, else as the drawings say."""
+        """Relative shrinking of the caustic per dioptre of myopia: measured, else nominal."""
         measured = self.measured_scale_per_dpt
         return self.nominal_scale_per_dpt if measured is None else measured
 
     @property
     def nominal_scale_per_dpt(self) -> float:
-        """The same by the drawings: z a^2 (Fresnel scaling)."""
+        """Relative shrinking of the caustic per dioptre of myopia by the drawings: z a^2 (Fresnel scaling)."""
         return self.diffuser_to_sensor_um * 1e-6 * self.angular_magnification**2
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the factory measured about one head, once.
+    """Measured or simulated calibration of one head.
 
-    `psfs` has one entry, or a stack over depth, for every colour or for each (`seen_in`); `dark_dn` and `flat` are
-    (rows, cols) or None; `bad` marks pixels not to be believed; `field_deg` is the illuminated disc around the centre
-    (None: not known).
+    `psfs` has one entry or a stack over depth, for all colours or for each (`for_colour`); `dark_dn` (dark frame) and
+    `flat` (flat frame) are (rows, cols) or None; `bad` marks defective pixels; `field_deg` is the diameter of the
+    illuminated disc around the centre (None: not known). PsfError without PSFs or for PSFs of different shapes.
     """
 
     psfs: tuple[Psf, ...]
@@ -197,10 +202,11 @@ class Calibration:
             raise PsfError("the PSFs of one stack must all have the same rows and columns")
         _freeze(self, "dark_dn", "flat", "bad")
 
-    def seen_in(self, colour: Colour) -> Self:
-        """The same with the PSFs of one colour only; a colour that nobody measured is seen through the first PSF.
+    def for_colour(self, colour: Colour) -> Self:
+        """Return the calibration with the PSFs of one colour only.
 
-        What is left is one PSF, or a stack over depth: which of these explains a frame is asked of the frame.
+        Without PSFs of that colour, those that hold for any colour are kept, else the first PSF. The result has one PSF
+        or a stack over depth; PSF selection chooses from a stack for each frame.
         """
         own = tuple(psf for psf in self.psfs if psf.colour == colour)
         every = tuple(psf for psf in self.psfs if psf.colour is None)
@@ -208,7 +214,7 @@ class Calibration:
 
     @property
     def id(self) -> str:
-        """Sixteen hexadecimal digits that change whenever anything that was measured changes."""
+        """Identity by content: the first sixteen hexadecimal digits of the SHA-256 of all values and arrays."""
         colours = tuple(psf.colour for psf in self.psfs)
         digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
@@ -218,26 +224,57 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Report:
-    """How a picture was made; its fields are the keys of `report.json`."""
+    """Report of a reconstruction; its fields are the keys of `report.json`.
+
+    Units are in the names; a name without a unit is a ratio. The keys inside of the mappings, and the JSON schema, are
+    in `services/lab/report_schema.py`, which takes the descriptions of the fields from here.
+    """
+
+    __pydantic_config__: ClassVar[Mapping[str, bool]] = {"use_attribute_docstrings": True}
 
     method: str
+    """Method of the picture, as listed by `diffuscope methods`; "none" if no picture was made."""
+
     bin: int = 1
+    """Side in sensor pixels of the square that was averaged to one sample before solving."""
+
     rounds: int = 1
+    """Rounds of the iterative solver that the picture has; 1 for a closed form, 0 without a picture."""
+
     stopped: str = "done"
+    """Reason of the end: "done", "deadline" (the next round did not fit into the time budget), or an error code."""
+
     seconds: dict[str, float] = field(default_factory=dict)
+    """Durations of the stages in s."""
+
     psf_index: int = 0
+    """Index of the PSF that was used, in the order in which several PSFs were given; 0 for the first."""
+
     psf_scale: float = 1.0
+    """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
+
     refraction_dpt: dict[str, float] | None = None
+    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null if it is not known."""
+
     regularisation: dict[str, Any] = field(default_factory=dict)
+    """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""
+
     noise_dn: float | None = None
+    """Standard deviation of the noise of one sensor pixel, in DN, at the mean light of the frame."""
+
     residual: float | None = None
+    """Rms of frame minus forward model in units of the noise; 1: only noise is left. Null if not computed."""
+
     quality: dict[str, Any] = field(default_factory=dict)
+    """Figures of frame and picture; null for a figure that is not valid for this frame."""
+
     warnings: tuple[str, ...] = ()
+    """Sentences for the operator, in English, the most useful first; the wording is not stable."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A picture of the retina: linear float32, rows x cols (x 3) of the sensor, and the report of its making."""
+    """Reconstructed picture of the retina: linear float32, rows x cols (x 3) of the sensor, with its report."""
 
     picture: Image
     report: Report
@@ -246,25 +283,3 @@ class Reconstruction:
     def __post_init__(self) -> None:
         check_image_shape(self.picture.shape)
         _freeze(self, "picture")
-
-
-@dataclass(frozen=True)
-class Capture:
-    """One kept press: its name, eye, moment, the report, and the SHA-256 of each kept file by file name."""
-
-    id: str
-    eye: Eye
-    taken_at: datetime
-    simulated: bool
-    calibration_id: str
-    report: dict[str, Any]
-    files: dict[str, str]
-
-    @classmethod
-    def named(cls, taken_at: datetime, eye: Eye, token: str) -> str:
-        """The name of a capture: sorts by time, says the eye, and never repeats."""
-        return f"{taken_at:%Y%m%dT%H%M%S}-{eye}-{token}"
-
-    def with_files(self, files: dict[str, str]) -> Self:
-        """The same capture with the digests of its files."""
-        return type(self)(self.id, self.eye, self.taken_at, self.simulated, self.calibration_id, self.report, files)

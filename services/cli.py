@@ -1,25 +1,30 @@
-"""The `diffuscope` command: every word of it starts one capability, and every mistake is answered with a remedy."""
+"""Command line `diffuscope`: each command parses its arguments and calls one function."""
 
 import json
 import os
 import sys
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from device.clock import SystemClock
+from device.config.head_file import InstrumentSpec, load_head
 from device.errors import DiffuscopeError
-from device.head import recording
-from device.recon.geometry import Grid
-from device.recon.methods import DEFAULT, METHODS
-from device.spec import InstrumentSpec, load_head
+from device.head import probe, recording_spec
+from device.recon.installed_methods import available_methods
+from device.recon.methods import DEFAULT
+from device.recon.model.grid import Grid
 from device.values import Colour
 from services import resources
-from services.instrument import calibrations
-from services.instrument.once import Order, reconstruct_file, written
+from services.lab import calibration_archive
+from services.lab.datasets import open_dataset
+from services.lab.peers import ENVIRONMENT, installed_peer
+from services.lab.reconstruct_each import reconstruct_each, refuse_several
+from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
+from services.lab.reconstruct_inputs import ReconstructOptions
 from services.records.command import app as snapshots
 from services.update.command import app as update_app
 
@@ -27,12 +32,19 @@ app = typer.Typer(
     name="diffuscope", help="A funduscope whose lens is a piece of diffuser.", no_args_is_help=True,
     add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
-app.add_typer(calibrations.app, name="calibrations")
+app.add_typer(calibration_archive.app, name="calibrations")
 
 app.add_typer(update_app, name="update")
 app.add_typer(snapshots, name="snapshots")
 
+INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography"})
 SIM_HEAD = resources.HEADS / "sim.toml"
+
+DataSet = Annotated[Path, typer.Argument(help="Folder of a data set: DLMD, DiffuserCam, LenslessPiCam or own pairs.")]
+OwnPsf = Annotated[Path | None, typer.Option(help="PSF for a folder with none or with several.")]
+Limit = Annotated[int | None, typer.Option(min=1, help="Just the first pairs of the data set.")]
+Peers = Annotated[Path, typer.Option(help="Python environment with LenslessPiCam, for comparison.")]
+NoPeers = Annotated[bool, typer.Option("--no-peers", help="Leave other solvers out.")]
 
 
 def _default_data() -> Path:
@@ -59,19 +71,24 @@ def run(
     send: Annotated[Path | None, typer.Option(help="Where finished visits are sent, as TOML; else nowhere.")] = None,
 ) -> None:
     """Serve the page: one button, one true picture."""
-    from services.instrument.carrier import Https, load_settings
-    from services.instrument.serve import bound, handed_over, serve  # opens the web stack; others do not need it
+    from services.delivery.uploader import HttpsUploader, load_settings
+    from services.http.server import (  # imports the web stack, which only this command needs
+        bind_socket,
+        inherited_socket,
+        serve,
+    )
     from services.instrument.watchdog import Watchdog
-    from services.records.protocol import STANDARD, load_protocol
+    from services.lab.frontier import measure_scene
+    from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
 
-    spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or STANDARD)
-    carrier = Https(load_settings(send)) if send is not None else None
+    spec, plan = _chosen(head, replay, tuple(raw or ()), tuple(psf or ())), load_protocol(protocol or DEFAULT_PROTOCOL)
+    uploader = HttpsUploader(load_settings(send)) if send is not None else None
     typer.echo(f"{spec.name}: getting ready (the first start measures this computer, about half a minute)")
-    address = handed_over(os.environ) or bound(host, port)
+    address = inherited_socket(os.environ) or bind_socket(host, port)
     served, at = address.getsockname()[:2]
     serve(
         spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
-        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, tuple(name or ()), (updates, wishes), carrier,
+        Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, measure_scene, tuple(name or ()), (updates, wishes), uploader,
     )  # fmt: skip
 
 
@@ -79,13 +96,13 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
     if replay is not None or raws or psfs:
         if head is not None:
             raise typer.BadParameter("choose --head or a recording (--replay, --raw with --psf), not both")
-        return recording(replay or raws[0].parent if raws else replay or Path(), raws, psfs)
+        return recording_spec(replay or raws[0].parent if raws else replay or Path(), raws, psfs)
     return load_head(head or SIM_HEAD)
 
 
 @app.command()
-def reconstruct(
-    raw: Annotated[Path, typer.Argument(help="Raw frame: tiff, png or npy; 2-D or three channels.")],
+def reconstruct(  # size: each option of the command is one declared parameter
+    raw: Annotated[list[Path], typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; with --each several.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
     psf: Annotated[
         list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
@@ -95,9 +112,19 @@ def reconstruct(
         typer.Option(metavar="DIR[:ID]", help="Instead of PSFs: a kept calibration; without ID the one in force."),
     ] = None,
     method: Annotated[
-        str | None, typer.Option(help="A name of `diffuscope methods`; by default what suits the frame.")
+        str | None,
+        typer.Option(help="A name of `diffuscope methods`, or FILE.py:NAME; by default what suits the frame."),
+    ] = None,
+    bin: Annotated[int | None, typer.Option(help="Pixels per sample along each side; else what the PSF needs.")] = None,
+    rounds: Annotated[int | None, typer.Option(help="Rounds of an iterative method, at the most.")] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A parameter of the method, else chosen from the frame."),
     ] = None,
     budget_s: Annotated[float | None, typer.Option(help="Seconds from the loaded frame to the result.")] = None,
+    bayer: Annotated[
+        str | None, typer.Option(metavar="RGGB", help="The raw is a mosaic: rggb, bggr, grbg or gbrg.")
+    ] = None,
     dark: Annotated[Path | None, typer.Option(help="Dark frame of the same exposure.")] = None,
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
     head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
@@ -105,28 +132,34 @@ def reconstruct(
     even: Annotated[
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
-    report: Annotated[Path | None, typer.Option(help="Where to write the report as JSON.")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Where to write the report as JSON; with --each a folder.")
+    ] = None,
     sweep: Annotated[
         Path | None, typer.Option(help="Where to draw how well each of several PSFs fits, as SVG.")
     ] = None,
+    each: Annotated[bool, typer.Option("--each", help="Make one picture of each raw, in the folder of -o.")] = False,
 ) -> None:
-    """Turn one raw frame into a picture, without a head and without a page."""
-    order = Order(
-        raw, tuple(psf or ()), output, method, budget_s, dark, flat, head, field_deg, even, _cache(), report, sweep,
-        calibration,
+    """Turn one raw frame into a picture, without a head and without a page; with --each every frame of a recording."""
+    options = ReconstructOptions(
+        raw[0], tuple(psf or ()), None if each else output, method, budget_s, dark, flat, head, field_deg, even,
+        resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds, parse_settings(setting or ()),
+        parse_bayer(bayer),
     )  # fmt: skip
-    made = reconstruct_file(order)
-    text = json.dumps(asdict(made.report), indent=1)
+    if each:
+        failed = reconstruct_each(raw, options, output, report, typer.echo, lambda line: typer.echo(line, err=True))
+        raise typer.Exit(1 if failed else 0)
+    refuse_several(raw)
+    made = reconstruct_file(options)
     if report is not None:
-        written(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
-    seconds = sum(made.report.seconds.values())
-    typer.echo(f"{output}: {made.report.method}, bin {made.report.bin}, {seconds:.3f} s")
+        write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
+    typer.echo(f"{output}: {made.summary}")
     for warning in made.report.warnings:
         typer.echo(f"note: {warning}", err=True)
 
 
-def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
+def _progress(line: str) -> None:
+    typer.echo(line, err=True)
 
 
 @app.command()
@@ -138,7 +171,7 @@ def health(
     """Ask the running instrument whether it could take a picture now; the exit status is 1 if a check fails."""
     from services.health import probe
 
-    checks = probe.examine(at, look)
+    checks = probe.probe_instrument(at, look)
     typer.echo(json.dumps(probe.as_json(checks), indent=1) if as_json else probe.table(checks))
     raise typer.Exit(0 if all(check.ok for check in checks) else 1)
 
@@ -150,12 +183,10 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
     The lamp shines, and its light is not counted for an eye: point the head at white paper. The exit status is 1 if a
     part is not well.
     """
-    from device.probe import probe  # the drivers, which the other commands do not need
-
     well = True
     for found in probe(load_head(head), SystemClock()):
         well &= found.ok
-        typer.echo(f"{'ok  ' if found.ok else 'FAIL'}  {found.part:<14} {found.said}")
+        typer.echo(f"{'ok  ' if found.ok else 'FAIL'}  {found.part:<14} {found.reading}")
         if found.remedy:
             typer.echo(f"{'':<22}{found.remedy}")
     raise typer.Exit(0 if well else 1)
@@ -190,25 +221,25 @@ def calibrate_head(
     ] = None,
 ) -> None:
     """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
-    from services.instrument.calibrating import Wish, calibrate  # the drivers, which the other commands do not need
+    from services.instrument.calibration_request import CalibrationRequest
+    from services.lab.calibrate_head import calibrate, measured_values
 
-    def ask(said: str) -> None:
-        typer.prompt(f"{said} Then press Enter", default="", show_default=False)
+    def ask_operator(prompt: str) -> None:
+        typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
 
-    mishaps = {stand: name for stand, _, name in (said.partition("=") for said in mishap or ())}
-    wish = Wish(archive, serial, by, source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps)
-    kept = calibrate(load_head(head), wish, SystemClock(), ask, typer.echo)
-    sensor, known = kept.calibration.sensor, dict(kept.provenance.figures)
-    typer.echo(f"black {sensor.black_dn:.2f} DN, gain {sensor.gain_e_per_dn:.3f} e-/DN, white {sensor.white_dn:.0f} DN")
-    typer.echo(f"read noise {sensor.read_noise_e:.2f} e-, " + ", ".join(f"{k} {v:.3g}" for k, v in known.items()))
-    typer.echo(f"{kept.calibration.id} is in force in {archive}")
+    mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
+    options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
+    request = CalibrationRequest(archive, serial, by, *options)
+    calibrated = calibrate(load_head(head), request, SystemClock(), ask_operator, typer.echo)
+    for line in (*measured_values(calibrated), f"{calibrated.calibration.id} is in force in {archive}"):
+        typer.echo(line)
 
 
 def _colours(words: str) -> tuple[Colour, ...]:
     known: dict[str, Colour] = {"red": "red", "green": "green", "blue": "blue"}
     named = [word.strip() for word in words.split(",") if word.strip()]
-    if strange := [word for word in named if word not in known]:
-        raise typer.BadParameter(f"--colours {strange[0]!r} is none of {', '.join(known)}")
+    if unknown := [word for word in named if word not in known]:
+        raise typer.BadParameter(f"--colours {unknown[0]!r} is none of {', '.join(known)}")
     return tuple(known[word] for word in named)
 
 
@@ -222,12 +253,16 @@ def check_head(
 
     The last captures tell; without any, dark frames are taken now. The exit status is 1 if a finding fails.
     """
-    from services.instrument.checking import checked, table, with_archive  # the drivers, which others do not need
+    from services.lab.check_head import (  # imports the drivers only for this command
+        check_calibration,
+        table,
+        with_archive,
+    )
 
     spec = with_archive(load_head(head), archive)
     if spec.calibration is None:
         raise typer.BadParameter("the head file names no archive of calibrations; give one with --archive")
-    found = checked(spec, data or _default_data(), SystemClock(), lambda line: typer.echo(line, err=True))
+    found = check_calibration(spec, data or _default_data(), SystemClock(), lambda line: typer.echo(line, err=True))
     typer.echo(f"calibration {found.kept.calibration.id} of {found.kept.provenance.serial}")
     typer.echo(table(found))
     raise typer.Exit(1 if any(one.fails for one in found.findings) else 0)
@@ -246,18 +281,16 @@ def simulate(
 
     Only the effects that the scene calls for are simulated; the plan says for each which number decided.
     """
-    from device.sim import exposure, plan  # the simulator, which the other commands do not need
-    from device.sim.setup import Scene
+    from services.lab import simulate_scene  # imports the simulator only for this command
 
     spec = load_head(scene)
-    choose = partial(plan.decide, everything=everything, only=only or (), without=without or ())
+    selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
     if explain:
-        typer.echo(plan.table(choose(Scene(spec, spec.light.colour))))
+        typer.echo(simulate_scene.explain_plan(spec, selected))
         return
     if output is None:
         raise typer.BadParameter("give -o FOLDER to write into, or --explain to see the plan only")
-    world = exposure.simulate(spec, output, choose)
-    typer.echo(plan.table(world.plan, world.setup(spec.light.colour).spent_ms))
+    typer.echo(simulate_scene.write_scene(spec, output, selected))
     typer.echo(f"{output}: raw.tiff, truth.npy, psf.tiff, plan.json")
 
 
@@ -273,13 +306,80 @@ def frontier(
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc of a raw frame, in degrees.")] = None,
     budget_s: Annotated[float, typer.Option(help="The time within which the instrument chooses.")] = 0.26,
     repeats: Annotated[int, typer.Option(min=1, help="Timed turns of every point; the median counts.")] = 7,
+    data: Annotated[Path | None, typer.Option(help="Data set with many pairs, instead of one frame.")] = None,
+    limit: Limit = None,
+    peers: Peers = ENVIRONMENT,
+    no_peers: NoPeers = False,
 ) -> None:
     """Measure accuracy against time: every method, bin and number of rounds, on this machine."""
-    from services.instrument import frontier as measured  # the simulator, which a picture does not need
+    from services.lab import frontier as measured  # imports the simulator only for this command
+    from services.lab import frontier_pairs
 
-    wish = measured.Wish(scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, _cache())
-    typer.echo(measured.table(measured.frontier(wish, lambda line: typer.echo(line, err=True))))
+    request = measured.FrontierRequest(
+        scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, resources.fft_plans()
+    )
+    if data is None:
+        typer.echo(measured.table(measured.frontier(request, _progress)))
+    else:
+        wanted = frontier_pairs.dataset_request(request, data, limit)
+        with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
+            found = frontier_pairs.frontier_of_dataset(wanted, peer, _progress)
+        typer.echo(frontier_pairs.dataset_table(found))
     typer.echo(f"{json_file}, {plot}")
+
+
+@app.command("data")
+def show_data_set(
+    folder: DataSet,
+    psf: OwnPsf = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Read every file; the exit status is 1 if one is bad.")
+    ] = False,
+    every: Annotated[bool, typer.Option("--all", help="Also pairs that the list of test files leaves out.")] = False,
+) -> None:
+    """Say what a folder of lensless recordings holds: layout, pairs, sizes, PSFs, orientation."""
+    from services.lab import dataset_summary
+
+    dataset = open_dataset(folder, psf, "all" if every else "test")
+    typer.echo(dataset_summary.summary(dataset))
+    if not check:
+        return
+    problems = dataset_summary.check(dataset, SystemClock(), _progress)
+    for problem in problems:
+        typer.echo(f"FAIL  {problem.pair}: {problem.reason}")
+    typer.echo(f"{len(dataset) - len(problems)} of {len(dataset)} pairs can be read")
+    raise typer.Exit(1 if problems else 0)
+
+
+@app.command("bench")
+def bench_data_set(
+    folder: DataSet,
+    psf: OwnPsf = None,
+    limit: Limit = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="Just this method of `diffuscope methods`; may be repeated.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed runs of every method on every pair.")] = 3,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Where to write every score, as JSON.")] = None,
+    peers: Peers = ENVIRONMENT,
+    no_peers: NoPeers = False,
+) -> None:
+    """Compare all methods and LenslessPiCam on a data set: seconds, PSNR, SSIM and PCC, with their spread over pairs.
+
+    The exit status is 1 if a pair, or a method on a pair, was left out.
+    """
+    from services.lab import benchmark  # imports the simulator only for this command
+    from services.lab.pair_scores import table
+
+    request = benchmark.BenchmarkRequest(
+        open_dataset(folder, psf), limit, tuple(method or ()), repeats, json_file, resources.fft_plans()
+    )
+    with installed_peer(None if no_peers else peers, benchmark.LENSLESS_ROUNDS, _progress) as peer:
+        found = benchmark.benchmark(request, peer, SystemClock(), _progress)
+    typer.echo(table(found.rows))
+    for one in found.left_out:
+        typer.echo(f"left out: {one}")
+    raise typer.Exit(1 if found.left_out else 0)
 
 
 @app.command()
@@ -291,9 +391,9 @@ def paper(
     merged: Annotated[int, typer.Option(min=1, max=3, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
 ) -> None:
     """Repeat the paper's experiments in the simulator and report them; fails if an assertion does not hold."""
-    from services.instrument.paper import report  # the simulator, which a picture does not need
+    from services.lab.paper import report  # imports the simulator only for this command
 
-    ran = report.rerun(output, SystemClock(), lambda line: typer.echo(line, err=True), only or (), merged)
+    ran = report.run_experiments(output, SystemClock(), lambda line: typer.echo(line, err=True), only or (), merged)
     typer.echo(report.table(ran))
     typer.echo(f"{output / 'report.html'}: {sum(one.seconds for one in ran):.0f} s")
     if not report.all_hold(ran):
@@ -311,8 +411,8 @@ def hard(
     check: Annotated[bool, typer.Option("--check", help="The exit status is 1 if there is a violation.")] = False,
 ) -> None:
     """Run the grid of hard cases: every kind of bad frame through every method and the ladder as shipped."""
-    from services.instrument.hard_cases import grid  # the simulator, which a picture does not need
-    from services.instrument.hard_cases.cells import COLUMNS
+    from services.lab.hard_cases import grid  # imports the simulator only for this command
+    from services.lab.hard_cases.cells import COLUMNS
 
     eyes = tuple(replace(eye, merged=merged) for eye in grid.EYES)
     found = grid.run(eyes, case or (), tuple(method or COLUMNS), lambda line: typer.echo(line, err=True))
@@ -326,14 +426,14 @@ def hard(
 @app.command()
 def optics(
     head: Annotated[Path | None, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")] = None,
-    sensor: Annotated[str | None, typer.Option(help="A sensor of device/sensors.py, such as imx296.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="A sensor of device/config/sensors.py, such as imx296.")] = None,
     eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
     pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,
     svg: Annotated[Path | None, typer.Option(help="Where to draw the light path, to scale.")] = None,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
-    from services.instrument import light_path_plot
-    from services.instrument import optics as budget
+    from services.lab import light_path_plot
+    from services.lab import optics_report as budget
 
     if head is not None and sensor is not None:
         raise typer.BadParameter("choose --head or --sensor, not both")
@@ -345,7 +445,7 @@ def optics(
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
     typer.echo(budget.table(chosen))
     if svg is not None:
-        written(svg, lambda: svg.write_text(light_path_plot.drawn(chosen), encoding="utf-8"))
+        write_or_raise(svg, lambda: svg.write_text(light_path_plot.draw_light_path(chosen), encoding="utf-8"))
         typer.echo(f"{svg}")
 
 
@@ -355,17 +455,43 @@ def methods(
     cols: Annotated[int, typer.Option(min=1, help="Columns of the frame.")] = 1920,
 ) -> None:
     """List the solvers with their cost in FFT pairs and their memory for a frame size."""
+    found = available_methods().values()  # before the first line is printed: a plug-in may be wrong
     typer.echo(f"{'method':<12} {'FFT pairs':>9} {'memory':>8}   for {rows} x {cols}")
-    for method in METHODS.values():
+    for method in found:
         memory = f"{method.memory_bytes(Grid.periodic((rows, cols), 1, float('inf'))) / 1e6:.0f} MB"
         mark = " (default)" if method.name == DEFAULT else ""
         typer.echo(f"{method.name:<12} {method.fft_pairs:>9} {memory:>8}   {method.sentence}{mark}")
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(version("diffuscope"))
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    _: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version, and exit.")
+    ] = False,
+) -> None:
+    """Image reconstruction for a funduscope whose lens is a piece of diffuser; and the whole instrument."""
+
+
 def main(words: list[str] | None = None) -> None:
-    """Run the command line (or the given words); an error of ours is a sentence and a remedy, never a traceback."""
+    """Run the command line with `words`, by default the process arguments.
+
+    For a DiffuscopeError, or a command that needs the extra `instrument` where it is not installed, print the message
+    and its remedy to stderr and exit with status 2.
+    """
     try:
         app(words)
     except DiffuscopeError as error:
         typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
+        sys.exit(2)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in INSTRUMENT_PACKAGES:
+            raise
+        remedy = 'Install the instrument: pip install "diffuscope[instrument]"'
+        typer.echo(f"error: this command needs {error.name}, which is not installed\n{remedy}", err=True)
         sys.exit(2)

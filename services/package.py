@@ -1,9 +1,64 @@
-"""Diffuscope: reconstruction of the retina from the raw frame of a lensless funduscope.
+"""Diffuscope: image reconstruction for a lensless funduscope, from one raw frame to a picture of the retina.
 
-The wheel lays this module as `diffuscope/__init__.py`; the program is in the packages `device` and `services`.
+    import diffuscope
+    scene = diffuscope.simulate("healthy")
+    made = diffuscope.reconstruct(scene.raw, scene.psf)
+    made.picture, made.report
+
+The wheel installs this module as `diffuscope/__init__.py`; the packages `device` and `services` hold the program.
+`__version__` is the installed version. A name is imported at its first use, so that `import diffuscope` is fast.
 """
 
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from device.errors import DiffuscopeError, FrameError, PsfError, SettingError, SpecError
+    from device.recon.methods import Method
+    from services.lab.datasets import open_dataset
+    from services.lab.frontier_result import Frontier
+    from services.lab.python_api import (
+        ForwardModel,
+        ReconstructionOptions,
+        Reconstructor,
+        SimulatedScene,
+        frontier,
+        methods,
+        reconstruct,
+        simulate,
+    )
+    from services.lab.reconstruct_file import FileReconstruction, FileReport
+
+__all__ = [
+    "DiffuscopeError", "FileReconstruction", "FileReport", "ForwardModel", "FrameError", "Frontier", "Method",
+    "PsfError", "ReconstructionOptions", "Reconstructor", "SettingError", "SimulatedScene", "SpecError", "__version__",
+    "frontier", "methods", "open_dataset", "reconstruct", "simulate",
+]  # fmt: skip
 __version__ = version("diffuscope")
+
+_MODULES = {
+    "device.errors": ("DiffuscopeError", "FrameError", "PsfError", "SettingError", "SpecError"),
+    "device.recon.methods": ("Method",),
+    "services.lab.datasets": ("open_dataset",),
+    "services.lab.frontier_result": ("Frontier",),
+    "services.lab.python_api": (
+        "ForwardModel", "ReconstructionOptions", "Reconstructor", "SimulatedScene", "frontier", "methods",
+        "reconstruct", "simulate",
+    ),
+    "services.lab.reconstruct_file": ("FileReconstruction", "FileReport"),
+}  # fmt: skip
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name at its first use."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'diffuscope' has no attribute {name!r}")
+    found: object = vars(import_module(_MODULE_OF[name]))[name]
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,9 +1,10 @@
-"""Paths of the files that are not Python: the page, head files, the light path and the changelog.
+"""Paths of the non-Python files: web page, head files, scenes, light path, changelog; and of cached FFT plans.
 
-A checkout has them at its top level. A wheel lays them into the package `diffuscope`, so that site-packages gets no
-folder named `web` or `hardware`.
+In a checkout they lie at the top level. In a wheel they lie in the package `diffuscope`, so that site-packages gets no
+top-level folder `web` or `hardware`.
 """
 
+import os
 from pathlib import Path
 
 BESIDE = Path(__file__).parents[1]
@@ -14,3 +15,9 @@ WEB = ROOT / "web"
 HEADS = ROOT / "hardware" / "heads"
 LIGHT_PATH = ROOT / "hardware" / "optics.toml"
 CHANGELOG = ROOT / "CHANGELOG.md"
+SCENES = BESIDE / "device" / "sim" / "scenes"
+
+
+def fft_plans() -> Path:
+    """Return the folder of cached FFT plans of this user; it may not exist yet."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"

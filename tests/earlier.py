@@ -1,7 +1,7 @@
-"""What each earlier version of the tables was written and read by: the very statements of that release, as text.
+"""SQL statements of earlier releases, one set for each version of the tables.
 
-They were noted down from the release itself and never change: a newer shelf must still answer them, for an update may
-be rolled back. A new version of the tables adds what its own release says, when the next one begins.
+The statements were recorded from the releases and never change: newer tables must still accept them, because an update
+may be rolled back. A new version of the tables adds the statements of its own release.
 """
 
 import hashlib
@@ -26,8 +26,8 @@ _SENDING = (
 _FIELD = "fields.visit, fields.name, fields.value, fields.set_at"
 
 
-def shelf_of(folder: Path, version: str) -> Path:
-    """An empty shelf whose tables are of that version."""
+def store_of_version(folder: Path, version: str) -> Path:
+    """Create an empty store whose tables have that version; return its folder."""
     (folder / "captures").mkdir(parents=True)
     engine = schema.open_engine(folder / "shelf.sqlite")
     config = schema.migration_config()
@@ -39,17 +39,17 @@ def shelf_of(folder: Path, version: str) -> Path:
 
 
 class Release:
-    """The program of an earlier version, as the shelf sees it: it connects, writes something of number `n`, reads."""
+    """Program of an earlier release: its connection, its write statements for number `n`, its queries."""
 
     def __init__(self, folder: Path, version: str) -> None:
         self._folder = folder
         self._versions = sorted(known for known in WRITES if known <= version)
 
     def write(self, n: int) -> None:
-        """Everything that it ever writes, with names that end in `n`; a capture's file too."""
-        place = self._folder / "captures" / f"c{n}"
-        place.mkdir()
-        (place / "raw.tiff").write_bytes(RAW)
+        """Run every write statement of the release, with names that end in `n`, and write a file of a capture."""
+        capture_folder = self._folder / "captures" / f"c{n}"
+        capture_folder.mkdir()
+        (capture_folder / "raw.tiff").write_bytes(RAW)
         with self._connected() as connection:
             connection.execute("BEGIN IMMEDIATE")
             for version in self._versions:
@@ -58,11 +58,13 @@ class Release:
         connection.close()
 
     def read(self, n: int) -> list[list[Row]]:
-        """What each of its questions about number `n` is answered."""
+        """Return the result of each query of the release about number `n`."""
         with self._connected() as connection:
-            said = [connection.execute(*ask).fetchall() for version in self._versions for ask in READS[version](n)]
+            results = [
+                connection.execute(*query).fetchall() for version in self._versions for query in READS[version](n)
+            ]
         connection.close()
-        return said
+        return results
 
     def _connected(self) -> sqlite3.Connection:
         connection = sqlite3.connect(self._folder / "shelf.sqlite", isolation_level=None)
@@ -71,13 +73,13 @@ class Release:
         return connection
 
 
-def _write_captures(say: sqlite3.Connection, n: int) -> None:
-    say.execute(
+def _write_captures(connection: sqlite3.Connection, n: int) -> None:
+    connection.execute(
         "INSERT INTO captures (id, eye, taken_at, simulated, calibration_id, report) VALUES (?, ?, ?, ?, ?, ?)",
         (f"c{n}", "OD", f"2026-03-01T12:00:{n:02}.000000+00:00", 1, "00ff", json.dumps({"verdict": {"n": n}})),
     )
     digest = hashlib.sha256(RAW).hexdigest()
-    say.execute(
+    connection.execute(
         "INSERT INTO files (capture_id, name, sha256, bytes) VALUES (?, ?, ?, ?)",
         (f"c{n}", "raw.tiff", digest, len(RAW)),
     )
@@ -100,15 +102,22 @@ def _read_captures(n: int) -> list[tuple[str, Row]]:
     ]
 
 
-def _write_light(say: sqlite3.Connection, n: int) -> None:
-    say.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OD", n, 0.001))
-    say.execute(
+def _write_light(connection: sqlite3.Connection, n: int) -> None:
+    connection.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OD", n, 0.001))
+    connection.execute(
         "UPDATE light_doses SET dose_j_per_cm2=? WHERE light_doses.eye = ? AND light_doses.slot = ?", (n, "OD", n)
     )
-    say.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OS", n, 0.001))
-    say.execute("DELETE FROM light_doses WHERE light_doses.eye = ? AND light_doses.slot = ?", ("OS", n))
-    if say.execute("UPDATE light_time SET now_s=?, observed_s=? WHERE light_time.id = ?", (1.0, 2.0, 1)).rowcount == 0:
-        say.execute("INSERT INTO light_time (id, boot, now_s, observed_s) VALUES (?, ?, ?, ?)", (1, "boot", 1.0, 2.0))
+    connection.execute("INSERT INTO light_doses (eye, slot, dose_j_per_cm2) VALUES (?, ?, ?)", ("OS", n, 0.001))
+    connection.execute("DELETE FROM light_doses WHERE light_doses.eye = ? AND light_doses.slot = ?", ("OS", n))
+    if (
+        connection.execute(
+            "UPDATE light_time SET now_s=?, observed_s=? WHERE light_time.id = ?", (1.0, 2.0, 1)
+        ).rowcount
+        == 0
+    ):
+        connection.execute(
+            "INSERT INTO light_time (id, boot, now_s, observed_s) VALUES (?, ?, ?, ?)", (1, "boot", 1.0, 2.0)
+        )
 
 
 def _read_light(n: int) -> list[tuple[str, Row]]:
@@ -122,29 +131,35 @@ def _read_light(n: int) -> list[tuple[str, Row]]:
     ]
 
 
-def _write_people(say: sqlite3.Connection, n: int) -> None:
+def _write_people(connection: sqlite3.Connection, n: int) -> None:
     now, visit, person = "2026-03-01T12:00:00.000000+00:00", f"v{n}", f"A{n}"
-    say.execute("DELETE FROM keys WHERE keys.done_at < ?", ("2026-01-01",))
-    if say.execute("UPDATE counters SET last=? WHERE counters.prefix = ?", (n, "A")).rowcount == 0:
-        say.execute("INSERT INTO counters (prefix, last) VALUES (?, ?)", ("A", n))
-    say.execute("INSERT INTO persons (number, made_at) VALUES (?, ?)", (person, now))
-    say.execute('INSERT INTO keys ("key", request, answer, done_at) VALUES (?, ?, ?, ?)', (f"{n:016}", "r", visit, now))
-    say.execute(
+    connection.execute("DELETE FROM keys WHERE keys.done_at < ?", ("2026-01-01",))
+    if connection.execute("UPDATE counters SET last=? WHERE counters.prefix = ?", (n, "A")).rowcount == 0:
+        connection.execute("INSERT INTO counters (prefix, last) VALUES (?, ?)", ("A", n))
+    connection.execute("INSERT INTO persons (number, made_at) VALUES (?, ?)", (person, now))
+    connection.execute(
+        'INSERT INTO keys ("key", request, answer, done_at) VALUES (?, ?, ?, ?)', (f"{n:016}", "r", visit, now)
+    )
+    connection.execute(
         "INSERT INTO visits (id, person, day, begun_at, finished_at, outcome) VALUES (?, ?, ?, ?, ?, ?)",
         (visit, person, "2026-03-01", now, None, None),
     )
-    say.execute("INSERT INTO fields (visit, name, value, set_at) VALUES (?, ?, ?, ?)", (visit, "age", "50", now))
-    say.execute(
+    connection.execute("INSERT INTO fields (visit, name, value, set_at) VALUES (?, ?, ?, ?)", (visit, "age", "50", now))
+    connection.execute(
         "UPDATE fields SET value=?, set_at=? WHERE fields.visit = ? AND fields.name = ?", ("51", now, visit, "age")
     )
-    say.execute("INSERT INTO identifiers (person, name, value) VALUES (?, ?, ?)", (person, "name", '"x"'))
-    say.execute("DELETE FROM identifiers WHERE identifiers.person = ? AND identifiers.name = ?", (person, "name"))
-    say.execute("INSERT INTO shots (capture, visit, slot) VALUES (?, ?, ?)", (f"c{n}", visit, "R-centre"))
-    say.execute(
+    connection.execute("INSERT INTO identifiers (person, name, value) VALUES (?, ?, ?)", (person, "name", '"x"'))
+    connection.execute(
+        "DELETE FROM identifiers WHERE identifiers.person = ? AND identifiers.name = ?", (person, "name")
+    )
+    connection.execute("INSERT INTO shots (capture, visit, slot) VALUES (?, ?, ?)", (f"c{n}", visit, "R-centre"))
+    connection.execute(
         "INSERT INTO slots (visit, slot, capture, reason) VALUES (?, ?, ?, ?)", (visit, "L-centre", None, "pupil")
     )
-    say.execute("UPDATE slots SET reason=? WHERE slots.visit = ? AND slots.slot = ?", ("pain", visit, "L-centre"))
-    say.execute(
+    connection.execute(
+        "UPDATE slots SET reason=? WHERE slots.visit = ? AND slots.slot = ?", ("pain", visit, "L-centre")
+    )
+    connection.execute(
         "UPDATE visits SET finished_at=?, outcome=? WHERE visits.id = ?",
         (now, OUTCOME, visit),
     )
@@ -175,19 +190,19 @@ def _read_people(n: int) -> list[tuple[str, Row]]:
     ]
 
 
-def _write_outbox(say: sqlite3.Connection, n: int) -> None:
+def _write_outbox(connection: sqlite3.Connection, n: int) -> None:
     now, visit = "2026-03-01T12:00:00.000000+00:00", f"v{n}"
-    say.execute(
+    connection.execute(
         "INSERT INTO sendings (visit, finished_at, tries, failing_since, error, said, sent_at, sha256, confirmed)"
         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (visit, now, 1, now, "send.link", "no answer", None, None, None),
     )
-    say.execute(
+    connection.execute(
         "UPDATE sendings SET tries=?, failing_since=?, error=?, said=?, sent_at=?, sha256=?, confirmed=?"
         " WHERE sendings.visit = ? AND sendings.finished_at = ?",
         (2, None, None, None, now, hashlib.sha256(RAW).hexdigest(), "sha256", visit, now),
     )
-    say.execute("UPDATE visits SET sent=? WHERE visits.id = ?", (now, visit))
+    connection.execute("UPDATE visits SET sent=? WHERE visits.id = ?", (now, visit))
 
 
 def _read_outbox(n: int) -> list[tuple[str, Row]]:
@@ -203,15 +218,39 @@ def _read_outbox(n: int) -> list[tuple[str, Row]]:
     ]
 
 
+def _correct_eye(connection: sqlite3.Connection, n: int) -> None:
+    report = {"verdict": {"n": n}, "visit": f"v{n}", "slot": "R-nerve", "laterality": {"eye": "OD"}}
+    connection.execute("UPDATE captures SET eye=?, report=? WHERE captures.id = ?", ("OD", json.dumps(report), f"c{n}"))
+    connection.execute("UPDATE shots SET slot=? WHERE shots.capture = ?", ("R-nerve", f"c{n}"))
+
+
+def _read_columns(n: int) -> list[tuple[str, Row]]:
+    return [
+        (
+            "SELECT captures.visit, captures.slot, captures.verdict, captures.laterality FROM captures"
+            " WHERE captures.id = ?",
+            (f"c{n}",),
+        ),
+        (
+            "SELECT shots.visit, coalesce(captures.slot, shots.slot) AS coalesce_1, shots.capture, captures.verdict"
+            " FROM shots LEFT OUTER JOIN captures ON captures.id = shots.capture WHERE shots.visit IN (?)"
+            " ORDER BY captures.rowid",
+            (f"v{n}",),
+        ),
+    ]
+
+
 WRITES: dict[str, Callable[[sqlite3.Connection, int], None]] = {
     "r0001": _write_captures,
     "r0002": _write_light,
     "r0003": _write_people,
     "r0004": _write_outbox,
+    "r0005": _correct_eye,
 }
 READS: dict[str, Callable[[int], list[tuple[str, Row]]]] = {
     "r0001": _read_captures,
     "r0002": _read_light,
     "r0003": _read_people,
     "r0004": _read_outbox,
+    "r0005": _read_columns,
 }

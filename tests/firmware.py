@@ -1,8 +1,8 @@
-"""What a Raspberry Pi 5's firmware makes of `autoboot.txt`, by its documentation: the judge of every power cut.
+"""Emulated Raspberry Pi 5 firmware: boot partition selection from `autoboot.txt`, as its documentation specifies.
 
-It reads the first 512 bytes. `[all]` holds for every start, `[tryboot]` for the one that was asked for, and what is
-said last counts. Without a file, or without a number, it takes the first partition that is FAT and has a `config.txt`:
-on our card that is `boot-a`, whatever is in it.
+It reads the first 512 bytes. `[all]` applies to every boot, `[tryboot]` to a boot with the tryboot argument, and the
+last value wins. Without a file or a number, it takes the first FAT partition with a `config.txt`: on our card `boot-a`,
+whatever its content.
 """
 
 import re
@@ -13,16 +13,16 @@ READS_BYTES = 512
 
 
 def partition(autoboot: bytes | None, tried: bool = False) -> int | None:
-    """The number that `autoboot.txt` names for this start; None if it names none."""
-    heard, number = True, None
+    """Return the partition number that `autoboot.txt` selects for this boot; None if it selects none."""
+    applies, number = True, None
     for line in (autoboot or b"")[:READS_BYTES].decode("ascii", "replace").splitlines():
         if section := re.fullmatch(r"\[(.+)\]", line):
-            heard = section[1] == "all" or (section[1] == "tryboot" and tried)
-        elif heard and (said := re.fullmatch(r"boot_partition=(\d+)", line)):
-            number = int(said[1])
+            applies = section[1] == "all" or (section[1] == "tryboot" and tried)
+        elif applies and (setting := re.fullmatch(r"boot_partition=(\d+)", line)):
+            number = int(setting[1])
     return number
 
 
 def boots(autoboot: bytes | None, tried: bool = False) -> str:
-    """The slot that is started."""
+    """Return the slot that boots."""
     return SLOTS[partition(autoboot, tried) or FIRST_BOOTABLE]

@@ -1,8 +1,8 @@
-"""A stand-in for RAUC, where there are no slots: it says what RAUC 1.8 was heard to say, and asks our boot chooser.
+"""Fake RAUC for machines without boot slots: prints recorded output of RAUC 1.8, and calls our boot chooser.
 
-    python -IS tests/rauc.py FOLDER info --output-format=json BUNDLE        (status, install, ... as RAUC knows them)
+    python -IS tests/rauc.py FOLDER info --output-format=json BUNDLE        (status, install, ... as in RAUC)
 
-FOLDER is that of `tests/updates.py`. A bundle is a line of JSON and some padding. Standard library only, to be quick.
+FOLDER is that of `tests/updates.py`. A bundle is a line of JSON and padding. Standard library only, for a fast start.
 """
 
 import json
@@ -19,13 +19,13 @@ STEPS = ("  0% Installing", " 20% Checking bundle", " 40% Checking bundle done."
 
 
 def main(folder: Path, words: list[str]) -> int:
-    """Say and do what was asked; the exit status."""
+    """Run one RAUC command; return the exit status."""
     chooser = BootChooser(folder / "chooser/autoboot.txt", folder / "state", folder / "word", folder / "cmdline")
     match words:
         case ["info", "--output-format=json", path]:
-            return told(Path(path))
+            return print_info(Path(path))
         case ["status", "--output-format=json"]:
-            say(json.dumps({"compatible": "diffuscope-pi5"}))
+            print_line(json.dumps({"compatible": "diffuscope-pi5"}))
         case ["status", "mark-good", "booted"]:
             chooser.set_good(chooser.booted())
         case ["status", "mark-bad", "booted"]:
@@ -33,33 +33,37 @@ def main(folder: Path, words: list[str]) -> int:
         case ["status", "mark-active", "other"]:
             chooser.set_primary(other(chooser.booted()))
         case ["install", path]:
-            return installed(folder, chooser, Path(path))
+            return install(folder, chooser, Path(path))
         case _:
             raise ValueError(f"the stand-in does not know {words}")
     return 0
 
 
-def told(path: Path) -> int:
-    said = content(path)
-    if said is None or said["signer"] != "ours":
-        sys.stderr.write(BROKEN if said is None else FOREIGN)
+def print_info(path: Path) -> int:
+    manifest = content(path)
+    if manifest is None or manifest["signer"] != "ours":
+        sys.stderr.write(BROKEN if manifest is None else FOREIGN)
         return 1
-    say(json.dumps(said | {"description": f"updates from {said['minimum']} or newer", "build": None, "images": []}))
+    print_line(
+        json.dumps(
+            manifest | {"description": f"updates from {manifest['minimum']} or newer", "build": None, "images": []}
+        )
+    )
     return 0
 
 
-def installed(folder: Path, chooser: BootChooser, path: Path) -> int:
-    slot, said = other(chooser.booted()), content(path)
-    assert said is not None
+def install(folder: Path, chooser: BootChooser, path: Path) -> int:
+    slot, manifest = other(chooser.booted()), content(path)
+    assert manifest is not None
     chooser.set_bad(slot)
     for step in STEPS:
-        say(step)
+        print_line(step)
     while (folder / "hold").exists():
         time.sleep(0.02)
-    if said["slot"] == "small":
-        say("100% Installing failed.\nLastError: Slot 'rootfs.1' is too small for the image")
+    if manifest["slot"] == "small":
+        print_line("100% Installing failed.\nLastError: Slot 'rootfs.1' is too small for the image")
         return 1
-    say("100% Installing done.")
+    print_line("100% Installing done.")
     chooser.set_primary(slot)
     return 0
 
@@ -71,7 +75,7 @@ def content(path: Path) -> dict[str, str] | None:
         return None
 
 
-def say(words: str) -> None:
+def print_line(words: str) -> None:
     sys.stdout.write(f"{words}\n")
     sys.stdout.flush()
 

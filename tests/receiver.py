@@ -1,4 +1,4 @@
-"""Who takes the visits that are sent: a folder behind real HTTPS, kept in memory, with everything that can go wrong."""
+"""Test receiver of visit archives: an HTTPS server that stores them in memory, with injectable faults."""
 
 import base64
 import hashlib
@@ -15,32 +15,33 @@ KEY = "a-key-of-this-device"
 
 @dataclass
 class Receiver:
-    """What arrived, and what is done with the next parcels.
+    """State of the server: stored archives, requests, and the faults of the next requests.
 
-    `answers` are statuses instead of an answer, by method; `mood` is what happens to a PUT: "half" keeps the first half
-    and says 201, "mute" keeps all and hangs up without a word, "cut" hangs up in the middle, "dribble" answers a letter
-    a second. `gate` is passed by each request, `after_put` by those after a parcel was kept.
+    `answers` are statuses returned instead of the normal answer, by method; `put_fault` is the fault of a PUT: "half"
+    stores the first half and answers 201, "mute" stores everything and closes without an answer, "cut" closes in the
+    middle, "dribble" answers slowly, byte by byte. Every request waits for `gate`, requests after a stored PUT also for
+    `after_put`.
     """
 
     at: str = ""
     kept: dict[str, bytes] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
     answers: dict[str, int] = field(default_factory=dict)
-    mood: str = "well"
-    tells_digest: bool = True
+    put_fault: str = "well"
+    sends_digest: bool = True
     gate: Event = field(default_factory=Event)
     after_put: Event = field(default_factory=Event)
     over: Event = field(default_factory=Event)
 
     def settings(self, folder: Path, **more: object) -> dict[str, object]:
-        """What a device must be told to send here."""
+        """Return the send settings of a device for this receiver."""
         token = folder / "send.token"
         token.write_text(f"{KEY}\n")
         return {"address": f"{self.at}/inbox", "token": token, "answer_s": 5.0} | more
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One request; the receiver is the server's."""
+    """One request; the state is the server's."""
 
     protocol_version = "HTTP/1.1"
     server: "Quiet"
@@ -51,7 +52,7 @@ class Handler(BaseHTTPRequestHandler):
             return
         content = known.kept.get(self.path)
         self.send_response(404 if content is None else 200)
-        if content is not None and known.tells_digest and self.headers["Want-Repr-Digest"]:
+        if content is not None and known.sends_digest and self.headers["Want-Repr-Digest"]:
             digest = base64.b64encode(hashlib.sha256(content).digest()).decode()
             self.send_header("Repr-Digest", f"sha-256=:{digest}:")
         self.send_header("Content-Length", str(len(content or b"")))
@@ -59,18 +60,18 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_PUT(self) -> None:
         known, length = self.server.known, int(self.headers["Content-Length"])
-        content = self.rfile.read(length // 2 if known.mood == "cut" else length)
+        content = self.rfile.read(length // 2 if known.put_fault == "cut" else length)
         self.close_connection = True
         if len(content) < length or self._is_answered():
             return
         if self.path in known.kept and self.headers["If-None-Match"] == "*":
-            self._say(412)
+            self._send_status(412)
             return
-        known.kept[self.path] = content[: length // 2] if known.mood == "half" else content
-        while known.mood == "dribble" and not known.over.wait(0.2):
+        known.kept[self.path] = content[: length // 2] if known.put_fault == "half" else content
+        while known.put_fault == "dribble" and not known.over.wait(0.2):
             self.wfile.write(b"H")
-        if known.mood not in ("mute", "dribble"):
-            self._say(201)
+        if known.put_fault not in ("mute", "dribble"):
+            self._send_status(201)
 
     def _is_answered(self) -> bool:
         known = self.server.known
@@ -82,10 +83,10 @@ class Handler(BaseHTTPRequestHandler):
         if status is None and self.headers["Authorization"] != f"Bearer {KEY}":
             status = 401
         if status is not None:
-            self._say(status)
+            self._send_status(status)
         return status is not None
 
-    def _say(self, status: int) -> None:
+    def _send_status(self, status: int) -> None:
         self.send_response(status)
         if status == 302:
             self.send_header("Location", f"{self.server.known.at}/elsewhere")
@@ -97,7 +98,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 class Quiet(ThreadingHTTPServer):
-    """A server that says nothing about who hung up."""
+    """HTTP server that does not log connection errors."""
 
     daemon_threads = True
 
@@ -111,7 +112,7 @@ class Quiet(ThreadingHTTPServer):
 
 @contextmanager
 def receiving(certificate: Path, key: Path, port: int = 0) -> Iterator[Receiver]:
-    """A receiver at localhost, for as long as the context lasts."""
+    """Yield a running receiver on localhost."""
     known = Receiver()
     known.gate.set()
     known.after_put.set()

@@ -1,9 +1,9 @@
-"""Small made-up inputs for the numerics: PSFs, scenes and calibrations that need no optics and no files."""
+"""Synthetic inputs for numerical tests: PSFs and calibrations without optics and files."""
 
 import numpy as np
 
 from device.clock import SystemClock, VirtualClock
-from device.recon.plan import Planner
+from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Calibration, Geometry, Image, Psf, Sensor
 
@@ -12,7 +12,7 @@ GEOMETRY = Geometry(pitch_um=20.16, diffuser_to_sensor_um=6000, angular_magnific
 
 
 def speckle(shape: tuple[int, int], seed: int = 0, grain_px: float = 1.2) -> Image:
-    """A caustic-like PSF: smoothed noise cubed inside a disc, positive, unit sum."""
+    """Return a caustic-like PSF: smoothed noise cubed inside a disc, positive, unit sum."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft2(rng.standard_normal(shape))
     f2 = np.fft.fftfreq(shape[0])[:, None] ** 2 + np.fft.rfftfreq(shape[1])[None] ** 2
@@ -25,23 +25,23 @@ def speckle(shape: tuple[int, int], seed: int = 0, grain_px: float = 1.2) -> Ima
 
 
 def delta(shape: tuple[int, int]) -> Image:
-    """A PSF that blurs nothing."""
+    """Return a PSF without blur."""
     psf = np.zeros(shape, np.float32)
     psf[shape[0] // 2, shape[1] // 2] = 1
     return psf
 
 
 def calibration(psf: Image, **changes: object) -> Calibration:
-    """A calibration around one PSF; by default no field is known and nothing saturates below 16 bits."""
-    facts: dict[str, object] = {"psfs": (Psf(psf),), "sensor": Sensor()} | changes
-    return Calibration(**facts)  # type: ignore[arg-type]
+    """Return a calibration with one PSF; by default the field is unknown and the white level is that of 16 bits."""
+    values: dict[str, object] = {"psfs": (Psf(psf),), "sensor": Sensor()} | changes
+    return Calibration(**values)  # type: ignore[arg-type]
 
 
 def reconstructor(cal: Calibration, shape: tuple[int, int], *recipes: Recipe) -> Reconstructor:
-    """A reconstructor on virtual time, unplanned beyond what the shape needs."""
+    """Return a reconstructor on virtual time; the default is one stage of `gradient` without binning."""
     return Reconstructor(cal, shape, PLANNER, VirtualClock(), recipes or (Recipe("gradient", 1),))
 
 
-def timed(cal: Calibration, shape: tuple[int, int], *recipes: Recipe) -> Reconstructor:
-    """The same on the computer's clock."""
+def reconstructor_on_system_clock(cal: Calibration, shape: tuple[int, int], *recipes: Recipe) -> Reconstructor:
+    """Return the same reconstructor on the system clock."""
     return Reconstructor(cal, shape, PLANNER, SystemClock(), recipes or (Recipe("gradient", 1),))

@@ -1,4 +1,4 @@
-"""Scenes for tests: coarser pixels with the same optics and light, other keys, and what a world then gives."""
+"""Scenes for tests: coarser pixels with the same optics and light, changed keys, and frames of their worlds."""
 
 from dataclasses import replace
 from functools import partial
@@ -9,19 +9,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.plan import decide
 from device.sim.world import World
-from device.spec import InstrumentSpec
-from device.values import Counts, Glow, Shot
+from device.values import Counts, ExposureSettings, Illumination
 
 SCENES = Path(__file__).parents[1] / "device" / "sim" / "scenes"
-PEDESTAL_DN = 1000.0  # so that nothing is cut off below zero
+PEDESTAL_DN = 1000.0  # so that no count is clipped at zero
+SMALL_SCENE = """\
+[sim]
+
+[sim.object]
+haemorrhages = 3
+"""
+
+
+def small_head_toml(name: str, tables: str = SMALL_SCENE, summed: int = 1, exposure_s: float | None = None) -> str:
+    """Return the head file of a simulated head with a small sensor, 270 x 480 pixels, `summed` x `summed` as one.
+
+    `tables` are its further tables; `exposure_s` is the exposure of pictures and of aiming, None: the default.
+    """
+    times = "" if exposure_s is None else f"exposure_s = {exposure_s}\npreview_exposure_s = {exposure_s}\n"
+    return f"""\
+name = "{name}"
+
+[camera]
+backend = "sim"
+rows = {2 * -(-135 // summed)}
+cols = {480 // summed}
+pitch_um = {20.16 * summed:.2f}
+full_well_e = 23000
+read_noise_e = 1.03
+{times}
+[light]
+backend = "sim"
+
+[optics]
+iris_um = 3200
+diffuser_to_sensor_um = 6000
+angular_magnification = 0.75
+field_deg = 33.4
+
+{tables}"""
 
 
 def coarse(spec: InstrumentSpec, k: int) -> InstrumentSpec:
-    """The head as if k x k of its pixels had been summed: as much light per area, as much noise, as fast a shutter."""
+    """Return the head with k x k of its pixels summed: same light per area, same noise, same readout time."""
     camera, sim = spec.camera, spec.sim
     assert sim is not None
     summed = {
@@ -34,33 +69,33 @@ def coarse(spec: InstrumentSpec, k: int) -> InstrumentSpec:
         "line_s": k * sim.sensor.line_s,
     }  # fmt: skip
     head = spec.model_copy(update={"camera": camera.model_copy(update=summed)})
-    return having(head, peak_e=k**2 * sim.peak_e, sensor=flaws)
+    return with_keys(head, peak_e=k**2 * sim.peak_e, sensor=flaws)
 
 
-def having(spec: InstrumentSpec, **keys: Any) -> InstrumentSpec:
-    """The head with other keys in [sim]; a dictionary changes keys of that table."""
+def with_keys(spec: InstrumentSpec, **keys: Any) -> InstrumentSpec:
+    """Return the head with other keys in [sim]; a dictionary changes keys of that table."""
     sim = spec.sim
     changed = {k: getattr(sim, k).model_copy(update=v) if isinstance(v, dict) else v for k, v in keys.items()}
     return spec.model_copy(update={"sim": sim.model_copy(update=changed)})
 
 
 def world(spec: InstrumentSpec, **chosen: Any) -> World:
-    """A world with those effects that `decide` is told to choose."""
+    """Return a world whose effects `decide` selects with these arguments."""
     return World(spec, VirtualClock(), choose=partial(decide, **chosen))
 
 
-def exposed(of: World, lit: bool = True) -> Counts:
-    """One frame, or a dark one."""
+def exposed_counts(of: World, lit: bool = True) -> Counts:
+    """Return one lit frame, or a dark one."""
     camera, light = SimCamera(of), SimLight(of)
     if not lit:
-        return camera.expose(Shot(of.spec.camera.exposure_s)).counts
-    with light.on(Glow(of.spec.light.colour)):
-        return camera.expose(Shot(of.spec.camera.exposure_s)).counts
+        return camera.expose(ExposureSettings(of.spec.camera.exposure_s)).counts
+    with light.on(Illumination(of.spec.light.colour)):
+        return camera.expose(ExposureSettings(of.spec.camera.exposure_s)).counts
 
 
-def expected(of: World) -> NDArray[np.float64]:
-    """The electrons of a frame without noise, after all that the sensor does to them but round."""
-    with SimLight(of).on(Glow(of.spec.light.colour)):
+def expected_electrons(of: World) -> NDArray[np.float64]:
+    """Return the noise-free electrons of a frame after the sensor's response, without rounding."""
+    with SimLight(of).on(Illumination(of.spec.light.colour)):
         arriving = of.electrons(of.spec.camera.exposure_s)
     gain = of.scene.peak_e / 40000
     reader = replace(

@@ -1,8 +1,8 @@
-"""A device that is updated, without a body: folders for stick, slots and boot choice, and a stand-in for RAUC.
+"""Emulated device for updates: folders for USB drive, boot slots and boot selection, and a fake RAUC.
 
-The updater is the real one, as a process of its own beside the page: `python -m tests.updates answer FOLDER VERSION` is
-what systemd calls on a device. `rauc FOLDER ...` is the stand-in, which says what RAUC 1.8 was heard to say; with the
-real RAUC everything runs in `tests/appliance`. A bundle is a line of JSON and some padding.
+The updater is the real one, in its own process beside the page: `python -m tests.updates answer FOLDER VERSION` is the
+call that systemd makes on a device. `tests/rauc.py` prints recorded output of RAUC 1.8; `tests/appliance` runs the real
+RAUC. A bundle is a line of JSON and padding.
 """
 
 import json
@@ -16,11 +16,11 @@ from pathlib import Path
 from threading import Event, Thread
 
 from device.clock import SystemClock
-from services.records.update_notes import TABLET, WISH
 from services.update.bootchooser import BootChooser
+from services.update.ipc import REQUEST_FILE, TABLET
 from services.update.settings import UpdateSettings
 from services.update.updater import Updater
-from tests.house import ROOT
+from tests.project_files import ROOT
 
 DEVICE = "diffuscope-pi5"
 NOWHERE = "http://127.0.0.1:9"  # no instrument
@@ -30,7 +30,7 @@ RAUC = ROOT / "tests" / "rauc.py"
 
 @dataclass
 class Board:
-    """The device's folders; `first_on_path` is where the updater's Python looks first: what its version is called."""
+    """Folders of the device; `first_on_path` comes first on the updater's PYTHONPATH and so sets its version."""
 
     folder: Path
     instrument: str = NOWHERE
@@ -39,7 +39,7 @@ class Board:
 
     @classmethod
     def new(cls, folder: Path, instrument: str = NOWHERE) -> "Board":
-        """From the factory: slot A runs and is committed."""
+        """Return a factory-new device: slot A runs and is committed."""
         for name in ("chooser", "media/STICK", f"state/{TABLET}", "wishes"):
             (folder / name).mkdir(parents=True)
         (folder / "chooser/autoboot.txt").write_text(AUTOBOOT)
@@ -51,7 +51,7 @@ class Board:
         return self.folder / "state"
 
     @property
-    def wishes(self) -> Path:
+    def requests(self) -> Path:
         return self.folder / "wishes"
 
     @property
@@ -66,7 +66,7 @@ class Board:
     def settings(self, **changed: object) -> UpdateSettings:
         here = self.folder
         known: dict[str, object] = {
-            "sticks": here / "media", "folder": self.state, "wishes": self.wishes, "keyring": here / "ca.crt",
+            "sticks": here / "media", "folder": self.state, "wishes": self.requests, "keyring": here / "ca.crt",
             "rauc": (sys.executable, "-IS", str(RAUC), str(here)), "instrument": self.instrument,
             "restart": ("touch", str(here / "off")), "answer_s": 2.0, "patience_s": self.patience_s,
             "modules": here / "modules",
@@ -77,14 +77,20 @@ class Board:
         return Updater(self.settings(**changed), SystemClock(), print, self.chooser, runs)
 
     def bundle(self, name: str, version: str = "2.0", padding_bytes: int = 3_000_000, **changed: str) -> Path:
-        """An update on the stick."""
+        """Write an update bundle to the USB drive; return its path."""
         path = self.stick / name
-        said = {"compatible": DEVICE, "version": version, "minimum": "0.1", "signer": "ours", "slot": "large"} | changed
-        path.write_bytes(json.dumps(said).encode() + b"\n" + bytes(padding_bytes))
+        manifest = {
+            "compatible": DEVICE,
+            "version": version,
+            "minimum": "0.1",
+            "signer": "ours",
+            "slot": "large",
+        } | changed
+        path.write_bytes(json.dumps(manifest).encode() + b"\n" + bytes(padding_bytes))
         return path
 
     def hold(self) -> None:
-        """Let the next install stand still when half of it is written, until `release`."""
+        """Pause the next install at half of its steps, until `release`."""
         (self.folder / "hold").touch()
 
     def release(self) -> None:
@@ -96,7 +102,7 @@ class Board:
         return (self.folder / "off").exists()
 
     def boot(self) -> str:
-        """What the firmware does with the word of an orderly restart; the slot that runs then."""
+        """Emulate the firmware after an orderly restart; return the slot that runs."""
         slot = self.chooser.primary()
         for name in ("word", "off"):
             (self.folder / name).unlink(missing_ok=True)
@@ -104,7 +110,7 @@ class Board:
         return slot
 
     def run(self, word: str, version: str) -> str:
-        """One call of the updater as systemd makes it."""
+        """Call the updater as systemd does; return its output."""
         words = [
             sys.executable,
             "-m",
@@ -123,19 +129,19 @@ class Board:
 
     @contextmanager
     def path_unit(self, version: str) -> Iterator[list[str]]:
-        """What `diffuscope-wish.path` does, while version `version` runs; what the updater said."""
-        said: list[str] = []
+        """Emulate `diffuscope-wish.path` while version `version` runs; yield the list of the updater's outputs."""
+        outputs: list[str] = []
         over = Event()
 
         def watch() -> None:
             while not over.wait(0.05):
-                if (self.wishes / WISH).exists():
-                    said.extend((self.run("answer", version), self.run("tidy", version)))
+                if (self.requests / REQUEST_FILE).exists():
+                    outputs.extend((self.run("answer", version), self.run("tidy", version)))
 
         thread = Thread(target=watch)
         thread.start()
         try:
-            yield said
+            yield outputs
         finally:
             over.set()
             thread.join(60)

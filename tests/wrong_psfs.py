@@ -1,4 +1,4 @@
-"""PSFs that do not belong to a frame: mirrored, rotated, its blocks shuffled, or another head's in the right shape."""
+"""Wrong PSFs for a frame: mirrored, rotated, shuffled in blocks, or from another head."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,13 +8,13 @@ from device.values import Image
 
 
 def orientations(psf: Image) -> dict[str, Image]:
-    """The PSF mirrored left to right, mirrored up to down, and rotated by 180 degrees."""
-    turned = {"mirrored left-right": psf[:, ::-1], "mirrored up-down": psf[::-1], "rotated by 180": psf[::-1, ::-1]}
-    return {name: np.ascontiguousarray(image) for name, image in turned.items()}
+    """Return the PSF mirrored left to right, mirrored up to down, and rotated by 180 degrees."""
+    views = {"mirrored left-right": psf[:, ::-1], "mirrored up-down": psf[::-1], "rotated by 180": psf[::-1, ::-1]}
+    return {name: np.ascontiguousarray(image) for name, image in views.items()}
 
 
 def shuffled(psf: Image, blocks: int = 8, seed: int = 0) -> Image:
-    """The PSF cut into blocks x blocks parts, in random order; what is left over at the far edges is dark."""
+    """Return the PSF with blocks x blocks parts in random order; the incomplete parts at the far edges are dark."""
     rows, cols = (size // blocks for size in psf.shape)
     image = np.zeros_like(psf)
     parts = psf[: rows * blocks, : cols * blocks].reshape(blocks, rows, blocks, cols).swapaxes(1, 2)
@@ -26,6 +26,6 @@ def shuffled(psf: Image, blocks: int = 8, seed: int = 0) -> Image:
 
 
 def resized(psf: Image, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Another head's PSF, interpolated to `shape`."""
+    """Return the PSF of another head, interpolated to `shape`."""
     factors = [want / have for want, have in zip(shape, psf.shape, strict=True)]
     return np.asarray(np.maximum(ndimage.zoom(psf, factors, order=1), 0), np.float32)

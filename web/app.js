@@ -1,57 +1,59 @@
-// The page's story: where the person is, what the instrument tells, what is drawn. What a person can do stands in act.js.
+// Controller of the exam page: handles route changes and server events, and renders the state store. User actions are
+// in core/actions.js.
 
-import { act, answers } from "./act.js";
-import { askForControls, EventLine, getCapture, getProtocol, getStatus, letControlsGo, Refusal } from "./api.js";
-import { page } from "./frame.js";
-import { listenToKeys } from "./keys.js";
-import "./live.js";
-import { get, set, store } from "./memory.js";
-import { cue, freshPicture, heardOfShots, lock, openPicture, settleShots, take } from "./press.js";
-import { follow, go } from "./routes.js";
-import { lower, over, raise, stands } from "./states.js";
+import { actions, pageHooks } from "./core/actions.js";
+import { requestControl, EventStream, getCapture, getProtocol, getStatus, releaseControl, ApiError } from "./core/api.js";
+import { page } from "./screens/page_layout.js";
+import { bindKeys } from "./core/keyboard.js";
+import "./components/live_preview.js";
+import { get, set, store } from "./core/state.js";
+import { playCue, resetPictureTools, captureEventHandlers, ignoreTaps, openPicture, resolveCutShots, takePicture } from "./core/capture.js";
+import { startRouter, navigate } from "./core/router.js";
+import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
 import { render } from "./vendor/lit-html.js";
-import { finishWhenMade, politely, refreshList, refreshOutbox, refreshVisit, saveRest } from "./visit.js";
-import { learn, t, today } from "./words.js";
+import { finishWhenComplete, alertOnError, refreshList, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
+import { loadLanguage, t, today } from "./i18n/translate.js";
 
-const STATUS_BEATS = 10; // ask for the status again at every tenth heartbeat
-const HOLD_BEATS = 4; // the controls are lent for ten seconds
-const READ_MS = 700; // a prompt stays long enough to be read
-const AUTO_MS = 500;
+const STATUS_BEATS = 10; // request the status at every tenth heartbeat
+const LEASE_BEATS = 4; // renewal period; the server's control lease lasts ten seconds
+const PROMPT_MIN_MS = 700; // minimum display time of a prompt
+const AUTO_CAPTURE_MS = 500;
 const LATE_S = 2;
 
 const $ = (selector) => document.querySelector(selector);
 
-// ---- arriving at a screen
+// ---- route changes
 
-async function arrive(route) {
+async function showRoute(route) {
   const before = get().route;
   const same = ["screen", "visit", "slot", "capture"].every((name) => before[name] === route[name]);
   const picked = route.visit === before.visit ? get().picked : Object.freeze([]);
-  if (!same) freshPicture();
-  // What went wrong belongs to the screen on which it did: nobody after that is told.
-  if (!same) lower(({ from }) => from === "press");
-  if (route.visit !== before.visit) lower("shot.crossed");
+  if (!same) resetPictureTools();
+  // Alerts of a failed action are cleared when the screen changes.
+  if (!same) lowerAlerts(({ from }) => from === "press");
+  if (route.visit !== before.visit) lowerAlerts("shot.crossed");
   if (route.screen !== "outcome") set({ finishing: null });
   set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
-  lock(); // a double tap must not also press what stands there on the new screen
-  lower("link.slow");
+  ignoreTaps(); // debounce: the second half of a double tap must not press a control of the new screen
+  lowerAlerts("link.slow");
   if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
-  await load(route);
-  if (!same) requestAnimationFrame(() => focusOn(route.screen));
+  await loadRoute(route);
+  if (!same) requestAnimationFrame(() => focusScreen(route.screen));
 }
 
-// What Home does not need, by the screens that do. A file that a lost link kept back is asked for again when the link is back.
-const FILES = {
+// Lazily loaded modules, and the screens that need them. A failed import is retried when the event stream is connected
+// again.
+const LAZY_MODULES = {
   history: () => import("./screens/history.js"),
   send: () => import("./screens/send.js"),
-  aloud: () => import("./screens/aloud.js"),
-  details: () => import("./screens/details.js"),
-  viewer: () => import("./viewer.js"),
+  speech: () => import("./components/speech_dialog.js"),
+  details: () => import("./components/picture_details.js"),
+  viewer: () => import("./components/viewer/viewer.js"),
 };
-const LATER = {
+const MODULES_OF_SCREEN = {
   find: ["viewer"],
-  person: ["viewer", "aloud"],
-  aim: ["viewer", "aloud"],
+  person: ["viewer", "speech"],
+  aim: ["viewer", "speech"],
   picture: ["viewer", "details"],
   history: ["viewer", "history"],
   send: ["send"],
@@ -59,18 +61,18 @@ const LATER = {
   compare: ["viewer", "history"],
 };
 
-async function bring(name) {
-  if (get().later[name]) return;
+async function loadModule(name) {
+  if (get().modules[name]) return;
   try {
-    const module = await FILES[name]();
-    set({ later: Object.freeze({ ...get().later, [name]: module }) });
+    const module = await LAZY_MODULES[name]();
+    set({ modules: Object.freeze({ ...get().modules, [name]: module }) });
   } catch (problem) {
     if (!(problem instanceof TypeError)) throw problem;
   }
 }
 
-async function load(route) {
-  for (const name of LATER[route.screen] ?? []) bring(name);
+async function loadRoute(route) {
+  for (const name of MODULES_OF_SCREEN[route.screen] ?? []) loadModule(name);
   if (route.screen === "home") refreshList({ day: today(), open: "true", limit: "20" });
   if (route.screen === "find") refreshList({ day: today(), limit: "100" });
   if (route.screen === "send") refreshOutbox();
@@ -79,180 +81,181 @@ async function load(route) {
   if (get().visit?.id !== route.visit) set({ visit: null });
   const visit = await refreshVisit(route.visit);
   if (get().route.visit !== route.visit) return;
-  if (!visit && !get().visit && get().link !== "lost") return leave();
+  if (!visit && !get().visit && get().link !== "lost") return leaveVisit();
   if (visit?.finished_at && ["aim", "person"].includes(route.screen)) {
-    return go({ screen: "outcome", visit: route.visit }, { replace: true }); // it is closed: to be looked at only
+    return navigate({ screen: "outcome", visit: route.visit }, { replace: true }); // a finished visit is read-only
   }
   if (route.screen === "compare") {
-    const both = await Promise.all([route.capture, route.other].map((id) => politely(() => getCapture(id))));
-    set({ compared: Object.freeze(both.filter(Boolean)) });
+    const captures = await Promise.all([route.capture, route.other].map((id) => alertOnError(() => getCapture(id))));
+    set({ compared: Object.freeze(captures.filter(Boolean)) });
   }
   if (route.screen !== "picture" || !visit) return;
-  if (!get().status) await refreshStatus(); // after a reload: is a picture being made?
+  if (!get().status) await refreshStatus(); // after a reload, `activity` shows whether a capture is in progress
   await openPicture(route);
 }
 
-// Home, with the words why.
-function leave() {
-  const said = get().states.filter(({ from }) => from === "press");
-  go({ screen: "home" }, { replace: true });
-  said.forEach(raise);
+// Go to Home and keep the error alert visible there.
+function leaveVisit() {
+  const messages = get().alerts.filter(({ from }) => from === "press");
+  navigate({ screen: "home" }, { replace: true });
+  messages.forEach(raiseAlert);
 }
 
-// Where the keyboard goes on; a finger does not notice.
+// Initial keyboard focus of each screen.
 const FOCUS = { aim: "#shutter", picture: "#shutter", home: "#new", outcome: "#done" };
-const focusOn = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
+const focusScreen = (screen) => $(FOCUS[screen] ?? "#back")?.focus({ preventScroll: true });
 
-// ---- what the instrument tells
+// ---- server events
 
-let beats = 0;
+let heartbeats = 0;
 
-const heard = {
-  ...heardOfShots,
+const eventHandlers = {
+  ...captureEventHandlers,
 
   link(link) {
     set({ link });
-    if (link === "lost") raise({ code: "link.lost", from: "page" });
-    else lower("link.lost");
+    if (link === "lost") raiseAlert({ code: "link.lost", from: "page" });
+    else lowerAlerts("link.lost");
     if (link === "live") refresh();
   },
 
   beat() {
-    beats += 1;
-    // A problem that is over must go at once.
-    if (beats % STATUS_BEATS === 0 || get().states.some(({ from }) => from === "status")) refreshStatus();
-    else if (get().route.screen === "send" && beats % HOLD_BEATS === 1) refreshOutbox();
-    else if (beats % HOLD_BEATS === 0 && get().mine) holdControls();
+    heartbeats += 1;
+    // While a status alert is shown, poll at every heartbeat, so that the alert ends soon after its cause.
+    if (heartbeats % STATUS_BEATS === 0 || get().alerts.some(({ from }) => from === "status")) refreshStatus();
+    else if (get().route.screen === "send" && heartbeats % LEASE_BEATS === 1) refreshOutbox();
+    else if (heartbeats % LEASE_BEATS === 0 && get().hasControl) renewControl();
   },
 
-  state: ({ state }) => set({ doing: state }),
-  aim: (aim) => heardAim(aim),
+  state: ({ state }) => set({ activity: state }),
+  aim: (aim) => showAim(aim),
 
-  /** What only tells begins, changes (`n`), or is over. */
+  /** An advisory alert begins, changes (`n`) or ends. */
   notice({ code, over: gone, ...more }) {
-    noticed += 1;
-    if (code === "link.other") holdControls(); // whose turn it is, the instrument says to each page by itself
-    else if (gone) over(code);
-    else raise({ code, ...more, from: "notice" });
+    noticeCount += 1;
+    if (code === "link.other") renewControl(); // the lease answer shows whether this page holds control
+    else if (gone) endNotice(code);
+    else raiseAlert({ code, ...more, from: "notice" });
   },
 
-  failed(what) {
-    heardOfShots.failed(what);
+  failed(failure) {
+    captureEventHandlers.failed(failure);
     refreshStatus();
   },
 };
 
-let sweptTold = false;
+let interruptedShown = false;
 
-let noticed = 0;
+let noticeCount = 0;
 
 async function refreshStatus() {
-  const before = noticed;
+  const before = noticeCount;
   let status;
   try {
     status = await getStatus();
   } catch (problem) {
-    if (!(problem instanceof Refusal)) throw problem;
-    return; // the lost link already tells
+    if (!(problem instanceof ApiError)) throw problem;
+    return; // the event stream already shows the lost connection
   }
   const { problem } = status;
-  set({ status: Object.freeze(status), doing: status.state });
-  lower(({ from, told }) => from === "status" && told !== problem?.code);
-  // A live picture whose light was cut tells it by its age; the next one is on its way.
-  if (problem && problem.code !== "light.cut") raise({ ...problem, told: problem.code, from: "status" });
-  if (noticed === before) stands(status.standing ?? []); // else it is older than what was just told
-  settleShots();
-  tellFindings(status.notices ?? []);
-  if (status.swept?.length && !sweptTold) tellSwept(status.swept);
-  await holdControls();
+  set({ status: Object.freeze(status), activity: status.state });
+  lowerAlerts(({ from, problemCode }) => from === "status" && problemCode !== problem?.code);
+  // The age on the live picture already shows a cut light; the next frame follows.
+  if (problem && problem.code !== "light.cut") raiseAlert({ ...problem, problemCode: problem.code, from: "status" });
+  if (noticeCount === before) syncNotices(status.standing ?? []); // otherwise `status.standing` is older than the latest notice event
+  resolveCutShots();
+  raiseFindings(status.notices ?? []);
+  if (status.swept?.length && !interruptedShown) raiseInterrupted(status.swept);
+  await renewControl();
 }
 
-const told = new Set(); // a finding that somebody has put off is not told again to this page
+const shownFindings = new Set(); // dismissed findings are not shown again on this page
 
-// What the instrument found about itself that does not stop it, in its own words.
-function tellFindings(notices) {
-  lower(({ from, message }) => from === "finding" && !notices.includes(message));
-  for (const message of notices.filter((words) => !told.has(words))) {
-    told.add(message);
-    raise({ code: `finding.${told.size}`, level: "tell", rank: 99, message, buttons: ["later"], from: "finding" });
+// Show findings of the instrument's self-checks that do not block captures, with the server's text.
+function raiseFindings(notices) {
+  lowerAlerts(({ from, message }) => from === "finding" && !notices.includes(message));
+  for (const message of notices.filter((text) => !shownFindings.has(text))) {
+    shownFindings.add(message);
+    raiseAlert({ code: `finding.${shownFindings.size}`, level: "tell", rank: 99, message, buttons: ["later"], from: "finding" });
   }
 }
 
-function tellSwept(swept) {
-  sweptTold = true;
+function raiseInterrupted(swept) {
+  interruptedShown = true;
   const [first] = swept;
   const known = swept.length === 1 && first.slot ? first : { buttons: ["ok"] };
-  raise({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
+  raiseAlert({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
 }
 
-async function holdControls() {
+async function renewControl() {
   try {
-    controls(await askForControls(false));
+    setControl(await requestControl(false));
   } catch (problem) {
-    if (!(problem instanceof Refusal)) throw problem;
+    if (!(problem instanceof ApiError)) throw problem;
   }
 }
 
-function controls({ mine }) {
-  set({ mine });
-  if (mine) lower("link.other");
-  else raise({ code: "link.other", from: "page" });
+function setControl({ mine }) {
+  set({ hasControl: mine });
+  if (mine) lowerAlerts("link.other");
+  else raiseAlert({ code: "link.other", from: "page" });
 }
 
-Object.assign(answers, { refreshStatus, controls });
+Object.assign(pageHooks, { refreshStatus, setControl });
 
 async function refresh() {
   await refreshStatus();
-  if (!get().protocol) set({ protocol: (await politely(getProtocol)) ?? null });
-  await saveRest();
-  await load(get().route);
+  if (!get().protocol) set({ protocol: (await alertOnError(getProtocol)) ?? null });
+  await flushUnsaved();
+  await loadRoute(get().route);
 }
 
-// ---- aiming: one prompt from the device, at most every 0.7 s
+// ---- aiming: at most one new prompt every 0.7 s
 
-let promptedAt = 0;
-let readySince = 0;
+let promptedMs = 0;
+let readySinceMs = 0;
 
-function heardAim(aim) {
+function showAim(aim) {
   if (!aim || get().route.screen !== "aim") return;
   const now = performance.now();
   const was = get().prompt;
-  if (aim.code !== "ready") readySince = 0;
-  else readySince ||= now;
-  if (aim.code !== was?.code && now - promptedAt >= READ_MS) {
-    promptedAt = now;
+  if (aim.code !== "ready") readySinceMs = 0;
+  else readySinceMs ||= now;
+  if (aim.code !== was?.code && now - promptedMs >= PROMPT_MIN_MS) {
+    promptedMs = now;
     set({ prompt: Object.freeze(aim) });
-    if (aim.code === "ready") cue("ready");
+    if (aim.code === "ready") playCue("ready");
   }
-  if (get().auto && get().prompt?.code === "ready" && readySince && now - readySince > AUTO_MS) take();
+  if (get().auto && get().prompt?.code === "ready" && readySinceMs && now - readySinceMs > AUTO_CAPTURE_MS) takePicture();
 }
 
-// A page that closes lets the next screen take pictures; one that only loads itself anew is back before anybody asks.
-addEventListener("pagehide", letControlsGo);
+// Release the control lease when the page closes, so that another screen can take pictures. After a reload, this page
+// requests control again.
+addEventListener("pagehide", releaseControl);
 
-act.heardAim = ({ detail }) => heardAim(detail);
-// Another screen changed the visit since it was loaded: loaded anew it tells why there is no light.
-act.heardRefused = ({ detail: { code } }) => code.startsWith("consent.") && refreshVisit(get().route.visit);
-act.heardLate = ({ detail: seconds }) => {
-  if (seconds && get().prompt) set({ prompt: null }); // nobody is ready by an old picture
+actions.previewAim = ({ detail }) => showAim(detail);
+// Consent changed on another screen: reload the visit to show the reason.
+actions.previewRefused = ({ detail: { code } }) => code.startsWith("consent.") && refreshVisit(get().route.visit);
+actions.previewLate = ({ detail: seconds }) => {
+  if (seconds && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
   if (seconds >= LATE_S && get().link === "live") {
-    raise({ code: "link.slow", n: seconds, from: "page" });
-  } else lower("link.slow");
+    raiseAlert({ code: "link.slow", n: seconds, from: "page" });
+  } else lowerAlerts("link.slow");
 };
 
-// ---- draw
+// ---- render
 
-function draw(state) {
+function renderPage(state) {
   document.documentElement.dataset.theme = state.theme;
-  render(page(state, act), $("#app"));
-  // The shutter had the focus and is gone: a keyboard goes on at the verdict, and a screen reader reads it.
+  render(page(state, actions), $("#app"));
+  // When the focused shutter is removed, move the focus to the verdict, which a screen reader then reads.
   if (document.activeElement === document.body) $("#result-title")?.focus({ preventScroll: true });
 }
 
-await learn(get().language);
-store.subscribe(draw);
-store.subscribe(finishWhenMade);
-listenToKeys(act);
-follow(arrive);
-draw(get());
-new EventLine(heard);
+await loadLanguage(get().language);
+store.subscribe(renderPage);
+store.subscribe(finishWhenComplete);
+bindKeys(actions);
+startRouter(showRoute);
+renderPage(get());
+new EventStream(eventHandlers);

@@ -1,11 +1,11 @@
-"""Darken the ring of LEDs, whatever anybody else does: a program of the standard library alone.
+"""Stand-alone program that turns the ring of LEDs off, with the standard library only.
 
     python3 -I -S blank.py --device /dev/spidev0.0            now; for systemd's ExecStopPost= and for every boot
-    python3 -I -S blank.py --device /dev/spidev0.0 --guard    when its parent ends, or a lease runs out
+    python3 -I -S blank.py --device /dev/spidev0.0 --guard    when its parent ends, or a lease expires
 
-The chain keeps its last colour while it has power, so a process that is killed leaves an eye lit. A guard reads leases:
-`lit 1.5` (it darkens in 1.5 s unless it hears before), `dark` (nothing to do); it answers each with `ok`. Exit status
-1: there is no such device, or it does not listen.
+The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
+standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease); it answers each with `ok`.
+Exit status 1: the device does not exist, or does not accept the frame.
 """
 
 import argparse
@@ -24,12 +24,12 @@ TRIES, AGAIN_S = 200, 0.05
 
 
 def dark_frame(leds: int) -> bytes:
-    """A start of zeros, every LED at full global brightness and no colour, a tail of half a clock for each LED."""
+    """Return the off frame: 4 zero bytes, per LED zero colour at full global brightness, trailing zeros as clocks."""
     return bytes(4) + b"\xff\0\0\0" * leds + bytes(max(8, -(-leds // 16)))
 
 
 def blank(device: str, leds: int) -> None:
-    """Send darkness twice, at a speed of our own: the kernel forgets the last user's. Raises OSError."""
+    """Send the off frame twice; set SPI mode and speed, as the kernel does not keep them. Raises OSError."""
     wire = os.open(device, os.O_RDWR | os.O_CLOEXEC)
     try:
         fcntl.ioctl(wire, WR_MODE, struct.pack("=B", 0))
@@ -42,8 +42,8 @@ def blank(device: str, leds: int) -> None:
         os.close(wire)
 
 
-def insist(device: str, leds: int) -> None:
-    """Darken, again and again while the bus does not listen. Raises OSError when it never does."""
+def blank_with_retries(device: str, leds: int) -> None:
+    """Send the off frame; if the bus fails, retry 200 times at intervals of 50 ms, then raise OSError."""
     for _ in range(TRIES):
         with suppress(OSError):
             blank(device, leds)
@@ -53,45 +53,45 @@ def insist(device: str, leds: int) -> None:
 
 
 def guard(device: str, leds: int) -> None:
-    """Darken when a lease runs out, when standard input ends, or when the parent does though its pipe lives on.
+    """Turn the LEDs off when a lease expires; also when standard input or the parent process ends, and then return.
 
-    After a lease has run out it darkens again and again until the parent speaks, which may have been stopped between
-    its promise and its light.
+    The parent is watched too, because a forked process may hold its pipe open. After a lease has expired, the off frame
+    is repeated every 50 ms until the next message: the parent may have been stopped between its lease and its light.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it ends with its parent, not before
-    ears = select.poll()
-    ears.register(0, select.POLLIN)
-    ears.register(os.pidfd_open(os.getppid()), select.POLLIN)
-    lease_ms: float | None = None  # poll() counts it from the message that began it
-    with suppress(BrokenPipeError):  # gone before it heard the answer
+        signal.signal(number, signal.SIG_IGN)  # the guard must not end before its parent
+    poller = select.poll()
+    poller.register(0, select.POLLIN)
+    poller.register(os.pidfd_open(os.getppid()), select.POLLIN)
+    lease_ms: float | None = None  # poll() counts it from the last message
+    with suppress(BrokenPipeError):  # the parent ended before it read the answer
         while True:
-            heard = {ear for ear, _ in ears.poll(lease_ms)}
+            heard = {ear for ear, _ in poller.poll(lease_ms)}
             if not heard:
                 with suppress(OSError):
                     blank(device, leds)
                 lease_ms = 1000 * AGAIN_S
                 continue
-            said = os.read(0, 4096).decode("ascii") if heard == {0} else ""
-            if not said:
+            message = os.read(0, 4096).decode("ascii") if heard == {0} else ""
+            if not message:
                 break
-            last = said.split("\n")[-2]
+            last = message.split("\n")[-2]
             lease_ms = 1000 * float(last.split()[1]) if last.startswith("lit") else None
             os.write(1, b"ok\n")
-    (blank if lease_ms is None else insist)(device, leds)
+    (blank if lease_ms is None else blank_with_retries)(device, leds)
 
 
 def main() -> int:
-    """Do what the words say."""
+    """Parse the arguments and run `blank`, or `guard` with --guard; return the exit status, 1 after an OSError."""
     parser = argparse.ArgumentParser(description="Darken the ring of LEDs.")
     parser.add_argument("--device", required=True, help="the SPI device, such as /dev/spidev0.0")
     parser.add_argument("--leds", type=int, default=LEDS, help="how many LEDs the chain has")
     parser.add_argument("--guard", action="store_true", help="darken when the parent ends or a lease runs out")
-    said = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        (guard if said.guard else blank)(said.device, said.leds)
+        (guard if arguments.guard else blank)(arguments.device, arguments.leds)
     except OSError as error:
-        sys.stderr.write(f"{said.device} cannot be darkened: {error}\n")
+        sys.stderr.write(f"{arguments.device} cannot be darkened: {error}\n")
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""The shutter's button: a line to ground."""
+"""Shutter button: a GPIO line to ground."""
 
 from typing import Protocol
 
@@ -6,24 +6,24 @@ from device.clock import Clock
 
 
 class Line(Protocol):
-    """What the button pulls (device/drivers/gpio.py)."""
+    """GPIO input of the button (device/drivers/gpio.py)."""
 
     def get(self) -> bool:
-        """Whether it is pulled to ground."""
+        """Return whether the line is pulled to ground."""
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the line."""
 
 
 class GpioButton:
-    """A Button on a line that is looked at, not waited for: who never looks never hears."""
+    """Button on a polled line: there are no edge events, so a press that lies between two polls is missed."""
 
     def __init__(self, line: Line, clock: Clock) -> None:
         self._line, self._clock = line, clock
         self._since_s: float | None = None
 
     def pressed_since_s(self) -> float | None:
-        """The moment at which the press was first seen; None while it is not pressed. BusFault if unreadable."""
+        """Return the clock time, s, at which the current press was first polled; None if not pressed. BusFault."""
         if not self._line.get():
             self._since_s = None
         elif self._since_s is None:
@@ -31,5 +31,5 @@ class GpioButton:
         return self._since_s
 
     def close(self) -> None:
-        """Let the line go."""
+        """Release the line."""
         self._line.close()

@@ -1,4 +1,4 @@
-"""Single lines of the Raspberry Pi's header, through gpiod; whoever needs one takes it as an argument."""
+"""Single GPIO lines of the Raspberry Pi's header, through gpiod."""
 
 from typing import Any
 
@@ -8,45 +8,45 @@ _REMEDY = "Check gpio.chip and the line's number in the head file, and that no o
 
 
 class OutputLine:
-    """A line that we drive, low from the start; BusFault if it cannot be had."""
+    """Output line, low from the start; BusFault if it is not available."""
 
     def __init__(self, chip: str, line: int) -> None:
         self._line = line
-        self._request, self._high, self._low = _requested(chip, line, output=True)
+        self._request, self._high, self._low = _request_line(chip, line, output=True)
 
     def set(self, high: bool) -> None:
-        """Drive it."""
+        """Drive the line high or low; BusFault if that fails."""
         try:
             self._request.set_value(self._line, self._high if high else self._low)
         except OSError as error:
             raise BusFault(f"GPIO {self._line} cannot be driven: {error}", _REMEDY) from error
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the line."""
         self._request.release()
 
 
 class InputLine:
-    """A line that a button pulls to ground, with the Pi's own pull-up; BusFault if it cannot be had."""
+    """Input line for a button to ground, with the Pi's internal pull-up; BusFault if it is not available."""
 
     def __init__(self, chip: str, line: int) -> None:
         self._line = line
-        self._request, self._high, _ = _requested(chip, line, output=False)
+        self._request, self._high, _ = _request_line(chip, line, output=False)
 
     def get(self) -> bool:
-        """Whether it is pulled to ground."""
+        """Return whether the line is pulled to ground; BusFault if unreadable."""
         try:
             return bool(self._request.get_value(self._line) == self._high)
         except OSError as error:
             raise BusFault(f"GPIO {self._line} cannot be read: {error}", _REMEDY) from error
 
     def close(self) -> None:
-        """Let it go."""
+        """Release the line."""
         self._request.release()
 
 
-def _requested(chip: str, line: int, *, output: bool) -> tuple[Any, Any, Any]:
-    """The line as gpiod gives it, and its words for high (active) and low."""
+def _request_line(chip: str, line: int, *, output: bool) -> tuple[Any, Any, Any]:
+    """Return gpiod's request of one line, and gpiod's values for active and inactive; BusFault if unavailable."""
     try:
         import gpiod
         from gpiod.line import Bias, Direction, Value

@@ -1,4 +1,4 @@
-"""The other process that darkens the ring: it hears before every light, and acts when this process is gone or hangs."""
+"""Guardian: a child process that turns the ring off when a lease of light expires or this process ends."""
 
 import select
 import subprocess
@@ -8,15 +8,16 @@ from types import TracebackType
 
 from device.errors import LightFault
 
-ANSWER_S = 0.5  # a guardian that does not answer in that time will not be in time either
+ANSWER_S = 0.5  # a guardian that answers later would also darken the ring too late
 DARKEN_S = 2.0
 BLANK = Path(__file__).with_name("blank.py")
 
 
 class Guardian:
-    """A child that runs `blank.py --guard`: it knows nothing but the bus, and needs nothing but the standard library.
+    """Handle of the child process `blank.py --guard`, which receives leases and acknowledges each.
 
-    Raises LightFault where it does not come up, or does not answer; then nothing may shine.
+    `device` is the SPI device, `leds` the length of the chain. Every message raises LightFault if the child has ended
+    or does not answer within 0.5 s; then no light may be turned on.
     """
 
     def __init__(self, device: str, leds: int) -> None:
@@ -24,25 +25,26 @@ class Guardian:
         self._child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
-        self.dark()
+        self.end_lease()
 
     @property
     def pid(self) -> int:
-        """Of the child."""
+        """Return the process id of the child."""
         return self._child.pid
 
-    def lit(self, lease_s: float) -> None:
-        """There will be light, for at most `lease_s` from now. It has answered when this returns."""
-        self._tell(f"lit {lease_s:.3f}\n")
+    def grant_lease(self, lease_s: float) -> None:
+        """Grant a lease of `lease_s` seconds of light from now; acknowledged on return, else LightFault."""
+        self._send(f"lit {lease_s:.3f}\n")
 
-    def dark(self) -> None:
-        """It is dark."""
-        self._tell("dark\n")
+    def end_lease(self) -> None:
+        """Cancel the lease, after the caller has turned the ring off; LightFault without an acknowledgement."""
+        self._send("dark\n")
 
     def close(self) -> None:
-        """Let it go: it darkens once more and ends; closing twice is harmless.
+        """End the child, which turns the ring off once more; closing twice is harmless.
 
-        LightFault if the bus does not let it: then it goes on trying, without us.
+        Raises LightFault if the child has not ended within 2 s, because the bus fails; it then continues to retry on
+        its own.
         """
         assert self._child.stdin is not None
         assert self._child.stdout is not None
@@ -61,7 +63,7 @@ class Guardian:
     ) -> None:
         self.close()
 
-    def _tell(self, words: str) -> None:
+    def _send(self, words: str) -> None:
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         try:

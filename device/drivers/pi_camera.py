@@ -1,6 +1,6 @@
-"""The camera of a Raspberry Pi, over picamera2: plain raw counts, exposed after the call, or a named error.
+"""Camera of a Raspberry Pi through picamera2: unpacked raw counts of frames whose exposure began after the call.
 
-One configuration lives as long as the camera; only exposure times change. Nothing waits without an end.
+One configuration stays as long as the camera is open; only exposure times change. Every wait has a timeout.
 """
 
 import logging
@@ -12,39 +12,42 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from device.drivers.exposing import STUCK, Exposing, Shining
+from device.config.head_file import CameraSpec
+from device.drivers.exposure_retry import CABLE_REMEDY, LampState, RetryingCamera
 from device.drivers.raw_counts import RawLayout, black_dn, pi_layout
-from device.errors import CameraMissing, CameraStalled, CameraWrong, HardwareError
-from device.spec import CameraSpec
-from device.values import Counts, Shot
+from device.errors import CameraMismatch, CameraMissing, CameraStalled, HardwareError
+from device.values import Counts, ExposureSettings
 
 log = logging.getLogger(__name__)
 
 BUFFERS = 3
-SETTLING = 16  # frames that may pass until a new exposure time arrives: those queued, and four of delay, twice over
-PATIENCE_S = 2.0
-OPENING_S = 10.0
-SPARE_US = 1500  # between two exposures, for the read-out's blanking; the sensor lengthens it to what it needs
-MAIN = (320, 240)  # the processed picture that picamera2 insists on; nobody looks at it
+MAX_SETTLING_FRAMES = 16  # frames until a new exposure time is in effect: queued ones plus four of delay, times two
+FRAME_TIMEOUT_S = 2.0
+OPEN_TIMEOUT_S = 10.0
+SPARE_US = 1500  # between two exposures, for the blanking of the read-out; the sensor lengthens it as needed
+MAIN = (320, 240)  # the processed stream that picamera2 requires; not used
 MOSAICS = {0: "SRGGB", 1: "SGRBG", 2: "SGBRG", 3: "SBGGR", 5: "R"}  # libcamera's ColorFilterArrangement
-WANTED = {"AeEnable": False, "AwbEnable": False, "AnalogueGain": 1.0, "NoiseReductionMode": 0, "Sharpness": 0.0}
-NO_CAMERA = "Check the camera's ribbon cable and the line dtoverlay of config.txt, then turn the device off and on."
+FIXED_CONTROLS = {"AeEnable": False, "AwbEnable": False, "AnalogueGain": 1.0, "NoiseReductionMode": 0, "Sharpness": 0.0}
+NO_CAMERA_REMEDY = (
+    "Check the camera's ribbon cable and the line dtoverlay of config.txt, then turn the device off and on."
+)
 
 
-class PiCamera(Exposing):
-    """A sensor of libcamera: one long-lived raw configuration, opened anew once if it falls silent.
+class PiCamera(RetryingCamera):
+    """libcamera driver that implements `ports.Camera`: one raw configuration, reopened once after a timeout.
 
-    `simulated` marks its frames, where the driver runs over an emulated sensor; `patience_s` is how long past its
-    exposure a frame is waited for. Raises CameraMissing, CameraWrong, CameraPacked or CameraStalled.
+    `light` is the source of each frame's illumination; `simulated` marks its frames if the driver runs over an emulated
+    sensor; `patience_s` is the timeout for a frame after its exposure; `allocator` is passed on to picamera2. Raises
+    CameraMissing, CameraMismatch, CameraPacked or CameraStalled.
     """
 
     def __init__(
         self,
         spec: CameraSpec,
-        light: Shining,
+        light: LampState,
         *,
         simulated: bool = False,
-        patience_s: float = PATIENCE_S,
+        patience_s: float = FRAME_TIMEOUT_S,
         allocator: Any = None,
     ) -> None:
         try:
@@ -59,26 +62,26 @@ class PiCamera(Exposing):
         self._patience_s, self._allocator = patience_s, allocator
         self._device: Any = None
         self._layout: RawLayout
-        self.open(Shot(spec.exposure_s))
+        self.open(ExposureSettings(spec.exposure_s))
 
     @property
     def facts(self) -> dict[str, str]:
-        """What answered, for a technician: the sensor, and the raw format that libcamera granted."""
+        """Return the sensor's name and the granted raw format by the keys `sensor` and `format`, for a technician."""
         return {"sensor": str(self._spec.sensor), "format": self._layout.name}
 
     # Opening
 
-    def _open(self, shot: Shot) -> None:
-        """Open the sensor that the head names, in its mode."""
+    def _open(self, shot: ExposureSettings) -> None:
+        """Open and start the sensor that the head file names, in its mode; TimeoutError after 10 s, CameraMissing."""
         try:
-            within(OPENING_S, lambda: self._start(shot.exposure_s))
+            run_with_timeout(OPEN_TIMEOUT_S, lambda: self._start(shot.exposure_s))
         except (HardwareError, TimeoutError):
             raise
-        except (RuntimeError, ValueError, OSError) as error:  # what picamera2 and libcamera raise
-            raise CameraMissing(f"the {self._name} cannot be opened: {error}", NO_CAMERA) from error
+        except (RuntimeError, ValueError, OSError) as error:  # the errors of picamera2 and libcamera
+            raise CameraMissing(f"the {self._name} cannot be opened: {error}", NO_CAMERA_REMEDY) from error
 
     def _start(self, exposure_s: float) -> None:
-        device = self._device = self._library(self._which(), allocator=self._allocator)
+        device = self._device = self._library(self._camera_index(), allocator=self._allocator)
         spec, size = self._spec, (self._spec.cols, self._spec.rows)
         mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
         asked = device.create_video_configuration(
@@ -89,54 +92,59 @@ class PiCamera(Exposing):
             buffer_count=BUFFERS, queue=False, display=None, encode=None,
         )  # fmt: skip
         device.configure(asked)
-        self._layout = self._granted(device.camera_configuration())
+        self._layout = self._granted_layout(device.camera_configuration())
         device.start()
         log.info("%s: raw %s", spec.sensor, device.camera_configuration()["raw"])
 
-    def _which(self) -> int:
-        """The number of the first camera of the sensor that the head names."""
+    def _camera_index(self) -> int:
+        """Return the index of the first camera with the sensor of the head file; CameraMissing or CameraMismatch."""
         found = [str(one["Model"]) for one in self._library.global_camera_info()]
         if not found:
-            raise CameraMissing(f"libcamera finds no camera; this head needs the {self._spec.sensor}", NO_CAMERA)
+            raise CameraMissing(f"libcamera finds no camera; this head needs the {self._spec.sensor}", NO_CAMERA_REMEDY)
         for number, model in enumerate(found):
             if model.lower().split("_")[0] == self._spec.sensor:
                 return number
-        raise CameraWrong(f"the camera is the {', '.join(found)}; this head needs the {self._spec.sensor}")
+        raise CameraMismatch(f"the camera is the {', '.join(found)}; this head needs the {self._spec.sensor}")
 
     def _controls(self, device: Any, exposure_s: float) -> dict[str, Any]:
-        """What to ask of the sensor, as far as it knows of it; CameraWrong if exposures cannot be chosen at all."""
+        """Return the controls of an exposure that the sensor has; CameraMismatch if exposure or gain cannot be set."""
         known = device.camera_controls
         if missing := {"ExposureTime", "AnalogueGain", "FrameDurationLimits"} - known.keys():
-            raise CameraWrong(f"the {self._spec.sensor} does not let {', '.join(sorted(missing))} be chosen")
-        return {name: value for name, value in (WANTED | timing(exposure_s)).items() if name in known}
+            raise CameraMismatch(f"the {self._spec.sensor} does not let {', '.join(sorted(missing))} be chosen")
+        return {
+            name: value for name, value in (FIXED_CONTROLS | exposure_controls(exposure_s)).items() if name in known
+        }
 
-    def _granted(self, configuration: dict[str, Any]) -> RawLayout:
-        """Read back what libcamera made of the request: it may adjust every word of it."""
+    def _granted_layout(self, configuration: dict[str, Any]) -> RawLayout:
+        """Return the granted layout, read back as libcamera may adjust a request; CameraMismatch, CameraPacked."""
         raw, sensor, spec = configuration["raw"], configuration.get("sensor") or {}, self._spec
         layout = pi_layout(raw["format"], spec.rows, spec.cols, spec.bit_depth)
         if tuple(raw["size"]) != (spec.cols, spec.rows):
-            raise CameraWrong(
+            raise CameraMismatch(
                 f"the {spec.sensor} has no mode of {spec.rows} x {spec.cols}: it grants {raw['size'][::-1]}"
             )
         if sensor.get("bit_depth", spec.bit_depth) != spec.bit_depth:
-            raise CameraWrong(f"the {spec.sensor} grants {sensor['bit_depth']} bits; this head needs {spec.bit_depth}")
+            raise CameraMismatch(
+                f"the {spec.sensor} grants {sensor['bit_depth']} bits; this head needs {spec.bit_depth}"
+            )
         return layout
 
     # Frames
 
-    def _take(self, shot: Shot, counts: Counts | None) -> None:
-        """The next frame whose metadata say what was asked, into `counts`; None looks at it only: the first one.
+    def _take(self, shot: ExposureSettings, counts: Counts | None) -> None:
+        """Write the next frame whose metadata match the request into `counts`; None: only check its raw bytes.
 
-        Raises TimeoutError when no frame comes, CameraStalled when frames come, and never the right one.
+        Raises TimeoutError when no frame arrives, CameraStalled when none of 16 frames matches, CameraMismatch by the
+        check.
         """
-        self._device.set_controls(timing(shot.exposure_s))
-        flush: bool | None = True  # a frame that began before this call shows another light
+        self._device.set_controls(exposure_controls(shot.exposure_s))
+        flush: bool | None = True  # a frame that began before this call may show another illumination
         wait_s = shot.exposure_s + self._patience_s
-        for _ in range(SETTLING):
+        for _ in range(MAX_SETTLING_FRAMES):
             request = self._device.capture_request(wait=wait_s, flush=flush)
             try:
-                said = request.get_metadata()
-                right = self._is_as_asked(said, shot)
+                metadata = request.get_metadata()
+                right = self._matches_request(metadata, shot)
                 if right:
                     with self._mapped(request, "raw", write=False) as raw:
                         first = self._read(raw.array, counts)
@@ -144,65 +152,65 @@ class PiCamera(Exposing):
                 request.release()
             if right:
                 if first is not None:
-                    self._check(first, said)
+                    self._check_first_frame(first, metadata)
                 return
-            flush = None  # those that follow are later still
+            flush = None  # the following frames began later
         raise CameraStalled(
-            f"{SETTLING} frames passed, and none was exposed for {shot.exposure_s * 1e6:.0f} us at gain 1 "
-            f"(the last: {said.get('ExposureTime')} us, gain {said.get('AnalogueGain')})"
+            f"{MAX_SETTLING_FRAMES} frames passed, and none was exposed for {shot.exposure_s * 1e6:.0f} us at gain 1 "
+            f"(the last: {metadata.get('ExposureTime')} us, gain {metadata.get('AnalogueGain')})"
         )
 
-    def _is_as_asked(self, said: dict[str, Any], shot: Shot) -> bool:
-        """Whether a frame's own metadata fit: exposures are whole rows, rounded down."""
-        off_us = abs(float(said["ExposureTime"]) - shot.exposure_s * 1e6)
-        return off_us <= 1.5 * self._spec.row_us and abs(float(said.get("AnalogueGain", 1.0)) - 1) < 0.1
+    def _matches_request(self, metadata: dict[str, Any], shot: ExposureSettings) -> bool:
+        """Return whether a frame has this exposure (within 1.5 rows: the sensor rounds down to rows) and gain 1."""
+        off_us = abs(float(metadata["ExposureTime"]) - shot.exposure_s * 1e6)
+        return off_us <= 1.5 * self._spec.row_us and abs(float(metadata.get("AnalogueGain", 1.0)) - 1) < 0.1
 
     def _read(self, raw: NDArray[np.uint8], counts: Counts | None) -> NDArray[np.uint8] | None:
-        """Take the counts out of a buffer that is lent; or, with nowhere to put them, a copy of it."""
+        """Copy the counts of a borrowed buffer into `counts`, return None; if None, return a copy of the raw bytes."""
         if counts is None:
             return raw.copy()
         self._layout.counts(raw, counts)
         return None
 
-    def _check(self, raw: NDArray[np.uint8], said: dict[str, Any]) -> None:
-        """Refuse a first frame that is not as the head's file and the granted format say."""
+    def _check_first_frame(self, raw: NDArray[np.uint8], metadata: dict[str, Any]) -> None:
+        """Raise CameraMismatch if a first frame contradicts the granted layout or the head file's black level."""
         self._layout.check(raw)
-        levels = said.get("SensorBlackLevels")
+        levels = metadata.get("SensorBlackLevels")
         if not levels:
             return
         nominal_dn, ours_dn = black_dn(levels[0], self._spec.bit_depth), self._spec.black_dn
         if abs(nominal_dn - ours_dn) > max(nominal_dn, ours_dn) / 2:
-            raise CameraWrong(
+            raise CameraMismatch(
                 f"the {self._spec.sensor} says its black level is {nominal_dn:g} DN at {self._spec.bit_depth} bits; "
                 f"the head's file says {ours_dn:g}",
                 "Correct bit_depth or black_dn in the head's file.",
             )
 
-    def _let_go(self) -> None:
-        """Stop and close, as far as that can be done in time: a driver may hang, and so may libcamera."""
+    def _close_device(self) -> None:
+        """Stop and close the device; CameraStalled after 10 s, because the driver or libcamera may hang."""
         device, self._device = self._device, None
         if device is None:
             return
         device.cancel_all_and_flush()
         try:
-            within(OPENING_S, device.close)
+            run_with_timeout(OPEN_TIMEOUT_S, device.close)
         except TimeoutError as error:
-            raise CameraStalled(f"the {self._spec.sensor} cannot be closed: its driver hangs", STUCK) from error
+            raise CameraStalled(f"the {self._spec.sensor} cannot be closed: its driver hangs", CABLE_REMEDY) from error
 
 
-def timing(exposure_s: float) -> dict[str, Any]:
-    """The controls of an exposure time: the frames follow each other as fast as it lets them."""
+def exposure_controls(exposure_s: float) -> dict[str, Any]:
+    """Return the libcamera controls of an exposure time; the frame duration is 1.5 ms longer than the exposure."""
     exposure_us = round(exposure_s * 1e6)
     return {"ExposureTime": exposure_us, "FrameDurationLimits": (exposure_us + SPARE_US, exposure_us + SPARE_US)}
 
 
-def within(limit_s: float, act: Callable[[], None]) -> None:
-    """Do something that may hang, in a thread of its own; TimeoutError after `limit_s`, the thread is left behind."""
+def run_with_timeout(limit_s: float, call: Callable[[], None]) -> None:
+    """Run a call that may hang in a thread and raise its error; TimeoutError after `limit_s`: the thread runs on."""
     done: Future[None] = Future()
 
     def run() -> None:
         try:
-            act()
+            call()
             done.set_result(None)
         except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
             done.set_exception(error)

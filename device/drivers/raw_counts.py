@@ -1,7 +1,7 @@
-"""From the bytes of a raw frame to counts: the padding cut off, the justification undone, nothing else touched.
+"""Conversion of raw frame bytes to counts: row padding and justification are removed, and nothing else.
 
-A camera hands over rows of `stride` bytes, of which the right margin is garbage. A Raspberry Pi 4 keeps a sensor's bits
-at the low end of each 16-bit word (`R10`, `R12`); a Pi 5 keeps them at the high end (`R16`). `seen_bits` tells which.
+A camera delivers rows of `stride` bytes with undefined padding on the right. A Raspberry Pi 4 stores a sensor's bits at
+the low end of each 16-bit word (`R10`, `R12`), a Pi 5 at the high end (`R16`); `RawLayout.check` verifies this.
 """
 
 import re
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from device.errors import CameraPacked, CameraWrong
+from device.errors import CameraMismatch, CameraPacked
 from device.values import Counts
 
 Bytes = NDArray[np.uint8]
@@ -21,7 +21,7 @@ V4L2_BITS = {"GREY": 8, "Y10 ": 10, "Y12 ": 12, "Y16 ": 16}
 
 @dataclass(frozen=True)
 class RawLayout:
-    """How the counts of one sensor lie in its rows: `word_bits` per pixel, `shift` below the lowest one that counts."""
+    """Layout of raw frame bytes: a word of `word_bits` per pixel, with `bit_depth` bits shifted left by `shift`."""
 
     name: str
     rows: int
@@ -32,21 +32,23 @@ class RawLayout:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of a row without its padding."""
+        """Return the number of bytes of a row without its padding."""
         return self.cols * self.word_bits // 8
 
     def words(self, raw: Bytes) -> NDArray[np.uint16] | Bytes:
-        """The words of the pixels (rows, cols) as they lie in `raw` (rows, stride); a view, never a copy.
+        """Return the pixel words (rows, cols) as a view of `raw` (rows, stride), never a copy.
 
-        Raises CameraWrong if the rows are shorter than the picture.
+        Raises CameraMismatch if the buffer is too small.
         """
         if raw.ndim != 2 or raw.shape[0] < self.rows or raw.shape[1] < self.row_bytes:
-            raise CameraWrong(f"a raw buffer of {raw.shape} bytes cannot hold {self.rows} x {self.cols} of {self.name}")
+            raise CameraMismatch(
+                f"a raw buffer of {raw.shape} bytes cannot hold {self.rows} x {self.cols} of {self.name}"
+            )
         pixels = raw[: self.rows, : self.row_bytes]
         return pixels if self.word_bits == 8 else pixels.view(np.uint16)
 
     def counts(self, raw: Bytes, out: Counts) -> Counts:
-        """The counts of a frame, in DN of the sensor, into `out` uint16 (rows, cols), which is returned."""
+        """Write the counts of a frame, DN of the sensor, to `out` uint16 (rows, cols); return it. CameraMismatch."""
         words = self.words(raw)
         if self.shift:
             np.right_shift(words, self.shift, out=out)
@@ -55,31 +57,33 @@ class RawLayout:
         return out
 
     def check(self, raw: Bytes) -> None:
-        """Refuse a frame whose bits are not where this layout says; noise sets every bit that a sensor has.
+        """Raise CameraMismatch if all counts are zero, or if a bit is set outside the layout's `bit_depth` bits.
 
-        Raises CameraWrong. For the first frame after the start: the driver's word for the justification is not enough.
+        Used on the first frame after a start, because the driver's format name does not prove the justification; noise
+        sets every bit that a sensor has.
         """
-        bits = seen_bits(self.words(raw))
+        bits = used_bits(self.words(raw))
         if bits == 0:
-            raise CameraWrong(f"every count of the {self.name} frame is zero: there is not even a black level")
+            raise CameraMismatch(f"every count of the {self.name} frame is zero: there is not even a black level")
         if bits & ((1 << self.shift) - 1):
-            raise CameraWrong(
+            raise CameraMismatch(
                 f"{self.name}: the lowest {self.shift} bits should be empty for a {self.bit_depth}-bit sensor, "
                 f"and are not ({bits:#06x})"
             )
         if bits >> self.shift >= 1 << self.bit_depth:
-            raise CameraWrong(f"{self.name}: counts beyond {self.bit_depth} bits ({bits:#06x})")
+            raise CameraMismatch(f"{self.name}: counts beyond {self.bit_depth} bits ({bits:#06x})")
 
 
-def seen_bits(words: NDArray[np.uint16] | Bytes) -> int:
-    """Every bit that any of the pixels has set."""
+def used_bits(words: NDArray[np.uint16] | Bytes) -> int:
+    """Return the bitwise OR of all pixel words."""
     return int(np.bitwise_or.reduce(words, axis=None))
 
 
 def pi_layout(name: str, rows: int, cols: int, bit_depth: int) -> RawLayout:
-    """The layout of a format that libcamera granted; CameraPacked for packed or compressed ones, by their name.
+    """Return the layout of a raw format granted by libcamera.
 
-    A 16-bit format of a sensor with fewer bits is at the high end (Raspberry Pi 5); the others are at the low end.
+    A 16-bit format of a sensor with fewer bits is left-justified (Raspberry Pi 5); the others are right-justified.
+    Errors: CameraPacked for a packed, compressed or unknown format; CameraMismatch for a wrong number of bits.
     """
     known = PLAIN.fullmatch(name)
     if known is None:
@@ -92,7 +96,7 @@ def pi_layout(name: str, rows: int, cols: int, bit_depth: int) -> RawLayout:
 
 
 def v4l2_layout(fourcc: str, rows: int, cols: int, bit_depth: int) -> RawLayout:
-    """The layout of a V4L2 pixel format (GREY, Y10, Y12, Y16: low end); CameraPacked for any other, by its name."""
+    """Return the layout of GREY, Y10, Y12 or Y16 (right-justified); else CameraPacked. CameraMismatch: other bits."""
     bits = V4L2_BITS.get(fourcc)
     if bits is None:
         raise CameraPacked(
@@ -103,12 +107,12 @@ def v4l2_layout(fourcc: str, rows: int, cols: int, bit_depth: int) -> RawLayout:
 
 
 def _fitting(layout: RawLayout, bits: int) -> RawLayout:
-    """A 16-bit word may hold any sensor; a smaller format must be as deep as the head says."""
+    """Return the layout; CameraMismatch unless the format's `bits` are 16 or exactly the bit depth of the head file."""
     if bits != layout.bit_depth and bits != 16:
-        raise CameraWrong(f"the camera grants {layout.name}, and the head's file says {layout.bit_depth} bits")
+        raise CameraMismatch(f"the camera grants {layout.name}, and the head's file says {layout.bit_depth} bits")
     return layout
 
 
 def black_dn(level: float, bit_depth: int) -> float:
-    """A black level on libcamera's 16-bit scale (`SensorBlackLevels`) in DN of the sensor: 3840 is 60 at 10 bits."""
+    """Return a black level of libcamera's 16-bit scale (`SensorBlackLevels`) in DN: 3840 is 60 at 10 bits."""
     return float(level / 2 ** (16 - bit_depth))

@@ -1,7 +1,7 @@
-"""The ring of APA102 LEDs on SPI: lit inside a context, dark before and after it, and dark if this process is gone.
+"""Ring of APA102 LEDs on SPI: on within a context, off before and after it, and off if this process ends.
 
-The LEDs keep their last colour while they have power. So every light is announced to a guardian, a process of its own,
-before it shines: it darkens when the lease runs out, or when this process is gone.
+The LEDs keep their last colour while they have power. So a guardian process receives a lease before each light, and
+turns the ring off when the lease expires or this process ends.
 """
 
 import logging
@@ -10,22 +10,22 @@ from threading import Lock
 from types import TracebackType
 from typing import Any, Protocol
 
+from device.config.head_file import ChainSpec
 from device.drivers.blank import SPEED_HZ, dark_frame
 from device.drivers.guardian import Guardian
 from device.errors import LightFault
 from device.optics.matrix import ring
-from device.spec import ChainSpec
-from device.values import Colour, Glow
+from device.values import Colour, Illumination
 
 log = logging.getLogger(__name__)
 
 FULL = 255
-GLOBAL = 0xFF  # 0b111 and 31: a smaller one is a second, slow PWM that beats with the shutter
-BLUE_GREEN_RED: tuple[Colour, Colour, Colour] = ("blue", "green", "red")  # as they follow on the wire
+GLOBAL = 0xFF  # 0b111 and 31: smaller values add a second, slow PWM that beats with the exposure
+BLUE_GREEN_RED: tuple[Colour, Colour, Colour] = ("blue", "green", "red")  # byte order on the bus
 
 
-def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Glow) -> bytes:
-    """The message that shows `glow` on these LEDs and nothing on the others; each by its own trim, never quite dark."""
+def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Illumination) -> bytes:
+    """Return the SPI frame that lights only these LEDs (chain indices), at level times trim, at least 1/255."""
     frame = bytearray(dark_frame(chain.rows * chain.cols))
     channel = 1 + BLUE_GREEN_RED.index(glow.colour)
     for place, led in enumerate(leds):
@@ -35,17 +35,17 @@ def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Glow) -> bytes:
 
 
 class Pulse(Protocol):
-    """What holds the hardware gate open while a lease is live (device/drivers/heartbeat.py)."""
+    """Heartbeat that keeps the hardware gate open while a lease is active (device/drivers/heartbeat.py)."""
 
     def start(self, lease_s: float) -> None:
-        """Beat from now, at most for `lease_s` seconds; the LEDs have power when this returns."""
+        """Start the heartbeat, for at most `lease_s` seconds; the LEDs have power on return."""
 
     def stop(self) -> None:
-        """Be still."""
+        """Stop the heartbeat."""
 
 
 class Apa102Ring:
-    """The lamp that `chain` describes. Raises LightFault when the chain cannot be reached, or not be kept safe."""
+    """APA102 driver that implements `ports.Light` on the LEDs of `chain`; LightFault if bus or guardian is unusable."""
 
     def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
         try:
@@ -55,8 +55,8 @@ class Apa102Ring:
         self._chain, self._guardian, self._lease_s = chain, guardian, lease_s
         self._leds, self._pulse = ring(chain), pulse
         self._dark = dark_frame(chain.rows * chain.cols)
-        self._glow: Glow | None = None
-        self._lock = Lock()  # the guard's timer may darken while the owner of the head lights up
+        self._glow: Illumination | None = None
+        self._lock = Lock()  # the guard's timer may turn the ring off while another thread turns it on
         self._wire: Any = spidev.SpiDev()
         try:
             bus, select = chain.device.removeprefix("/dev/spidev").split(".")
@@ -68,16 +68,16 @@ class Apa102Ring:
         self.off()
 
     @property
-    def glow(self) -> Glow | None:
-        """What it shines now; None when it is dark."""
+    def illumination(self) -> Illumination | None:
+        """Return the current illumination; None when it is off."""
         return self._glow
 
-    def on(self, glow: Glow) -> "RingLit":
-        """Shine from the entry of the returned context to its end; LightFault, on entry, if it cannot, and is dark."""
-        return RingLit(self, glow)
+    def on(self, glow: Illumination) -> "RingLightContext":
+        """Return a context in which the ring is on; LightFault on entry if that fails, and the ring is then off."""
+        return RingLightContext(self, glow)
 
     def off(self) -> None:
-        """Be dark; always allowed, harmless when dark or closed already. LightFault if the chain does not listen."""
+        """Turn the ring off, stop the heartbeat, cancel the lease; harmless if off or closed. Raises LightFault."""
         with self._lock:
             if self._wire is None:
                 return
@@ -88,20 +88,20 @@ class Apa102Ring:
             finally:
                 if self._pulse is not None:
                     self._pulse.stop()
-            self._guardian.dark()
+            self._guardian.end_lease()
 
-    def shine(self, glow: Glow) -> None:
-        """Shine now, once the guardian knows; for the context only."""
+    def turn_on(self, glow: Illumination) -> None:
+        """Grant the lease, start the heartbeat, then turn the ring on; LightFault. Called by RingLightContext only."""
         with self._lock:
-            self._guardian.lit(self._lease_s)
+            self._guardian.grant_lease(self._lease_s)
             if self._pulse is not None:
                 self._pulse.start(self._lease_s)
-                self._send(self._dark)  # LEDs that had no power show anything
+                self._send(self._dark)  # LEDs show arbitrary colours after power-up
             self._glow = glow
             self._send(lit_frame(self._chain, self._leds, glow))
 
     def close(self) -> None:
-        """Be dark, and let the bus and the guardian go; closing twice is harmless."""
+        """Turn the ring off, close the SPI device and end the guardian; closing twice is harmless."""
         if self._wire is None:
             return
         try:
@@ -114,20 +114,20 @@ class Apa102Ring:
     def _send(self, frame: bytes) -> None:
         try:
             self._wire.writebytes2(frame)
-        except (OSError, SystemError) as error:  # spidev answers a short write with the latter
+        except (OSError, SystemError) as error:  # spidev raises SystemError for a short write
             raise LightFault(f"the lamp's bus does not take its message: {error}") from error
 
 
-class RingLit:
-    """The time in which the ring shines."""
+class RingLightContext:
+    """Context manager: the ring is on from entry to exit."""
 
-    def __init__(self, ring: Apa102Ring, glow: Glow) -> None:
+    def __init__(self, ring: Apa102Ring, glow: Illumination) -> None:
         self._ring, self._glow = ring, glow
 
-    def __enter__(self) -> "RingLit":
-        """The ring is on."""
+    def __enter__(self) -> "RingLightContext":
+        """Turn the ring on; after an error turn it off again and raise the error."""
         try:
-            self._ring.shine(self._glow)
+            self._ring.turn_on(self._glow)
         except BaseException:
             self._ring.off()
             raise
@@ -136,5 +136,5 @@ class RingLit:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """The ring is off, whatever happened."""
+        """Turn the ring off, also after an exception."""
         self._ring.off()

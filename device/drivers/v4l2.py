@@ -1,4 +1,4 @@
-"""As much of Linux's <linux/videodev2.h> as streaming from one camera needs, for 64-bit machines, by ctypes."""
+"""Subset of Linux's <linux/videodev2.h> for streaming from one camera on 64-bit machines, through ctypes."""
 
 import ctypes
 import fcntl
@@ -56,13 +56,13 @@ class Control(ctypes.Structure):
 
 
 class Integer(ctypes.Structure):
-    """The int that STREAMON and STREAMOFF take."""
+    """The int argument of STREAMON and STREAMOFF."""
 
     _fields_ = (("value", ctypes.c_int),)
 
 
 def _code(direction: int, number: int, struct: type[ctypes.Structure]) -> int:
-    """Linux's _IOC: 1 writes to the kernel, 2 reads from it, 3 does both."""
+    """Return the request code of Linux's _IOC macro: direction 1 writes to the kernel, 2 reads from it, 3 does both."""
     return direction << 30 | ctypes.sizeof(struct) << 16 | ord("V") << 8 | number
 
 
@@ -74,43 +74,43 @@ G_CTRL, S_CTRL = _code(3, 27, Control), _code(3, 28, Control)
 
 
 class Transport(Protocol):
-    """The calls into the kernel: the seam at which an emulated device takes its place."""
+    """System calls of the V4L2 driver; tests pass an emulated device here."""
 
     def open(self, path: str) -> int:
-        """A file descriptor; OSError."""
+        """Return a file descriptor; OSError."""
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure) -> None:
-        """One request, which may fill its argument; OSError."""
+        """Send one request; the driver writes its answer, if any, into `argument`. OSError."""
 
     def map(self, fd: int, length: int, offset: int) -> Any:
-        """The memory of one buffer, with the buffer protocol and `close`."""
+        """Return the memory of one buffer, with the buffer protocol and `close`; OSError."""
 
     def wait(self, fd: int, limit_s: float) -> bool:
-        """Whether a frame became ready within the limit."""
+        """Return True once a frame is ready; False if none is ready within `limit_s` seconds."""
 
     def close(self, fd: int) -> None:
-        """Give the descriptor back."""
+        """Close the file descriptor."""
 
 
-class Kernel:
-    """The real one."""
+class KernelTransport:
+    """Transport to the Linux kernel: the real system calls."""
 
     def open(self, path: str) -> int:
-        """A file descriptor; OSError."""
+        """Return a file descriptor; OSError."""
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure) -> None:
-        """One request, which may fill its argument; OSError."""
+        """Send one request; the driver writes its answer, if any, into `argument`. OSError."""
         fcntl.ioctl(fd, request, argument)
 
     def map(self, fd: int, length: int, offset: int) -> Any:
-        """The memory of one buffer."""
+        """Return the read-only memory map of one buffer."""
         return mmap.mmap(fd, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
 
     def wait(self, fd: int, limit_s: float) -> bool:
-        """Whether a frame became ready within the limit."""
+        """Return True once a frame is ready; False if none is ready within `limit_s` seconds."""
         return bool(select.select([fd], [], [], max(0.0, limit_s))[0])
 
     def close(self, fd: int) -> None:
-        """Give the descriptor back."""
+        """Close the file descriptor."""
         os.close(fd)

@@ -1,7 +1,7 @@
-"""A UVC or industrial camera over Linux's V4L2: GREY, Y10, Y12 or Y16, streamed from memory that the kernel shares.
+"""UVC or industrial camera through Linux's V4L2: GREY, Y10, Y12 or Y16, streamed through memory-mapped buffers.
 
-Its frames carry no exposure time, only their moment: a frame counts from when its exposure began, and the control is
-read back. (The sensors of a Raspberry Pi are not plain V4L2 devices: `pi_camera.py`.)
+V4L2 frames carry a timestamp but no exposure time: a frame is accepted by the start of its exposure, and the exposure
+control is read back. (Raspberry Pi sensors are not plain V4L2 devices: see `pi_camera.py`.)
 """
 
 import ctypes
@@ -11,64 +11,65 @@ from typing import Any
 import numpy as np
 
 from device.clock import Clock
+from device.config.head_file import CameraSpec
 from device.drivers import v4l2
-from device.drivers.exposing import Exposing, Shining
+from device.drivers.exposure_retry import LampState, RetryingCamera
 from device.drivers.raw_counts import V4L2_BITS, RawLayout, v4l2_layout
-from device.errors import CameraMissing, CameraStalled, CameraWrong, HardwareError
-from device.spec import CameraSpec
-from device.values import Counts, Shot
+from device.errors import CameraMismatch, CameraMissing, CameraStalled, HardwareError
+from device.values import Counts, ExposureSettings
 
 BUFFERS = 4
-DELAY = 2  # frames after a change of exposure time that may still have the old one
+DELAY = 2  # frames after a change of exposure time that may still have the previous one
 MOST_FRAMES = 16
-PATIENCE_S = 2.0
-NO_CAMERA = "Plug the camera in, or name another device in the head's file; see `ls /dev/video*`."
+FRAME_TIMEOUT_S = 2.0
+NO_CAMERA_REMEDY = "Plug the camera in, or name another device in the head's file; see `ls /dev/video*`."
 
 
-class V4l2Camera(Exposing):
-    """One /dev/video*: a fixed mode, memory-mapped buffers, manual exposure in steps of 100 us.
+class V4l2Camera(RetryingCamera):
+    """V4L2 driver that implements `ports.Camera` on one /dev/video*: a fixed mode, manual exposure in steps of 100 us.
 
-    `clock` must be the one that stamps the frames: CLOCK_MONOTONIC, which SystemClock reads on Linux. Raises
-    CameraMissing, CameraWrong, CameraPacked or CameraStalled.
+    `light` is the source of each frame's illumination. `clock` must be the clock of the frame timestamps:
+    CLOCK_MONOTONIC, which SystemClock reads on Linux. `patience_s` is the timeout for a frame after its exposure.
+    Raises CameraMissing, CameraMismatch, CameraPacked or CameraStalled.
     """
 
     def __init__(
         self,
         spec: CameraSpec,
-        light: Shining,
+        light: LampState,
         clock: Clock,
         *,
         simulated: bool = False,
-        patience_s: float = PATIENCE_S,
+        patience_s: float = FRAME_TIMEOUT_S,
         transport: v4l2.Transport | None = None,
     ) -> None:
         super().__init__(spec, light, simulated)
-        self._clock, self._patience_s, self._kernel = clock, patience_s, transport or v4l2.Kernel()
+        self._clock, self._patience_s, self._kernel = clock, patience_s, transport or v4l2.KernelTransport()
         self._fd: int | None = None
         self._memory: list[Any] = []
         self._stride = self._exposure_100us = 0
         self._layout: RawLayout
-        self.open(Shot(spec.exposure_s))
+        self.open(ExposureSettings(spec.exposure_s))
 
     # Opening
 
-    def _open(self, shot: Shot) -> None:
+    def _open(self, shot: ExposureSettings) -> None:
         try:
             self._fd = self._kernel.open(self._spec.device)
             self._set_up(shot)
         except HardwareError:
             raise
         except OSError as error:
-            raise CameraMissing(f"{self._spec.device} cannot be used: {error.strerror}", NO_CAMERA) from error
+            raise CameraMissing(f"{self._spec.device} cannot be used: {error.strerror}", NO_CAMERA_REMEDY) from error
 
-    def _set_up(self, shot: Shot) -> None:
+    def _set_up(self, shot: ExposureSettings) -> None:
         can = v4l2.Capability()
         self._ioctl(v4l2.QUERYCAP, can)
         if ~(can.device_caps or can.capabilities) & (v4l2.CAN_CAPTURE | v4l2.CAN_STREAM):
-            raise CameraWrong(f"{self._spec.device} ({can.card.decode(errors='replace')}) does not stream pictures")
-        self._layout = self._granted()
-        self._control(v4l2.EXPOSURE_AUTO, v4l2.MANUAL)
-        self._control(v4l2.AUTOGAIN, 0, optional=True)
+            raise CameraMismatch(f"{self._spec.device} ({can.card.decode(errors='replace')}) does not stream pictures")
+        self._layout = self._granted_layout()
+        self._set_control(v4l2.EXPOSURE_AUTO, v4l2.MANUAL)
+        self._set_control(v4l2.AUTOGAIN, 0, optional=True)
         self._exposure_100us = 0
         self._set_exposure(shot)
         asked = v4l2.Buffers(count=BUFFERS, type=v4l2.CAPTURE, memory=v4l2.MMAP)
@@ -80,8 +81,8 @@ class V4l2Camera(Exposing):
             self._ioctl(v4l2.QBUF, buffer)
         self._ioctl(v4l2.STREAMON, v4l2.Integer(v4l2.CAPTURE))
 
-    def _granted(self) -> RawLayout:
-        """Ask for the mode in each plain format that holds the sensor's bits, and read back what was made of it."""
+    def _granted_layout(self) -> RawLayout:
+        """Return the layout of the first format granted with the sensor's bits or 16; CameraMismatch, CameraPacked."""
         spec, granted = self._spec, v4l2.Format()
         deep = sorted((bits, name) for name, bits in V4L2_BITS.items() if bits in (spec.bit_depth, 16))
         for _, name in deep:
@@ -93,7 +94,7 @@ class V4l2Camera(Exposing):
                 break
         layout = v4l2_layout(granted.fourcc.decode(errors="replace"), spec.rows, spec.cols, spec.bit_depth)
         if (granted.height, granted.width) != self.shape:
-            raise CameraWrong(
+            raise CameraMismatch(
                 f"{spec.device} has no mode of {spec.rows} x {spec.cols}: it grants {granted.height} x {granted.width}"
             )
         self._stride = granted.bytesperline
@@ -101,21 +102,21 @@ class V4l2Camera(Exposing):
 
     # Controls and frames
 
-    def _set_exposure(self, shot: Shot) -> bool:
-        """Whether the exposure time had to be changed; CameraWrong if the camera makes another one of it."""
+    def _set_exposure(self, shot: ExposureSettings) -> bool:
+        """Set the exposure time (100 us steps) and return whether it changed; CameraMismatch if another is read."""
         wanted = max(1, round(shot.exposure_s * 1e4))
         if wanted == self._exposure_100us:
             return False
-        self._control(v4l2.EXPOSURE_100US, wanted)
+        self._set_control(v4l2.EXPOSURE_100US, wanted)
         now = v4l2.Control(id=v4l2.EXPOSURE_100US)
         self._ioctl(v4l2.G_CTRL, now)
         if abs(now.value - wanted) > 1:
-            raise CameraWrong(f"{self._name} exposes for {now.value / 10:g} ms where {wanted / 10:g} ms were asked")
+            raise CameraMismatch(f"{self._name} exposes for {now.value / 10:g} ms where {wanted / 10:g} ms were asked")
         self._exposure_100us = wanted
         return True
 
-    def _take(self, shot: Shot, counts: Counts | None) -> None:
-        """The next whole frame that began after this call. Raises TimeoutError when none comes."""
+    def _take(self, shot: ExposureSettings, counts: Counts | None) -> None:
+        """Write the next whole frame begun after this call to `counts` (None: check). TimeoutError, CameraStalled."""
         begin_s = self._clock.now_s()
         try:
             late = DELAY if self._set_exposure(shot) else 0
@@ -135,15 +136,15 @@ class V4l2Camera(Exposing):
         except (HardwareError, TimeoutError):
             raise
         except OSError as error:
-            if error.errno == errno.EIO:  # a frame was lost on the bus, and perhaps the next one too
+            if error.errno == errno.EIO:  # a frame was lost on the bus, and later ones may be lost too
                 raise TimeoutError from error
-            raise CameraMissing(f"{self._name} has gone: {error.strerror}", NO_CAMERA) from error
+            raise CameraMissing(f"{self._name} has gone: {error.strerror}", NO_CAMERA_REMEDY) from error
         raise CameraStalled(f"{MOST_FRAMES} frames passed, all of them broken or too old")
 
-    def _began_s(self, buffer: v4l2.Buffer, shot: Shot) -> float:
-        """When the exposure of a frame began; its stamp is its end unless it says otherwise."""
+    def _began_s(self, buffer: v4l2.Buffer, shot: ExposureSettings) -> float:
+        """Return the clock time, s, of the exposure's start; the timestamp is its end unless flags mark its start."""
         if not buffer.flags & v4l2.STAMP_MONOTONIC:
-            raise CameraWrong(f"{self._name} does not say when its frames were taken, so that old ones would pass")
+            raise CameraMismatch(f"{self._name} does not say when its frames were taken, so that old ones would pass")
         stamp_s = float(buffer.seconds + buffer.microseconds * 1e-6)
         return stamp_s if buffer.flags & v4l2.STAMP_AT_START else stamp_s - shot.exposure_s
 
@@ -155,15 +156,15 @@ class V4l2Camera(Exposing):
         else:
             self._layout.counts(rows, counts)
 
-    def _let_go(self) -> None:
+    def _close_device(self) -> None:
         fd, self._fd = self._fd, None
         memory, self._memory = self._memory, []
         for part in memory:
             part.close()
         if fd is not None:
-            self._kernel.close(fd)  # which also ends the streaming
+            self._kernel.close(fd)  # closing also ends the streaming
 
-    # Words to the kernel
+    # Kernel requests
 
     @property
     def _handle(self) -> int:
@@ -174,14 +175,14 @@ class V4l2Camera(Exposing):
     def _ioctl(self, request: int, argument: ctypes.Structure) -> None:
         self._kernel.ioctl(self._handle, request, argument)
 
-    def _control(self, control: int, value: int, optional: bool = False) -> None:
+    def _set_control(self, control: int, value: int, optional: bool = False) -> None:
         try:
             self._ioctl(v4l2.S_CTRL, v4l2.Control(id=control, value=value))
         except OSError as error:
             if error.errno not in (errno.EINVAL, errno.ENOTTY):
                 raise
             if not optional:
-                raise CameraWrong(f"{self._name} does not let its exposure time be chosen") from error
+                raise CameraMismatch(f"{self._name} does not let its exposure time be chosen") from error
 
     def _buffer(self, index: int) -> v4l2.Buffer:
         return v4l2.Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP)

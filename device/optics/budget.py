@@ -1,21 +1,22 @@
-"""The optical budget of one head: what its light path, its sensor and an eye give, in numbers, before it is built."""
+"""Optical budget of a head: the numbers that its light path, sensor and eye give, by closed formulas."""
 
 from dataclasses import dataclass
 from math import radians
 
+from device.config.head_file import ChainSpec, InstrumentSpec, OpticsSpec
+from device.config.sensors import SensorProfile
 from device.errors import SpecError
+from device.optics import field_extent
 from device.optics.eye import Relay, reflex_free_mm, size_mm
-from device.optics.illumination import Budget, half_period_deg, photon_budget, tried
+from device.optics.illumination import PhotonBudget, half_period_deg, photon_budget, within_simulated_range
 from device.optics.light_path import LightPath, relay_of
 from device.optics.matrix import chain_of, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
-from device.sensors import SensorProfile
-from device.spec import ChainSpec, InstrumentSpec, OpticsSpec
 from device.values import Colour
 
 
 @dataclass(frozen=True)
 class Design:
-    """What a budget is made for: a light path, a ring, a sensor's pixels, and an eye."""
+    """Input of a budget: light path, LED ring, sensor, eye (focal length and pupil), colour and exposure time."""
 
     title: str
     path: LightPath
@@ -31,19 +32,19 @@ class Design:
 
     @property
     def relay(self) -> Relay:
-        """Its relay, iris and distance."""
+        """Relay with this design's magnification, iris and diffuser distance."""
         return relay_of(self.path, self.optics)
 
     @property
     def sides_mm(self) -> tuple[float, float]:
-        """(long, short) side of the light-sensitive area."""
+        """(long, short) side of the light-sensitive area, mm."""
         sides = self.cols * self.pitch_um / 1000, self.rows * self.pitch_um / 1000
         return max(sides), min(sides)
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side of the sensor: the widest field by the paper's rule, and what it catches of this one."""
+    """One side of the sensor: length, field of which it captures all (or half) of the edge's light, captured share."""
 
     sensor_mm: float
     strict_field_deg: float
@@ -53,7 +54,7 @@ class Side:
 
 @dataclass(frozen=True)
 class OpticalBudget:
-    """The numbers of a design; fields are full angles at the eye, `long` and `short` the sensor's sides."""
+    """Numbers of a design; fields are full angles at the eye, `long` and `short` are the sensor's sides."""
 
     field_deg: float
     retina_mm: float
@@ -74,15 +75,15 @@ class OpticalBudget:
     reflex_free_mm: float
     first_lens_mm: float
     splitter_mm: float
-    light: Budget
+    light: PhotonBudget
     electrons_per_px: float
     half_period_deg: float
     half_period_um: float
-    tried: bool
+    within_simulated_range: bool
 
 
 def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
-    """A head's own numbers; a ring or pupil that it does not name is the path's. SpecError for one without optics."""
+    """Return a head's design, with ring and pupil of `path` if the head names none; SpecError without [optics]."""
     if spec.optics is None:
         raise SpecError(f"{spec.name}: no table [optics], so nothing is known of its light path")
     chain, camera, pupil_mm = chain_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
@@ -93,7 +94,7 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
 
 
 def design_of_sensor(path: LightPath, sensor: SensorProfile) -> Design:
-    """The shared light path in front of a sensor at full resolution."""
+    """Return the design of the light path `path` with a sensor profile at full resolution, green light and 0.1 s."""
     return Design(
         sensor.title, path, path.optics, path.ring, sensor.rows, sensor.cols, sensor.pitch_um,
         path.eye.focal_mm, path.eye.pupil_mm,
@@ -101,7 +102,7 @@ def design_of_sensor(path: LightPath, sensor: SensorProfile) -> Design:
 
 
 def optical_budget(design: Design) -> OpticalBudget:
-    """Every number of a design, each by its formula in `eye.py`, `matrix.py` or `illumination.py`."""
+    """Return all numbers of a design, by the formulas in `eye.py`, `matrix.py` and `illumination.py`."""
     relay, field, pitch_um = design.relay, design.optics.field_deg, design.pitch_um
     leds = len(ring(design.chain))
     light = photon_budget(design.colour, pitch_um, field, design.eye_mm, relay, leds)
@@ -111,9 +112,9 @@ def optical_budget(design: Design) -> OpticalBudget:
     return OpticalBudget(
         field_deg=field,
         retina_mm=size_mm(field, design.eye_mm),
-        half_shift_mm=relay.half_shift_mm(field),
-        extent_mm=relay.extent_mm(field),
-        extent_tan_mm=relay.iris_mm + 2 * relay.half_shift_tan_mm(field),
+        half_shift_mm=field_extent.half_shift_mm(relay, field),
+        extent_mm=field_extent.extent_mm(relay, field),
+        extent_tan_mm=relay.iris_mm + 2 * field_extent.half_shift_tan_mm(relay, field),
         long=long,
         short=short,
         px_per_deg=relay.px_per_deg(pitch_um),
@@ -126,20 +127,21 @@ def optical_budget(design: Design) -> OpticalBudget:
         ring_at_pupil_mm=ring_at_pupil_mm(design.chain, relay.angular_magnification),
         inner_ring_at_pupil_mm=inner_ring_at_pupil_mm(design.chain, relay.angular_magnification),
         reflex_free_mm=reflex_free_mm(field / 2),
-        first_lens_mm=relay.clear_at_first_mm(field),
-        splitter_mm=relay.clear_before_iris_mm(field, design.path.relay.splitter_to_iris_mm),
+        first_lens_mm=relay.first_lens_aperture_mm(field),
+        splitter_mm=relay.beam_before_iris_mm(field, design.path.relay.splitter_to_iris_mm),
         light=light,
         electrons_per_px=electrons,
         half_period_deg=finest_deg,
         half_period_um=radians(finest_deg) * design.eye_mm * 1000,
-        tried=tried(electrons, pitch_um),
+        within_simulated_range=within_simulated_range(electrons, pitch_um),
     )
 
 
 def _side(relay: Relay, field_deg: float, sensor_mm: float) -> Side:
+    """Return the numbers of one sensor side of `sensor_mm`, with the captured share for a field of `field_deg`."""
     return Side(
         sensor_mm,
-        relay.strict_field_deg(sensor_mm),
-        relay.half_caught_field_deg(sensor_mm),
-        relay.captured(field_deg, sensor_mm),
+        field_extent.strict_field_deg(relay, sensor_mm),
+        field_extent.half_captured_field_deg(relay, sensor_mm),
+        field_extent.captured_share(relay, field_deg, sensor_mm),
     )

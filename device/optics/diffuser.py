@@ -1,8 +1,8 @@
-"""The diffuser: a smooth random surface at the iris, and the caustic that one retinal point becomes behind it.
+"""Diffuser model: a smooth random surface at the iris, and the wave-optics PSF (caustic) of a retinal point behind it.
 
-    opd_sigma_um   how rough the surface is, from the scattering angle on its data sheet
-    surface        one realisation of it
-    caustic        the wave-optics point spread function on the sensor (paper, section "Algorithm": h)
+    opd_sigma_um   roughness of the surface, from the scattering angle in its data sheet
+    surface        one realisation of the surface
+    caustic        point spread function on the sensor (paper, section "Algorithm": h)
 
 x runs with the columns and y with the rows; the axis of the eye meets the sensor in the middle of pixel (n//2, n//2).
 """
@@ -15,21 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from device.config.head_file import OpticsSpec
 from device.errors import SpecError
 from device.optics.propagation import Field, propagate, require_sampling
-from device.spec import OpticsSpec
 from device.values import Image
 
 FWHM_PER_SIGMA = 2.3548
-STEEPEST = 5  # slopes beyond five sigma carry nothing that a count could show (optics.md 2.1: f_max ~ 5 sigma/lambda)
-FINENESS = 0.4  # of the coarsest permitted sampling: the PSF is then within 1 % of one on half that pitch (2.2)
-ROOM = 1.2  # window / extent of the light, so that what diffracts at the iris does not come round again
-IRIS_EDGE_UM = 10.0  # a cut edge is not sharper than this
+MAX_SLOPE_SIGMAS = 5  # light at slopes beyond five sigma is below one count (OPTICS.md 2.4: f_max ~ 5 sigma/lambda)
+SAMPLING_FRACTION = (
+    0.4  # of the coarsest permitted sampling: the PSF is then within 1 % of one on half that pitch (2.2)
+)
+WINDOW_MARGIN = 1.2  # window / extent of the light, so that light diffracted at the iris does not wrap around
+IRIS_EDGE_UM = 10.0  # width of the iris's soft edge
 MAX_SAMPLES = 4096
 
 
 class Beam(NamedTuple):
-    """The round beam of one place of the retina where it meets the iris: how far off its middle is, and its radius."""
+    """Circular beam of one place of the retina at the iris: shift of its centre from the iris's, and its radius."""
 
     x_um: float
     y_um: float
@@ -37,9 +39,9 @@ class Beam(NamedTuple):
 
 
 class Refraction(NamedTuple):
-    """The refraction of an eye as its wavefront: mean sphere, and the two axes of the cylinder, in dioptres.
+    """Refraction of an eye as a wavefront: mean sphere M and cylinder components J0 and J45, in dioptres.
 
-    Positive mean: the beam leaving the eye converges (myopia). The spectacle correction has the opposite sign.
+    Positive M: the beam that leaves the eye converges (myopia). The spectacle correction has the opposite sign.
     """
 
     m_dpt: float = 0.0
@@ -47,7 +49,10 @@ class Refraction(NamedTuple):
     j45_dpt: float = 0.0
 
     def warp(self, optics: OpticsSpec) -> NDArray[np.float64]:
-        """The matrix T by which the caustic of a relaxed, perfect eye is stretched, on (x, y); optics.md 2.4."""
+        """Return the (2, 2) matrix that maps (x, y) in the caustic of an emmetropic eye to that of this eye.
+
+        OPTICS.md 2.6.
+        """
         m, j0, j45 = self
         lever = optics.diffuser_to_sensor_um * 1e-6 * optics.angular_magnification**2
         return np.eye(2) - lever * np.array([[m + j0, j45], [j45, m - j0]])
@@ -58,7 +63,7 @@ EMMETROPIA = Refraction()
 
 @dataclass(frozen=True)
 class Grid:
-    """A square wave-optics grid whose samples fall `step` to a sensor pixel: `pixels` x `pixels` of `pitch_um`."""
+    """Square grid for wave optics: `pixels` x `pixels` sensor pixels of `pitch_um`, each of `step` x `step` samples."""
 
     pixels: int
     step: int
@@ -71,42 +76,42 @@ class Grid:
 
     @property
     def dx_um(self) -> float:
-        """Distance between samples."""
+        """Distance between samples, um."""
         return self.pitch_um / self.step
 
     @property
     def x_um(self) -> NDArray[np.float64]:
-        """Positions of the samples; zero is the middle of pixel `pixels // 2`."""
+        """Positions of the samples, um; zero is the middle of pixel `pixels // 2`."""
         middle = self.pixels // 2 * self.step + (self.step - 1) / 2
         return (np.arange(self.samples, dtype=np.float64) - middle) * self.dx_um
 
 
 def slope_sigma(optics: OpticsSpec) -> float:
-    """Standard deviation of the optical slope along one axis, in radians."""
+    """Return the standard deviation of the optical slope along one axis, radians."""
     return math.radians(optics.slope_fwhm_deg) / FWHM_PER_SIGMA
 
 
 def opd_sigma_um(optics: OpticsSpec) -> float:
-    """Standard deviation of the optical path difference; optics.md 2.1: sigma_th * ell / sqrt(2)."""
+    """Return the standard deviation of the optical path difference, um; OPTICS.md 2.1: sigma_th * ell / sqrt(2)."""
     return slope_sigma(optics) * optics.correlation_um / math.sqrt(2)
 
 
 def steepest_rad(optics: OpticsSpec, refraction: Refraction = EMMETROPIA) -> float:
-    """The steepest ray behind the diffuser: five sigma of its slope, and the eye's own slope at the iris edge."""
+    """Return the steepest ray behind the diffuser, rad: five sigma of its slope plus the eye's slope at the iris."""
     m, j0, j45 = refraction
     eye = optics.angular_magnification**2 * (abs(m) + math.hypot(j0, j45)) * optics.iris_um / 2 * 1e-6
-    return STEEPEST * slope_sigma(optics) + eye
+    return MAX_SLOPE_SIGMAS * slope_sigma(optics) + eye
 
 
 def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA) -> Grid:
-    """The smallest grid at the sensor's pitch, or a whole fraction of it, that samples the caustic honestly.
+    """Return a grid, as small as possible, whose samples are a whole fraction of a pixel and resolve the caustic.
 
-    Raises SpecError when no grid of at most 4096 samples does.
+    SpecError if that needs more than 4096 samples a side, or if the correlation length exceeds a quarter of the grid.
     """
     angle = steepest_rad(optics, refraction)
-    coarsest_um = min(FINENESS * optics.wavelength_um / (2 * angle), optics.correlation_um / 4)
+    coarsest_um = min(SAMPLING_FRACTION * optics.wavelength_um / (2 * angle), optics.correlation_um / 4)
     step = math.ceil(pitch_um / coarsest_um)
-    extent_um = ROOM * (optics.iris_um + 2 * optics.diffuser_to_sensor_um * angle)
+    extent_um = WINDOW_MARGIN * (optics.iris_um + 2 * optics.diffuser_to_sensor_um * angle)
     fringes_um = optics.wavelength_um * optics.diffuser_to_sensor_um * step / pitch_um
     needed = math.ceil(max(extent_um, fringes_um) / pitch_um)
     if needed * step > MAX_SAMPLES:
@@ -121,10 +126,10 @@ def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMET
 
 
 def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
-    """The optical path difference of one diffuser, in um: Gaussian, zero mean, autocorrelation exp(-r^2 / ell^2).
+    """Return the optical path difference of one diffuser, um: Gaussian, zero mean, autocorrelation exp(-r^2 / ell^2).
 
-    Returns (samples, samples) float32. The same seed and window size give the same surface however finely sampled:
-    only the waves that the surface holds are drawn, not the samples.
+    float32 (samples, samples). The same seed and window size give the same surface at any sampling, because the random
+    numbers are the amplitudes of the surface's spatial frequencies and not its samples.
     """
     window_um = grid.samples * grid.dx_um
     ell_um = optics.correlation_um
@@ -134,7 +139,7 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
     draw = np.random.default_rng(seed).standard_normal((2, order.size, order.size))
     spectrum = np.zeros((grid.samples, grid.samples), np.complex64)
     waves_there = (draw[0] + 1j * draw[1]) * np.exp(-((np.pi * ell_um) ** 2) * f_squared / 2)
-    start = np.exp(2j * np.pi * order * grid.x_um[0] / window_um)  # the surface is tied to the axis, not to a corner
+    start = np.exp(2j * np.pi * order * grid.x_um[0] / window_um)  # the axis, not a corner, is the phase origin
     spectrum[np.ix_(order, order)] = waves_there * start[:, None] * start[None, :]
     spectrum[0, 0] = 0
     opd: Image = fft.ifft2(spectrum, overwrite_x=True).real.astype(np.float32)
@@ -146,12 +151,12 @@ def caustic(
     optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
     beam: Beam | None = None,
 ) -> Image:  # fmt: skip
-    """The intensity on the sensor from one retinal point on the axis: float32 (n, n), sum 1, wave optics.
+    """Return the intensity on the sensor from one retinal point on the axis by wave optics: float32 (n, n), sum 1.
 
-    A `beam` that leaves a part of the iris dark is told by its shape and by a sum below 1. `seed` names the diffuser;
-    `lines` wavelengths across the bandwidth add incoherently; every pixel holds the light of its whole area. The grid
-    is a relaxed eye's: another window would hold another surface. Raises SpecError where no honest grid exists, or that
-    one cannot carry so strong a refraction. optics.md 2.1.
+    With a `beam` that does not fill the iris, the sum is the transmitted share, below 1. `seed` selects the diffuser.
+    `lines` wavelengths across the bandwidth add incoherently. Every pixel integrates over its whole area. The grid is
+    that of a relaxed eye, because another window would hold another surface. SpecError if no grid samples the light
+    sufficiently, or if the grid cannot carry so strong a refraction. OPTICS.md 2.2.
     """
     return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines, beam)
 
@@ -160,7 +165,7 @@ def caustic_on(
     grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
     beam: Beam | None = None,
 ) -> Image:  # fmt: skip
-    """The caustic on a grid of one's own choice; SpecError if it cannot carry the light."""
+    """Return the result of `caustic` on a given grid, (pixels, pixels); SpecError for a grid too coarse or small."""
     require_sampling(
         grid.samples,
         grid.dx_um,
@@ -185,16 +190,17 @@ def caustic_on(
 
 
 def spectral_lines_um(optics: OpticsSpec, lines: int) -> list[float]:
-    """Wavelengths in the middle of `lines` equal slices of the bandwidth."""
+    """Return the central wavelengths of `lines` equal slices of the bandwidth, um."""
     return [optics.wavelength_um + optics.bandwidth_um * ((i + 0.5) / lines - 0.5) for i in range(lines)]
 
 
 def iris(optics: OpticsSpec, grid: Grid) -> Image:
-    """The amplitude that the round iris lets through, with an edge 10 um soft; float32 (samples, samples)."""
+    """Return the amplitude transmission of the circular iris, with an edge 10 um soft; float32 (samples, samples)."""
     return _disc(grid, Beam(0.0, 0.0, optics.iris_um / 2))
 
 
 def _disc(grid: Grid, beam: Beam) -> Image:
+    """Return the amplitude of a circular beam, 0 to 1, float32 (samples, samples), with an edge 10 um soft."""
     x_um = grid.x_um.astype(np.float32)
     radius_um = np.hypot(x_um[:, None] - np.float32(beam.y_um), x_um[None, :] - np.float32(beam.x_um))
     amplitude: Image = np.clip((beam.radius_um - radius_um) / IRIS_EDGE_UM + 0.5, 0, 1)
@@ -202,7 +208,7 @@ def _disc(grid: Grid, beam: Beam) -> Image:
 
 
 def eye_wavefront_um(optics: OpticsSpec, grid: Grid, refraction: Refraction) -> Image:
-    """The path difference that a refractive error lays over the iris, in um; optics.md 2.1, W."""
+    """Return the optical path difference of a refractive error over the iris, um; OPTICS.md 2.2, W."""
     m, j0, j45 = refraction
     x_um = grid.x_um[None, :]
     y_um = grid.x_um[:, None]
@@ -212,7 +218,7 @@ def eye_wavefront_um(optics: OpticsSpec, grid: Grid, refraction: Refraction) -> 
 
 
 def _onto_pixels(intensity: Image, grid: Grid) -> Image:
-    """The light of each whole pixel: the exact average over a sample's area, then a block sum; sum 1."""
+    """Return the intensity on the pixels, (pixels, pixels), sum 1: exact average over each sample, then block sum."""
     f_rows = fft.fftfreq(grid.samples)
     f_cols = fft.rfftfreq(grid.samples)
     spectrum = fft.rfft2(intensity)

@@ -1,27 +1,28 @@
-"""Light from the ring to the pixel: how many electrons a human fundus gives, and how much light the eye gets for it.
+"""Photon budget from the LED ring to the pixel: irradiance at the eye, and electrons from a human fundus.
 
-optics.md 3.7 and 3.8. The LEDs' power is a guess until somebody measures it: within a factor of two (optics.md 10).
+OPTICS.md 4.1 and 4.2. The LEDs' power is an estimate within a factor of two until it is measured (OPTICS.md 5.2).
 """
 
 from dataclasses import dataclass
 from math import degrees, exp, log, pi, radians, sin, tan
 
+from device.optics import field_extent
 from device.optics.eye import Relay
 from device.values import Colour
 
 PLANCK_LIGHT_J_M = 1.98645e-25  # h c
 LEDS = 12
-TO_THE_EYE = 0.42 * 0.5 * 0.9  # polariser, beam splitter, relay
-FROM_THE_EYE = 0.9 * 0.5 * 0.40  # relay, beam splitter, crossed polariser of depolarised light
+TRANSMISSION_TO_EYE = 0.42 * 0.5 * 0.9  # transmission of polariser, beam splitter, relay
+TRANSMISSION_FROM_EYE = 0.9 * 0.5 * 0.40  # transmission of relay, beam splitter, crossed polariser of depolarised light
 RELAY_HALF_CONE_DEG = 12.5
-# Half-periods in simulation (optics.md 8.2): electrons at the peak of a pixel of 5.04 um, um on a retina behind 17 mm.
+# Half-periods in simulation (OPTICS.md 4.3): electrons at the peak of a pixel of 5.04 um, um on a retina behind 17 mm.
 RESOLVED = ((2e3, 244.0), (20e3, 137.0), (100e3, 104.0))
 RESOLVED_PITCH_UM, RESOLVED_EYE_MM = 5.04, 17.0
 
 
 @dataclass(frozen=True)
 class Led:
-    """One colour of the ring: its wavelength, power of one LED at full drive, and what tissue and sensor make of it."""
+    """One colour of the ring: wavelength, power of one LED at full drive, reflectance of tissue, quantum efficiency."""
 
     wavelength_um: float
     power_mw: float
@@ -37,8 +38,8 @@ LED: dict[Colour, Led] = {
 
 
 @dataclass(frozen=True)
-class Budget:
-    """What arrives on the way: at the cornea, on the retina, in the image, and as electrons in a pixel."""
+class PhotonBudget:
+    """Photon budget: power at the cornea and in the image, irradiance on the retina, electrons per pixel per second."""
 
     cornea_mw: float
     retina_mw_per_cm2: float
@@ -49,27 +50,28 @@ class Budget:
 def photon_budget(
     colour: Colour, pitch_um: float, field_deg: float = 33.4, eye_mm: float = 17.0, relay: Relay | None = None,
     leds: int = LEDS,
-) -> Budget:  # fmt: skip
-    """The light of all LEDs at full drive, spread over the field of a human eye and collected by its pupil's share.
+) -> PhotonBudget:  # fmt: skip
+    """Return the budget of `leds` LEDs at full drive, spread over the field of a human eye, collected by the iris.
 
-    The image of a field is as wide as d + 2s, because the diffuser spreads every point over the iris's shadow.
+    `eye_mm` is the eye's focal length; `relay` None: the paper's. The image's width is d + 2 s, iris plus twice the
+    shift of the field's edge, because the diffuser spreads every point over the iris's shadow.
     """
     relay, led = relay or Relay(), LED[colour]
-    cornea_mw = leds * led.power_mw * sin(radians(RELAY_HALF_CONE_DEG)) ** 2 * TO_THE_EYE
+    cornea_mw = leds * led.power_mw * sin(radians(RELAY_HALF_CONE_DEG)) ** 2 * TRANSMISSION_TO_EYE
     lit_cm2 = pi * (eye_mm / 10 * tan(radians(field_deg / 2))) ** 2
     retina_mw_per_cm2 = cornea_mw / lit_cm2
     radiance = retina_mw_per_cm2 * led.reflectance / pi
     pupil_cm2 = pi * (relay.iris_at_eye_mm / 20) ** 2
-    image_nw = radiance * pupil_cm2 * lit_cm2 / (eye_mm / 10) ** 2 * FROM_THE_EYE * 1e6
+    image_nw = radiance * pupil_cm2 * lit_cm2 / (eye_mm / 10) ** 2 * TRANSMISSION_FROM_EYE * 1e6
     photons_per_s = image_nw * 1e-9 * led.wavelength_um * 1e-6 / PLANCK_LIGHT_J_M
-    pixels = pi * (relay.extent_mm(field_deg) * 1000 / 2 / pitch_um) ** 2
-    return Budget(cornea_mw, retina_mw_per_cm2, image_nw, photons_per_s * led.quantum_efficiency / pixels)
+    pixels = pi * (field_extent.extent_mm(relay, field_deg) * 1000 / 2 / pitch_um) ** 2
+    return PhotonBudget(cornea_mw, retina_mw_per_cm2, image_nw, photons_per_s * led.quantum_efficiency / pixels)
 
 
 def half_period_deg(electrons_per_px: float, pitch_um: float) -> float:
-    """The finest half-period that stands out of the photon noise: between three simulated points, by power laws.
+    """Return the finest resolved half-period, degrees at the eye, for this light: power laws through simulated points.
 
-    Outside of 2000 to 100000 electrons per 5.04 um pixel the nearest law goes on, which nobody has tried.
+    Outside of 2000 to 100000 electrons per 5.04 um pixel the nearest law is extrapolated; no simulation supports that.
     """
     light = log(electrons_per_px * (RESOLVED_PITCH_UM / pitch_um) ** 2)
     known = [(log(electrons), log(um)) for electrons, um in RESOLVED]
@@ -78,7 +80,7 @@ def half_period_deg(electrons_per_px: float, pitch_um: float) -> float:
     return degrees(um / 1000 / RESOLVED_EYE_MM)
 
 
-def tried(electrons_per_px: float, pitch_um: float) -> bool:
-    """Whether `half_period_deg` lies between points that were simulated."""
+def within_simulated_range(electrons_per_px: float, pitch_um: float) -> bool:
+    """Return true if `half_period_deg` interpolates between simulated points."""
     light = electrons_per_px * (RESOLVED_PITCH_UM / pitch_um) ** 2
     return RESOLVED[0][0] <= light <= RESOLVED[-1][0]

@@ -1,19 +1,19 @@
-"""The light path as a file, `hardware/optics.toml`: the one truth that heads, the simulator and drawings share."""
+"""Light path of the instrument, `hardware/optics.toml`: the single source for heads, simulator and drawings."""
 
 from math import inf, isclose, radians, tan
 from pathlib import Path
 
 from pydantic import Field, model_validator
 
+from device.config.head_file import ChainSpec, OpticsSpec
+from device.config.toml_file import Table, load_toml
 from device.optics.eye import Relay
-from device.spec import ChainSpec, OpticsSpec
-from device.tables import Table, load_toml
 
 Place = tuple[float, float]
 
 
 class RelaySpec(Table):
-    """The two lens groups and the plate that lets the LEDs' light in between them and the diffuser."""
+    """Relay: focal lengths and diameter of its two lens groups; diameter and place of the LEDs' beam splitter."""
 
     first_mm: float = Field(gt=0)
     second_mm: float = Field(gt=0)
@@ -23,14 +23,14 @@ class RelaySpec(Table):
 
 
 class EyeSpec(Table):
-    """The eye that is looked into, if nobody says another one: its focal length and its pupil."""
+    """Default eye: focal length, and diameter of the pupil."""
 
     focal_mm: float = Field(ge=5, le=35)
     pupil_mm: float = Field(gt=0, le=10)
 
 
 class LightPath(Table):
-    """Everything between the eye and the sensor, and the ring of LEDs."""
+    """Components from the eye to the sensor, and the ring of LEDs."""
 
     name: str = Field(min_length=1)
     optics: OpticsSpec
@@ -40,21 +40,22 @@ class LightPath(Table):
 
     @model_validator(mode="after")
     def _one_magnification(self) -> "LightPath":
-        said, lenses = self.optics.angular_magnification, self.relay.first_mm / self.relay.second_mm
-        if not isclose(said, lenses, rel_tol=1e-6):
-            raise ValueError(f"optics.angular_magnification = {said:g}, but the relay's lenses give {lenses:g}")
+        """Raise ValueError if the magnification is not first_mm / second_mm, or the splitter not behind the lenses."""
+        stated, lenses = self.optics.angular_magnification, self.relay.first_mm / self.relay.second_mm
+        if not isclose(stated, lenses, rel_tol=1e-6):
+            raise ValueError(f"optics.angular_magnification = {stated:g}, but the relay's lenses give {lenses:g}")
         if self.relay.splitter_to_iris_mm >= self.relay.second_mm:
             raise ValueError("relay.splitter_to_iris_mm: the plate stands between the second lens and the iris")
         return self
 
 
 def load_light_path(path: Path) -> LightPath:
-    """Read `hardware/optics.toml`, or another file like it; SpecError names the line of a mistake."""
+    """Return the light path in `hardware/optics.toml` or a file like it; SpecError names the line of an error."""
     return load_toml(path, LightPath)
 
 
 def relay_of(path: LightPath, optics: OpticsSpec) -> Relay:
-    """The relay of a head: the path's first lens, and the second that gives the head's own magnification."""
+    """Return the relay of a head: the path's first lens, and the second lens that gives the head's magnification."""
     return Relay(
         first_mm=path.relay.first_mm,
         second_mm=path.relay.first_mm / optics.angular_magnification,
@@ -64,16 +65,17 @@ def relay_of(path: LightPath, optics: OpticsSpec) -> Relay:
 
 
 def planes_mm(relay: Relay) -> tuple[float, float, float, float]:
-    """Where first lens, second lens, iris and sensor stand on the axis, counted from the eye's pupil."""
+    """Return the positions of first lens, second lens, iris and sensor on the axis, from the eye's pupil, mm."""
     second = 2 * relay.first_mm + relay.second_mm
     iris = second + relay.second_mm
     return relay.first_mm, second, iris, iris + relay.diffuser_to_sensor_mm
 
 
 def ray_mm(relay: Relay, eye_mm: float, height_mm: float, angle_deg: float) -> list[Place]:
-    """(along, off the axis) of a ray from the retina to the sensor, through ideal thin lenses and no diffuser.
+    """Return the points (along the axis, off the axis), mm, of a ray from retina to sensor, without diffuser.
 
-    It leaves the pupil at `height_mm`, at `angle_deg` to the axis.
+    The points are on retina, pupil (0, `height_mm`), both ideal thin lenses, iris and sensor. The ray leaves the pupil
+    at `angle_deg` to the axis.
     """
     slope, planes = tan(radians(angle_deg)), planes_mm(relay)
     at, places = 0.0, [(-eye_mm, -eye_mm * slope), (0.0, height_mm)]
@@ -85,9 +87,10 @@ def ray_mm(relay: Relay, eye_mm: float, height_mm: float, angle_deg: float) -> l
 
 
 def led_ray_mm(path: LightPath, relay: Relay, led_mm: float, angle_deg: float) -> list[Place]:
-    """A ray of an LED `led_mm` off the ring's axis: up to the plate, back through both lenses, into the pupil.
+    """Return the points (along the axis, off the axis), mm, of a ray of an LED: LED, splitter, both lenses, pupil.
 
-    The ring stands as far beside the axis as the iris stands behind the plate: the plate mirrors one into the other.
+    The LED is `led_mm` off the ring's axis and the ray at `angle_deg` to it. The ring is as far beside the axis as the
+    iris is behind the splitter, which mirrors one into the other.
     """
     first, second, iris, _ = planes_mm(relay)
     plate, slope = iris - path.relay.splitter_to_iris_mm, tan(radians(angle_deg))

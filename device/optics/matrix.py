@@ -1,31 +1,35 @@
-"""Which LEDs of a matrix make a ring: geometry alone, never indices by heart."""
+"""LED matrix geometry: positions of the LEDs and selection of those that form a ring."""
 
 from math import hypot
 
+from device.config.head_file import ChainSpec, InstrumentSpec
 from device.errors import SpecError
-from device.spec import ChainSpec, InstrumentSpec
 
-LEAST_LEDS = 4  # fewer do not light a field from all around
+MIN_LEDS = 4  # fewer do not light a field from all sides
 
 
-def places_mm(chain: ChainSpec) -> list[tuple[float, float]]:
-    """(right, up) of every LED from the light path's axis, LED side facing you; index 0 is at the bottom left."""
+def led_positions_mm(chain: ChainSpec) -> list[tuple[float, float]]:
+    """Return (right, up) of every LED from the light path's axis, mm, seen from the LED side.
+
+    Index 0 is at the bottom left; the index increases along a row, then from row to row upwards.
+    """
     row, col = chain.axis if chain.axis is not None else ((chain.rows - 1) / 2, (chain.cols - 1) / 2)
     pitch = chain.pitch_mm
     return [((i % chain.cols - col) * pitch, (i // chain.cols - row) * pitch) for i in range(chain.rows * chain.cols)]
 
 
 def ring(chain: ChainSpec) -> tuple[int, ...]:
-    """The LEDs whose distance from the axis is that of the ring, within its tolerance, or those that the head names.
+    """Return the indices of the LEDs on a circle of diameter `ring_mm` +- `tolerance_mm`, or `chain.leds` if given.
 
-    Raises SpecError where none is. The LuMini's only clean ring near 9.5 mm is that of 10.04 mm, with eight LEDs.
+    SpecError if there is none, or more than `most_lit`. Of the LuMini's rings near 9.5 mm only that of 10.04 mm, with
+    eight LEDs, is clearly separate.
     """
     if chain.leds is not None:
         return chain.leds
     radius, slack = chain.ring_mm / 2, chain.tolerance_mm / 2
-    found = tuple(i for i, place in enumerate(places_mm(chain)) if abs(hypot(*place) - radius) <= slack)
+    found = tuple(i for i, place in enumerate(led_positions_mm(chain)) if abs(hypot(*place) - radius) <= slack)
     if not found:
-        near = min(places_mm(chain), key=lambda place: abs(hypot(*place) - radius))
+        near = min(led_positions_mm(chain), key=lambda place: abs(hypot(*place) - radius))
         raise SpecError(
             f"light.chain.ring_mm = {chain.ring_mm:g}: no LED lies on that ring; the nearest one is "
             f"{2 * hypot(*near):.2f} mm wide"
@@ -36,38 +40,40 @@ def ring(chain: ChainSpec) -> tuple[int, ...]:
 
 
 def ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
-    """How wide the ring is where the relay images it into the eye's pupil (optics.md 1.4)."""
+    """Return the outer diameter of the ring's image in the eye's pupil, mm; `magnification` is f1 / f2."""
     return 2 * max(_radii_mm(chain)) * magnification
 
 
 def inner_ring_at_pupil_mm(chain: ChainSpec, magnification: float) -> float:
-    """The same for those of its LEDs that are nearest to the axis: what the cornea's reflex is judged by."""
+    """Return the inner diameter of the ring's image in the eye's pupil, mm, which decides the corneal reflex."""
     return 2 * min(_radii_mm(chain)) * magnification
 
 
 def _radii_mm(chain: ChainSpec) -> list[float]:
-    places = places_mm(chain)
+    """Return the distance of each LED of the ring from the axis, mm."""
+    places = led_positions_mm(chain)
     return [hypot(*places[i]) for i in ring(chain)]
 
 
-def for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> ChainSpec:
-    """The same matrix with the widest ring of at least four LEDs whose image fits into a pupil of that diameter.
+def ring_for_pupil(chain: ChainSpec, pupil_mm: float, magnification: float) -> ChainSpec:
+    """Return the matrix with the widest ring of at least four LEDs whose image fits into a pupil of that diameter.
 
-    The wider the ring, the farther its reflex is from the picture (optics.md 3.6). Raises SpecError where none fits.
+    The wider the ring, the farther its corneal reflex is from the picture (OPTICS.md 3.6). SpecError if no ring fits,
+    or if a ring at least as wide has more than `most_lit` LEDs.
     """
-    distances = sorted({round(hypot(*place), 3) for place in places_mm(chain)}, reverse=True)
+    distances = sorted({round(hypot(*place), 3) for place in led_positions_mm(chain)}, reverse=True)
     for radius_mm in distances:
         found = chain.model_copy(update={"ring_mm": 2 * radius_mm, "leds": None, "trims": None})
-        if radius_mm > 0 and len(ring(found)) >= LEAST_LEDS and ring_at_pupil_mm(found, magnification) <= pupil_mm:
+        if radius_mm > 0 and len(ring(found)) >= MIN_LEDS and ring_at_pupil_mm(found, magnification) <= pupil_mm:
             return found
     raise SpecError(
-        f"light.pupil_mm = {pupil_mm:g}: no ring of at least {LEAST_LEDS} LEDs of this matrix fits into that pupil"
+        f"light.pupil_mm = {pupil_mm:g}: no ring of at least {MIN_LEDS} LEDs of this matrix fits into that pupil"
     )
 
 
 def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
-    """The ring that the head file describes, or that fits the pupil which it names; None without one."""
+    """Return the LED matrix of a head file, with `light.pupil_mm` that of the ring that fits; None without a matrix."""
     chain, light = spec.light.chain, spec.light
     if chain is None or light.pupil_mm is None or spec.optics is None:
         return chain
-    return for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)
+    return ring_for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)

@@ -1,8 +1,8 @@
-"""Light from one plane to the next: the angular spectrum, exact for a scalar field in free space.
+"""Free-space propagation of scalar fields by the angular spectrum method (exact).
 
-transfer            the phase that each spatial frequency collects on the way
-propagate           a field carried over a distance
-require_sampling    refuse grids on which the above would lie (optics.md 2.2)
+transfer            transfer function: phase of each spatial frequency over a distance
+propagate           propagation of a field over a distance
+require_sampling    check of a grid against the sampling conditions (OPTICS.md 2.3)
 """
 
 import numpy as np
@@ -15,10 +15,10 @@ Field = NDArray[np.complex64]
 
 
 def transfer(samples: int, dx_um: float, wavelength_um: float, distance_um: float) -> Field:
-    """The phase that every spatial frequency collects over `distance_um`; evanescent waves end.
+    """Return the transfer function over `distance_um`, (samples, samples) complex64; 0 for evanescent waves.
 
-    Returns (samples, samples) complex64 in FFT order. The phase of the plane wave along the axis is left out:
-    no intensity can show it, and single precision would drown in its ten thousand turns.
+    Frequencies are in FFT order. The phase of the plane wave along the axis is left out: it does not change the
+    intensity, and its ten thousand periods would exhaust single precision.
     """
     f_per_um = fft.fftfreq(samples, dx_um)
     sine_squared = (wavelength_um * f_per_um[:, None]) ** 2 + (wavelength_um * f_per_um[None, :]) ** 2
@@ -29,7 +29,7 @@ def transfer(samples: int, dx_um: float, wavelength_um: float, distance_um: floa
 
 
 def propagate(field: Field, dx_um: float, wavelength_um: float, distance_um: float) -> Field:
-    """Carry a square complex field over a distance; energy is kept, and what leaves the window comes back in.
+    """Return a square complex field after a distance; energy is conserved, and light beyond the window wraps around.
 
     `field` is (n, n) with samples `dx_um` apart; so is the result. Goodman, Introduction to Fourier Optics, 3.10.
     """
@@ -42,10 +42,10 @@ def propagate(field: Field, dx_um: float, wavelength_um: float, distance_um: flo
 def require_sampling(
     samples: int, dx_um: float, *, wavelength_um: float, distance_um: float, aperture_um: float, angle_rad: float
 ) -> None:
-    """Refuse a grid that cannot carry rays of `angle_rad` from an aperture over a distance; SpecError names the rule.
+    """Raise SpecError for a grid that cannot represent rays up to `angle_rad` from an aperture over a distance.
 
-    optics.md 2.2: the steepest ray needs two samples per fringe, its landing place must lie in the window, and the
-    chirp of the transfer function must be sampled.
+    The conditions, one of which the message names (OPTICS.md 2.3): two samples per fringe of the steepest ray, its end
+    point inside the window, and a sampled chirp of the transfer function.
     """
     if dx_um > wavelength_um / (2 * angle_rad):
         raise SpecError(

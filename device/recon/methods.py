@@ -1,109 +1,119 @@
-"""The solvers by name, with what they cost: asked before they run, printed by `diffuscope methods`."""
+"""Table of the built-in deconvolution methods: name, description, cost in FFT pairs, memory (`diffuscope methods`).
 
-from collections.abc import Callable
+The methods of installed packages are added by `installed_methods`, and only where a researcher's command asks for them.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from device.errors import SettingError
-from device.recon.closed import GRADIENT, TIKHONOV, ClosedForm
-from device.recon.geometry import Grid, Pair
-from device.recon.model import Model, periodic_model, tight_model
-from device.recon.openfield import OpenField
-from device.recon.plan import Planner, RealFft
-from device.recon.prepare import Linear
-from device.recon.variation import EvidenceWiener, Variation
-from device.values import Calibration, Image
-
-
-class Solver(Protocol):
-    """One planned way from a linear frame to a picture; the caller owns the loop, and so the clock.
-
-    `inbox` is where it would like to find the frame, if it matters to it: there nothing has to be copied.
-    """
-
-    model: Model
-    inbox: Image | None
-    facts: dict[str, Any]
-    rounds: int
-
-    def refocus(self) -> None:
-        """Measure anew what depends on the model's OTF, which has changed."""
-
-    def start(self, frame: Linear) -> None:
-        """Take a frame and make a first picture."""
-
-    def step(self) -> None:
-        """Make it better by one round; called at most `rounds` times."""
-
-    def finish(self, out: Image) -> None:
-        """Write the picture on the grid into `out`."""
+from device.recon.method_settings import (
+    MU,
+    PRIOR_LOG_POWER,
+    PRIOR_SLOPE,
+    TAU,
+    ConfigurableSolver,
+    Setting,
+    Settings,
+    check_settings,
+)
+from device.recon.model.fft_plans import Planner, RealFft
+from device.recon.model.forward_model import Model, periodic_model, tight_model
+from device.recon.model.grid import Grid, Pair
+from device.recon.solvers.solver import Solver
+from device.recon.solvers.tv import EvidenceWiener, TotalVariation
+from device.recon.solvers.tv_open_field import OpenFieldTotalVariation
+from device.recon.solvers.wiener import GRADIENT, TIKHONOV, ClosedForm
+from device.values import Calibration
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way from a frame to a picture: its name, one sentence, its cost in real FFT pairs, and how it is built.
+    """Description of one method: name, one sentence, cost in real FFT pairs, and the constructor of its solver.
 
-    `start_pairs` are those of the first picture, `round_pairs` those of each of `rounds` further rounds; `images`
-    counts the float32 arrays of the grid that it holds.
+    An FFT pair is one forward and one inverse FFT. `start_pairs` are the pairs of `Solver.start`, `round_pairs` those
+    of each round, `rounds` the default number of rounds; both are 0 for a closed form. `images`: number of float32
+    arrays of the grid's shape that the solver holds. `periodic`: the grid has the size of the sensor
+    (`periodic_model`), else a margin (`tight_model`). `build` is called once per stage, before the first frame.
+    `settings`: the parameters that a user may set; the solver of a method with settings has `configure`.
     """
 
     name: str
     sentence: str
-    start_pairs: int
-    round_pairs: int
-    rounds: int
-    images: int
-    periodic: bool
     build: Callable[[Model, Calibration, Planner], Solver]
+    start_pairs: int = 1
+    round_pairs: int = 0
+    rounds: int = 0
+    images: int = 6
+    periodic: bool = False
+    settings: tuple[Setting, ...] = ()
+
+    def solver(self, model: Model, calibration: Calibration, planner: Planner, settings: Settings) -> Solver:
+        """Return the planned solver with these settings; SettingError for an unknown name or a value out of range."""
+        check_settings(self.name, self.settings, settings)
+        solver = self.build(model, calibration, planner)
+        if settings:
+            if not isinstance(solver, ConfigurableSolver):
+                raise SettingError(f"the solver of '{self.name}' takes no settings", "Leave the settings out.")
+            solver.configure(settings)
+        return solver
 
     def model(self, calibration: Calibration, shape: Pair, n: int, planner: Planner, index: int) -> Model:
-        """The model that it works on."""
+        """Return the forward model for a sensor of `shape` (rows, cols), n x n pixels per sample and PSF `index`."""
         return (periodic_model if self.periodic else tight_model)(calibration, shape, n, planner, index)
 
     @property
     def fft_pairs(self) -> int:
-        """All FFT pairs of a full solution."""
+        """Number of real FFT pairs (forward plus inverse) of a solution with all `rounds` rounds."""
         return self.start_pairs + self.rounds * self.round_pairs
 
     def memory_bytes(self, grid: Grid) -> int:
-        """What its arrays take on a grid: dark, gain and picture of the sensor, the plans, and its own images."""
+        """Return the bytes of all arrays on a grid: dark, gain and picture of the sensor, the FFT plans, the images."""
         sensor = 4 * grid.sensor[0] * grid.sensor[1]
         plans = (1 + (self.round_pairs > 0)) * RealFft.memory_bytes(grid.shape)
         return 3 * sensor + plans + 4 * self.images * grid.size
 
 
-METHODS = {
+METHODS: Mapping[str, Method] = {
     method.name: method
     for method in (
         Method(
             "tikhonov", "the paper's closed form: periodic, L2 prior, mu by cross-validation",
-            1, 0, 0, 6, True, lambda model, _, __: ClosedForm(model, TIKHONOV),
+            lambda model, _, __: ClosedForm(model, TIKHONOV), start_pairs=1, images=6, periodic=True, settings=(MU,),
         ),
         Method(
             "gradient", "flat field taken out first, gradient prior with an L2 floor, mu by cross-validation",
-            1, 0, 0, 6, False, lambda model, _, __: ClosedForm(model, GRADIENT),
+            lambda model, _, __: ClosedForm(model, GRADIENT), start_pairs=1, images=6, settings=(MU,),
         ),
         Method(
             "evidence", "shading taken out first, Wiener filter with the prior that the frame's evidence supports",
-            2, 0, 0, 12, False, lambda model, calibration, _: EvidenceWiener(model, calibration),
+            lambda model, calibration, _: EvidenceWiener(model, calibration), start_pairs=2, images=12,
+            settings=(PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
         Method(
             "variation", "crop-aware, noise-weighted total variation, positive; starts from `evidence`",
-            3, 2, Variation.rounds, 22, False,
-            lambda model, calibration, planner: Variation(model, calibration, planner),
+            lambda model, calibration, planner: TotalVariation(model, calibration, planner),
+            start_pairs=3, round_pairs=2, rounds=TotalVariation.rounds, images=22,
+            settings=(TAU, PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
         Method(
             "open", "the same where no field is known: weights and tau from what the frame itself leaves open",
-            4, 2, OpenField.rounds, 22, False,
-            lambda model, calibration, planner: OpenField(model, calibration, planner),
+            lambda model, calibration, planner: OpenFieldTotalVariation(model, calibration, planner),
+            start_pairs=4, round_pairs=2, rounds=OpenFieldTotalVariation.rounds, images=22,
+            settings=(TAU, PRIOR_SLOPE, PRIOR_LOG_POWER),
         ),
     )
 }  # fmt: skip
 DEFAULT = "variation"
 
 
-def method_named(name: str) -> Method:
-    """The method of that name; SettingError lists what there is."""
-    if name not in METHODS:
-        raise SettingError(f"there is no method '{name}'", f"Choose one of: {', '.join(METHODS)}.")
-    return METHODS[name]
+def method_named(name: str, methods: Mapping[str, Method] = METHODS) -> Method:
+    """Return the method with that name from a table; SettingError lists the names of the table."""
+    if name not in methods:
+        raise unknown_method(name, methods)
+    return methods[name]
+
+
+def unknown_method(name: str, known: Iterable[str]) -> SettingError:
+    """Return the error for a method that does not exist; its remedy lists the `known` names."""
+    return SettingError(f"there is no method '{name}'", f"Choose one of: {', '.join(known)}.")

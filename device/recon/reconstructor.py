@@ -1,59 +1,85 @@
-"""From counts to a picture: a quick look at once, then rounds that make it better, none begun that cannot finish."""
+"""Reconstruction of a frame in stages by regularised deconvolution, anytime within a deadline.
+
+Every stage inverts the forward model y = crop(h * x) + b (`model.forward_model`) with one method of `methods`. The
+first stage (by default a coarse quick look) always runs. A later stage, and each round of an iterative solver, starts
+only if its measured cost fits into the time that is left.
+"""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import isfinite, isinf
-from typing import Any
 
 import numpy as np
 
 from device.clock import Clock, Deadline
 from device.errors import FrameError, SettingError
-from device.recon.defects import DefectFinder
-from device.recon.kernels import Pixels, Places
-from device.recon.methods import DEFAULT, Solver, method_named
-from device.recon.model import field_radius_px
-from device.recon.plan import Planner, Spectrum
-from device.recon.prepare import Preparer
-from device.recon.psf_consistency import Match, PsfConsistency
-from device.recon.quality import PRESUMED, complaints, explains, is_lit, is_measured, matched
-from device.recon.refraction import Refraction, Refractor, can_refract
-from device.recon.resolution import EMPTY, EMPTY_OPEN, working_bin
-from device.recon.upsample import to_sensor
+from device.recon.assessment.image_quality import (
+    NO_SIGNAL,
+    PSF_FIGURES,
+    Audience,
+    is_explained,
+    is_lit,
+    is_measured,
+    psf_match,
+    quality_warnings,
+)
+from device.recon.assessment.psf_consistency import Match, PsfConsistency
+from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.refraction import Refraction, RefractionEstimator, can_estimate_refraction
+from device.recon.methods import DEFAULT, METHODS, Method, method_named
+from device.recon.model.fft_plans import Planner, Spectrum
+from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.kernels import Pixels, Places
+from device.recon.model.preprocessing import Linear, Preprocessor
+from device.recon.model.resampling import to_sensor
+from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, working_bin
+from device.recon.solvers.solver import Diagnostics, Solver
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One rung of the ladder: a method and how many sensor pixels make one sample, n x n; at most `rounds` rounds."""
+    """Settings of one stage: method, binning (`bin` x `bin` sensor pixels per sample) and the largest number of rounds.
+
+    `rounds` None means the default of the method. `settings` are names and values of the method's `settings`; what is
+    not set is chosen from the frame.
+    """
 
     method: str = DEFAULT
     bin: int = 1
     rounds: int | None = None
+    settings: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A picture on the way: the recipe that made it, and the part that people look at, linear, on its own samples."""
+class StageResult:
+    """Result of one stage: settings, shown part of its picture (linear, on its grid), and if it is the last stage."""
 
     recipe: Recipe
     picture: Image
     last: bool
 
 
+@dataclass(frozen=True)
+class RoundDone:
+    """A round of the last stage is done: the consumer may do other work before it continues the iteration."""
+
+
+ROUND_DONE = RoundDone()
+Step = StageResult | RoundDone | Reconstruction  # what `Reconstructor.steps` yields
 ChannelFrame = tuple[Pixels, Pixels | None, Places | None]  # counts, dark frame, defective pixels
-Watcher = Callable[[Stage], None]
-Between = Callable[[], None]
 
 
-def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
-    """What the instrument climbs by itself: a quick look, then the best picture at the resolution the optics gives.
+def default_schedule(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> tuple[Recipe, Recipe]:
+    """Return the two default stages: a quick look, then the best picture at the resolution of the optics.
 
-    Where no field is known the object may be anywhere: then the solver is the one that doubts its model.
+    `shape` is (rows, cols) of the sensor, `index` the PSF. With a known field the methods are `evidence` and
+    `variation`, otherwise `gradient` and `open`. The second stage uses `working_bin`, reduced until the shorter side
+    has at least 64 samples; the first uses twice that bin, or the same if the side would have fewer than 16.
     """
     is_open = isinf(field_radius_px(calibration))
-    n = working_bin(calibration.psfs[index], EMPTY_OPEN if is_open else EMPTY)
+    n = working_bin(calibration.psfs[index], STOPBAND_SHARE_OPEN if is_open else STOPBAND_SHARE)
     while n > 1 and min(shape) // n < 64:
         n -= 1
     coarse = 2 * n if min(shape) // (2 * n) >= 16 else n
@@ -62,44 +88,49 @@ def ladder(calibration: Calibration, shape: tuple[int, int], index: int = 0) -> 
     return Recipe("evidence", coarse), Recipe("variation", n)
 
 
-class Cost:
-    """What something took lately, and so may take again: the worst of its last runs; the slowest press counts."""
+class DurationEstimate:
+    """Estimate of the duration of a step in seconds: the maximum of its last 12 measured durations."""
 
     def __init__(self) -> None:
         self._seen: deque[float] = deque(maxlen=12)
 
     def add(self, seconds: float) -> None:
-        """Remember one run."""
+        """Add the duration of one run."""
         self._seen.append(seconds)
 
     @property
     def seconds(self) -> float:
-        """The worst of the last dozen; nothing is known to be free."""
+        """Maximum of the last 12 durations; 0.0 before the first run."""
         return max(self._seen, default=0.0)
 
-    def doubt(self) -> None:
-        """Believe the worst run only half: what one bad moment made refused must get its chance again."""
+    def halve_maximum(self) -> None:
+        """Halve the largest stored duration; called when a step was skipped because it would miss the deadline.
+
+        A skipped step records no new duration, so a single slow run would otherwise block the step forever.
+        """
         if self._seen:
             self._seen[self._seen.index(self.seconds)] /= 2
 
 
-class _Rung:
-    """Everything that one recipe needs, planned: its preparer, its solver, its output, its cost."""
+class _Stage:
+    """Planned resources of one stage: forward model, preprocessor, solver, output arrays and cost estimates."""
 
-    def __init__(self, recipe: Recipe, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int):
-        method = method_named(recipe.method)
-        self.recipe = recipe
+    def __init__(
+        self, recipe: Recipe, method: Method, calibration: Calibration, shape: tuple[int, int], planner: Planner,
+        index: int,
+    ) -> None:  # fmt: skip
+        self.recipe, self.is_closed_form = recipe, method.rounds == 0
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
         self.scale = 1.0
-        self.solver: Solver = method.build(self.model, calibration, planner)
-        self.preparer = Preparer(calibration, self.grid, self.solver.inbox)
-        self.most = self.solver.rounds if recipe.rounds is None else recipe.rounds
+        self.solver: Solver = method.solver(self.model, calibration, planner, dict(recipe.settings))
+        self.preparer = Preprocessor(calibration, self.grid, self.solver.input_buffer)
+        self.most = method.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
-        self.start_cost, self.round_cost, self.finish_cost = Cost(), Cost(), Cost()
+        self.start_cost, self.round_cost, self.finish_cost = DurationEstimate(), DurationEstimate(), DurationEstimate()
 
     def refocus(self, otf: Spectrum, scale: float) -> None:
-        """See from now on through the OTF of the PSF stretched by `scale`."""
+        """Use `otf`, the OTF of the PSF scaled by `scale`, from the next `solver.start` on; no-op if in use."""
         self.scale = scale
         if otf is not self.model.otf:
             self.model.refocus(otf)
@@ -107,114 +138,137 @@ class _Rung:
 
     @property
     def picture(self) -> Image:
-        """What was solved last: (rows, cols) or (rows, cols, 3) of the grid."""
+        """Last solution: (rows, cols) or (rows, cols, 3) of the grid."""
         return self.planes[0] if len(self.planes) == 1 else np.moveaxis(self.planes, 0, -1)
 
-    def doubt(self) -> None:
-        """It was refused: let its costs age, so that one bad moment does not refuse it for ever."""
+    def halve_costs(self) -> None:
+        """Halve the cost estimates after the stage was skipped; one slow run would otherwise block it forever."""
         for cost in (self.start_cost, self.round_cost, self.finish_cost):
-            cost.doubt()
+            cost.halve_maximum()
 
     @property
     def shown(self) -> Image:
-        """The part of it that people look at."""
+        """The field of view in the picture: `picture` cropped to `grid.shown`."""
         return self.picture[self.grid.shown]
 
 
 class Reconstructor:
-    """Plans once for a calibration and a sensor shape; then turns frames into pictures within a deadline.
+    """Reconstruction of the frames of one calibration and one sensor shape; all planning is done at construction.
 
-    `recipes` run in order; the last is the wanted picture, those before it are quick looks. One thread at a time.
-    `timed` measures on noise what every step costs, before the first deadline; without deadlines leave it.
-    `consistency` is asked about each frame's PSF, outside the deadline: for files, where seconds do not matter.
-    With `refract`, where geometry and field are known, the frame tells the eye's refraction after the quick look, and
-    what follows is solved with the PSF of that eye.
+    `recipes` (empty: `default_schedule`) run in order; the last gives the final picture, the earlier ones quick looks.
+    Not thread-safe: one thread at a time. `timed` measures the cost of every step on noise, before the first deadline;
+    False saves this time where no deadline is used. `consistency` tests the PSF on each frame, outside the deadline
+    (for files). `audience`: the reader of the warnings. With `refract`, and with known geometry and field, the
+    refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF scaled
+    accordingly, or the stored PSF if there is no reliable estimate. `methods`: the table in which the recipes' methods
+    are looked up. SettingError if a bin is below 1, or for a method that the table does not have.
     """
 
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
         recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
-        consistency: PsfConsistency | None = None, timed: bool = True,
+        consistency: PsfConsistency | None = None, timed: bool = True, methods: Mapping[str, Method] = METHODS,
+        audience: Audience = Audience.OPERATOR,
     ) -> None:  # fmt: skip
-        recipes = recipes or ladder(calibration, shape, psf_index)
+        recipes = recipes or default_schedule(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
             raise SettingError("a sample is made of at least one pixel")
         self.calibration, self.shape, self.clock, self.psf_index = calibration, shape, clock, psf_index
-        self.rungs = [_Rung(recipe, calibration, shape, planner, psf_index) for recipe in recipes]
+        self.stages = [
+            _Stage(recipe, method_named(recipe.method, methods), calibration, shape, planner, psf_index)
+            for recipe in recipes
+        ]
         self.defects = DefectFinder(calibration, shape, psf_index)
         self.refractor = None
-        if refract and can_refract(calibration):
-            self.refractor = Refractor(calibration, shape, planner, psf_index)
-        self._sharp = self.rungs[min(1, len(self.rungs) - 1) :]  # what is solved with the eye's own PSF
-        self._find_cost, self._refocus_cost = Cost(), Cost()
+        if refract and can_estimate_refraction(calibration):
+            self.refractor = RefractionEstimator(calibration, shape, planner, psf_index)
+        self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
+        self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
         self._consistency: PsfConsistency | None = None
+        self._audience = audience
         self._warm_up(timed)
         self._consistency = consistency  # noise needs no check
 
     def _warm_up(self, timed: bool) -> None:
-        """Run on noise, so that the first frame meets compiled code and touched memory and, `timed`, a known cost."""
+        """Run on noise to compile the kernels, touch the memory and, with `timed`, measure the cost of each step."""
         noise = np.random.default_rng(0).integers(100, 200, self.shape, dtype=np.uint16)
-        self(noise, rounds=1)  # compiles, where no compiled code is kept
+        self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
         if not timed:
             return
-        self(noise, np.zeros_like(noise), quick=True)  # with a dark frame it is other code
-        for rung in self.rungs:
-            rung.start_cost, rung.round_cost, rung.finish_cost = Cost(), Cost(), Cost()
-        self._find_cost = Cost()
+        self(noise, np.zeros_like(noise), quick=True)  # a dark frame selects another compiled signature
+        for stage in self.stages:
+            stage.start_cost, stage.round_cost, stage.finish_cost = (
+                DurationEstimate(),
+                DurationEstimate(),
+                DurationEstimate(),
+            )
+        self._find_cost = DurationEstimate()
         self(noise, rounds=2)
         for m_dpt in (1.0, None):
             self._refocus(m_dpt)
 
     def __call__(
-        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False,
-        deadline: Deadline | None = None, watch: Watcher | None = None, rounds: int | None = None, quick: bool = False,
-        between: Between | None = None,
+        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
+        rounds: int | None = None, quick: bool = False,
     ) -> Reconstruction:  # fmt: skip
-        """The best picture that fits: linear float32, rows x cols (x 3) of the sensor.
+        """Return the best picture that fits into `deadline`, and its report: the last one of `steps`."""
+        steps = self.steps(counts, dark, simulated=simulated, deadline=deadline, rounds=rounds, quick=quick)
+        (picture,) = deque(steps, maxlen=1)
+        assert isinstance(picture, Reconstruction)
+        return picture
 
-        `counts` and `dark` are uint16 or float32 (rows, cols) or (rows, cols, 3). The first rung always runs;
-        with `quick` nothing else does. `between` is called between two rounds of the last rung; the time that it takes
-        is given back, and it may take a quick look at another frame with this same reconstructor.
+    def steps(
+        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
+        rounds: int | None = None, quick: bool = False,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
+
+        The picture is linear float32, (rows, cols) or (rows, cols, 3) of the sensor; `counts` and `dark` are uint16 or
+        float32 of that shape. `simulated` is copied to the result. The first stage always runs; with `quick` it is the
+        only one. `rounds` limits the rounds of every stage. With several stages a ROUND_DONE follows each round of the
+        last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
+        called with `quick`. FrameError for another shape than that of the sensor, or if too many pixels are missing
+        (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
-        climb = _Climb(self, counts, dark, deadline, rounds, between if len(self.rungs) > 1 else None)
+        run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
-        for rung in self.rungs[:1] if quick else self.rungs:
-            if rung is self._sharp[0] and not quick:
-                self._focus(climb)
-            if not climb.up(rung):
+        for stage in self.stages[:1] if quick else self.stages:
+            if stage is self._refracted[0] and not quick:
+                self._estimate_refraction(run)
+            if not run.has_time_for(stage):
                 break
-            if watch is not None:
-                watch(Stage(rung.recipe, rung.shown, last=rung is self.rungs[-1]))
+            yield from run.solve(stage, pauses=stage is self.stages[-1] and len(self.stages) > 1)
+            yield StageResult(stage.recipe, stage.shown, last=stage is self.stages[-1])
         solved_s = self.clock.now_s()
-        picture = to_sensor(climb.done.picture, climb.done.grid)
+        picture = to_sensor(run.done.picture, run.done.grid)
         finished_s = self.clock.now_s()
-        climb.done.finish_cost.add(finished_s - solved_s)
-        solve_s = solved_s - begin_s - climb.focus_s - climb.away_s
-        seconds = {"solve": solve_s, "refract": climb.focus_s, "upsample": finished_s - solved_s}
-        return Reconstruction(picture, self._report(climb, seconds), simulated)
+        run.done.finish_cost.add(finished_s - solved_s)
+        solve_s = solved_s - begin_s - run.refraction_s - run.between_s
+        seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
+        yield Reconstruction(picture, self._report(run, seconds), simulated)
 
-    def _focus(self, climb: "_Climb") -> None:
-        """Ask the frame for the eye's refraction if time allows, and see through the PSF of that eye."""
+    def _estimate_refraction(self, run: "_Run") -> None:
+        """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's."""
         begin_s = self.clock.now_s()
         if self.refractor is None:
             return
-        if climb.fits(self._find_cost.seconds + self._refocus_cost.seconds + climb.cost_s(self._sharp[0])):
-            climb.refraction = self.refractor.find(*climb.brightest())
+        if run.fits(self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])):
+            run.refraction = self.refractor.find(*run.brightest())
             self._find_cost.add(self.clock.now_s() - begin_s)
-        self._refocus(climb.sharp_dpt)
-        climb.focus_s = self.clock.now_s() - begin_s
+        self._refocus(run.selected_dpt)
+        run.refraction_s = self.clock.now_s() - begin_s
 
     def _refocus(self, m_dpt: float | None) -> None:
-        """The PSF of an eye with mean sphere M from now on; None: the stored one."""
+        """Set the OTF of the later stages to an eye with mean sphere `m_dpt`; None selects the stored PSF."""
         if self.refractor is None:
             return
         begin_s = self.clock.now_s()
-        for rung in self._sharp:
+        for stage in self._refracted:
             if m_dpt is None:
-                rung.refocus(rung.model.stored, 1.0)
+                stage.refocus(stage.model.stored, 1.0)
             else:
-                rung.refocus(self.refractor.otf(rung.grid, m_dpt), self.refractor.scale(m_dpt))
+                stage.refocus(self.refractor.otf(stage.grid, m_dpt), self.refractor.scale(m_dpt))
         if m_dpt is not None:
             self._refocus_cost.add(self.clock.now_s() - begin_s)
 
@@ -225,73 +279,84 @@ class Reconstructor:
                 f"the frame has {counts.shape[:2]} pixels, the calibration {self.shape}", "Use the head's own PSF."
             )
 
-    def _report(self, climb: "_Climb", seconds: dict[str, float]) -> Report:
-        recipe, facts = climb.done.recipe, climb.facts
-        dark = not facts["mean_dn"] > 0 or facts["noise_dn"] == 0
-        quality = {key: facts[key] for key in ("saturated", "missing", "mean_dn")} | facts.get("quality", {})
-        misfit = facts.get("residual") if isfinite(field_radius_px(self.calibration)) else None
-        match, eye = matched(quality), climb.refraction
+    def _report(self, run: "_Run", seconds: dict[str, float]) -> Report:
+        assert run.solved is not None
+        recipe, diagnostics, frame = run.done.recipe, run.solved.diagnostics, run.solved.frame
+        dark = not frame.mean_dn > 0 or diagnostics.noise_dn == 0
+        quality: dict[str, float | None] = {
+            "saturated": frame.saturated, "missing": frame.missing, "mean_dn": frame.mean_dn, **diagnostics.quality,
+        }  # fmt: skip
+        misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
+        match, eye = psf_match(quality), run.refraction
         if self._consistency is not None and not dark:
-            figures = self._consistency(climb.counts, climb.psf_scale, climb.known_defects)
-            quality |= {} if figures is None else figures.facts
+            figures = self._consistency(run.counts, run.psf_scale, run.known_defects)
+            quality |= {} if figures is None else figures.report_figures
             match = Match.UNKNOWN if figures is None else figures.match
-        warnings = ("There is no signal in this frame.",) if dark else complaints(quality, match, misfit)
-        explained = not dark and explains(quality, match, misfit)
+        warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience)
+        explained = not dark and is_explained(quality, match, misfit)
         if not (explained and is_lit(quality)):
             eye = None
-        quality |= {key: None for key in PRESUMED if key in quality and not (explained and is_measured(key, quality))}
+        quality |= {
+            key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
+        }
         if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
-        apart = ("saturated", "missing", "mean_dn", "noise_dn", "residual", "quality")
         return Report(
-            method=recipe.method, bin=recipe.bin, rounds=climb.rounds_done, stopped=climb.stopped, seconds=seconds,
-            psf_index=self.psf_index, psf_scale=climb.psf_scale,
+            method=recipe.method, bin=recipe.bin, rounds=run.rounds_done, stopped=run.stopped, seconds=seconds,
+            psf_index=self.psf_index, psf_scale=run.psf_scale,
             refraction_dpt=None if eye is None else {"sphere": -eye.sphere_dpt, "sd": eye.sd_dpt},
-            regularisation={k: v for k, v in facts.items() if k not in apart},
-            noise_dn=facts["noise_dn"] * recipe.bin, residual=facts.get("residual"),
+            regularisation=dict(diagnostics.regularisation),
+            noise_dn=None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin,
+            residual=diagnostics.residual,
             quality=quality, warnings=warnings,
         )  # fmt: skip
 
 
-class _Climb:
-    """One frame's way up the ladder, and what it met."""
+@dataclass(frozen=True)
+class _Solved:
+    """The last frame that a solver has solved, and its diagnostics."""
+
+    frame: Linear
+    diagnostics: Diagnostics
+
+
+class _Run:
+    """State of the reconstruction of one frame."""
 
     def __init__(
-        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None,
-        between: Between | None,
-    ) -> None:  # fmt: skip
+        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
+    ) -> None:
         self.clock, self.counts, self.dark = owner.clock, counts, dark
         self._defects = owner.defects
         self._found: dict[int, Places | None] = {}
-        self.deadline, self.most, self.between = deadline, most, between
-        self.last = owner.rungs[-1]
+        self.deadline, self.most = deadline, most
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
-        self.done: _Rung = owner.rungs[0]
-        self.facts: dict[str, Any] = {}
+        self.done: _Stage = owner.stages[0]
+        self.solved: _Solved | None = None  # None before the first stage
         self.rounds_done, self.stopped = 0, "done"
         self.refraction: Refraction | None = None
-        self.focus_s, self.away_s, self.psf_scale = 0.0, 0.0, 1.0
+        self.refraction_s, self.between_s, self.psf_scale = 0.0, 0.0, 1.0
 
     @property
-    def sharp_dpt(self) -> float | None:
-        """The mean sphere with which to see on; None where the stored PSF is as good as any."""
+    def selected_dpt(self) -> float | None:
+        """Mean sphere M of the PSF for the later stages, in dpt; None for the stored PSF."""
         eye = self.refraction
         return None if eye is None or eye.in_doubt else eye.sphere_dpt
 
     def fits(self, cost_s: float) -> bool:
-        """Whether something of that cost fits into what is left."""
+        """Return True if a step of `cost_s` seconds fits into the time left, or if there is no deadline."""
         return self.deadline is None or self.deadline.fits(cost_s)
 
-    def cost_s(self, rung: _Rung) -> float:
-        """What a rung takes at the least."""
-        return self.channels * (rung.start_cost.seconds + rung.round_cost.seconds) + rung.finish_cost.seconds
+    def cost_s(self, stage: _Stage) -> float:
+        """Return the minimum duration of a stage in seconds: start, one round and finish, for all channels."""
+        return self.channels * (stage.start_cost.seconds + stage.round_cost.seconds) + stage.finish_cost.seconds
 
     def brightest(self) -> ChannelFrame:
-        """The channel with the most light."""
+        """Return counts, dark frame and defective pixels of the channel with the highest mean count."""
         return self.channel(0 if self.channels == 1 else int(np.argmax(np.nanmean(self.counts, axis=(0, 1)))))
 
     def channel(self, c: int) -> ChannelFrame:
-        """Counts, dark frame and defective pixels of one channel; the defects are searched once per frame."""
+        """Return counts, dark frame (or None) and defective pixels of channel `c`; defects are searched only once."""
         counts, dark = plane(self.counts, c), None if self.dark is None else plane(self.dark, c)
         if c not in self._found:
             self._found[c] = self._defects(counts, dark)
@@ -299,66 +364,74 @@ class _Climb:
 
     @property
     def known_defects(self) -> Places | None:
-        """The pixels that are defective in any channel that was solved."""
+        """Flat indices of the pixels that are defective in at least one solved channel; None if there are none."""
         found = [places for places in self._found.values() if places is not None]
         return np.unique(np.concatenate(found)) if found else None
 
-    def up(self, rung: _Rung) -> bool:
-        """Solve one rung, channel by channel; False if it does not fit into what is left, and what was solved stays."""
-        if self.facts and not self.fits(self.cost_s(rung)):
+    def has_time_for(self, stage: _Stage) -> bool:
+        """Return whether a stage runs: the first one always, a later one if there is time; else record the reason."""
+        if self.solved is not None and not self.fits(self.cost_s(stage)):
             self.stopped = "deadline"
-            rung.doubt()
+            stage.halve_costs()
             return False
-        if len(rung.planes) != self.channels:
-            rung.planes = np.zeros((self.channels, *rung.grid.shape), np.float32)
-        for c in range(self.channels):
-            self._channel(rung, c)
-        self.done = rung
-        self.psf_scale = rung.scale
         return True
 
-    def _channel(self, rung: _Rung, c: int) -> None:
+    def solve(self, stage: _Stage, pauses: bool) -> Iterator[RoundDone]:
+        """Solve one stage, channel by channel; with `pauses` yield ROUND_DONE after each round."""
+        if len(stage.planes) != self.channels:
+            stage.planes = np.zeros((self.channels, *stage.grid.shape), np.float32)
+        for c in range(self.channels):
+            yield from self._channel(stage, c, pauses)
+        self.done = stage
+        self.psf_scale = stage.scale
+
+    def _channel(self, stage: _Stage, c: int, pauses: bool) -> Iterator[RoundDone]:
+        """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""
         begin_s = self.clock.now_s()
-        frame = rung.preparer(*self.channel(c))
-        rung.solver.start(frame)
+        frame = stage.preparer(*self.channel(c))
+        stage.solver.start(frame)
         now_s = self.clock.now_s()
-        rung.start_cost.add(now_s - begin_s)
+        stage.start_cost.add(now_s - begin_s)
         self.stopped = "done"
-        most = rung.most if self.most is None else min(self.most, rung.most)
+        most = stage.most if self.most is None else min(self.most, stage.most)
         self.rounds_done = 0
-        while self.rounds_done < most - (rung.solver.rounds == 1):
-            if not self._fits_another(rung, self.channels - c):
+        while self.rounds_done < most and not stage.is_closed_form:
+            if not self._fits_another(stage, self.channels - c):
                 self.stopped = "deadline"
                 break
             begin_s = now_s
-            rung.solver.step()
+            stage.solver.step()
             now_s = self.clock.now_s()
-            rung.round_cost.add(now_s - begin_s)
+            stage.round_cost.add(now_s - begin_s)
             self.rounds_done += 1
-            if self.between is not None and rung is self.last:
-                now_s = self._rest(self.between, now_s)
-        rung.solver.finish(rung.planes[c])
-        self.facts = rung.solver.facts | {"saturated": frame.saturated, "missing": frame.missing}
+            if pauses:
+                yield ROUND_DONE
+                now_s = self._resume(now_s)
+        stage.solver.finish(stage.planes[c])
+        self.solved = _Solved(frame, stage.solver.diagnostics)
 
-    def _rest(self, between: Between, begin_s: float) -> float:
-        """Let others do something; the deadline moves by what they took. The time after it."""
-        between()
+    def _resume(self, paused_s: float) -> float:
+        """Move the deadline by the duration of a pause that began at `paused_s`, and return the present time."""
         now_s = self.clock.now_s()
-        self.away_s += now_s - begin_s
+        self.between_s += now_s - paused_s
         if self.deadline is not None:
-            self.deadline = self.deadline.later(now_s - begin_s)
+            self.deadline = self.deadline.later(now_s - paused_s)
         return now_s
 
-    def _fits_another(self, rung: _Rung, channels_left: int) -> bool:
-        """Whether one more round fits, when the channels that are still to come get as much time as this one."""
+    def _fits_another(self, stage: _Stage, channels_left: int) -> bool:
+        """Return True if one more round fits, with time for the remaining channels (as many rounds) and the finish."""
         if self.deadline is None:
             return True
-        others_s = (channels_left - 1) * (rung.start_cost.seconds + (self.rounds_done + 1) * rung.round_cost.seconds)
-        return self.deadline.fits(rung.round_cost.seconds + others_s + rung.finish_cost.seconds)
+        others_s = (channels_left - 1) * (stage.start_cost.seconds + (self.rounds_done + 1) * stage.round_cost.seconds)
+        return self.deadline.fits(stage.round_cost.seconds + others_s + stage.finish_cost.seconds)
 
 
 def plane(image: Pixels, c: int) -> Pixels:
-    """One channel, read-only: to compiled code that is part of the type, and only one of the two is compiled early."""
+    """Return channel `c` of (rows, cols, 3), or a whole (rows, cols) image, as a contiguous read-only array.
+
+    uint16 is kept, any other type becomes float32; the caller's array stays writeable. Read-only is part of the type in
+    compiled code, and only the read-only signature is compiled in advance.
+    """
     image = image if image.ndim == 2 else image[..., c]
     plane: Pixels
     if image.dtype == np.uint16:

@@ -1,57 +1,64 @@
-"""The simulated sensor: it reads what arrives in the shared world, with the noise of a real one."""
+"""Simulated camera, a noisy sensor model that reads the electrons of a `World`."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device.errors import CameraMissing, CameraStalled, FrameError
 from device.sim.world import World
-from device.values import Frame, Shot
+from device.values import ExposureSettings, Frame
 
-STALL_S = 1.0  # how long past its exposure a frame is waited for
+STALL_S = 1.0  # timeout of a frame after its exposure
 
 
 class SimCamera:
-    """A camera in a World: frames are numbered, fresh, and marked as simulated."""
+    """Simulated camera of `world`: frames are numbered from 1 and marked as simulated."""
 
     def __init__(self, world: World) -> None:
-        self._world = world
+        self.world = world
         self._open = True
         self._check()
 
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, cols) of every frame."""
-        return self._world.shape
+        return self.world.shape
 
-    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
-        """Take one frame whose exposure began after this call; `into` (rows, cols) is filled if it is given.
+    @property
+    def facts(self) -> dict[str, str]:
+        """Empty: a simulated sensor has no driver to report."""
+        return {}
 
-        Raises CameraMissing, CameraStalled, or FrameError if `into` does not fit.
+    def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
+        """Return one frame whose exposure began after this call; `into` (rows, cols) is filled if given.
+
+        Sleeps for the exposure time. Raises CameraMissing, CameraStalled, or FrameError if `into` does not fit. With
+        the fault "camera.mode" the counts are a new array of every other row and column.
         """
         self._check()
         if into is not None and (into.shape != self.shape or into.dtype != np.uint16):
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
-        world = self._world
+        world = self.world
         world.clock.sleep(shot.exposure_s)
-        if world.broken("camera.stalled"):
+        if world.has_fault("camera.stalled"):
             world.clock.sleep(STALL_S)
             raise CameraStalled(f"the simulated camera gave no frame within {shot.exposure_s + STALL_S:.2g} s")
         world.frames += 1
-        seed = (world.seed, world.frames)
+        seed = (world.scene.seed, world.frames)
         counts = world.sensor.read(world.electrons(shot.exposure_s), seed, into)
-        if world.broken("camera.mode"):
+        if world.has_fault("camera.mode"):
             counts = counts[::2, ::2].copy()
-        return Frame(counts, shot.exposure_s, world.frames, world.glow, simulated=True)
+        return Frame(counts, shot.exposure_s, world.frames, world.illumination, simulated=True)
 
-    def prepare(self, shot: Shot) -> None:
-        """Nothing to do: every exposure has its own time."""
+    def prepare(self, shot: ExposureSettings) -> None:
+        """Do nothing: every exposure sets its own time."""
 
     def close(self) -> None:
-        """Release the sensor; closing twice is harmless."""
+        """Close the camera, so that later exposures raise CameraMissing; idempotent."""
         self._open = False
 
     def _check(self) -> None:
+        """Raise CameraMissing if the camera is closed or has the fault "camera.missing"."""
         if not self._open:
             raise CameraMissing("the simulated camera has been closed")
-        if self._world.broken("camera.missing"):
+        if self.world.has_fault("camera.missing"):
             raise CameraMissing("the simulated camera does not answer")

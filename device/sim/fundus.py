@@ -1,9 +1,10 @@
-"""A retina that nobody has: vessels, disc, macula, choroid and lesions, drawn from a seed.
+"""Procedural fundus: vessels, optic disc, macula, choroid and lesions, drawn from a seed.
 
-    fundus      the picture, colour by colour, as reflectance
-    Fundus      what it returns: reflectances, vessels, field, where disc and fovea are
+    fundus      draws the retina, colour by colour, as reflectance
+    Fundus      its result: reflectances, vessels, field, places of disc and fovea
 
-Drawn as a right eye in degrees from the fovea; the left eye is its mirror image. Colours follow optics.md 3.7.
+Coordinates are degrees right and down from the fovea of a right eye; the left eye is its mirror image. Colours follow
+OPTICS.md 4.1. The disc is the optic disc.
 """
 
 from dataclasses import dataclass, field
@@ -19,10 +20,10 @@ from device.sim.strokes import draw
 from device.sim.vessels import DISC, Vessel, grow
 from device.values import Colour, Eye, Image, Mask
 
-LOOK = (5.2, -0.4)  # the middle of the picture, in degrees from the fovea: between macula and disc
+FIELD_CENTRE_DEG = (5.2, -0.4)  # centre of the picture, in degrees from the fovea: between macula and disc
 LEVEL: dict[Colour, float] = {"red": 0.049, "green": 0.0141, "blue": 0.0081}  # Delori & Pflibsen 1989, perifovea
 BLOOD: dict[Colour, float] = {"red": 0.08, "green": 0.55, "blue": 0.45}  # contrast of the widest vein
-ARTERY = 0.70  # of a vein's contrast: brighter blood
+ARTERY = 0.70  # contrast of arteries relative to veins: oxygenated blood is brighter
 MACULA: dict[Colour, float] = {"red": 0.16, "green": 0.30, "blue": 0.45}
 DISC_GAIN: dict[Colour, float] = {"red": 1.45, "green": 2.1, "blue": 2.6}
 EXUDATE: dict[Colour, float] = {"red": 0.25, "green": 0.6, "blue": 0.35}
@@ -33,7 +34,7 @@ COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 
 @dataclass(frozen=True)
 class Fundus:
-    """A retina as an object: reflectance per colour, float32 (rows, cols), zero outside the round field.
+    """Retina as an object: reflectance per colour, float32 (rows, cols), zero outside the round field.
 
     `vessels` (None: not known) and `field` are masks; `disc` and `fovea` are (row, col), None where not known.
     """
@@ -47,7 +48,7 @@ class Fundus:
 
 @dataclass(frozen=True)
 class Canvas:
-    """The pixels that hold the field, and where each of them is in degrees from the fovea."""
+    """Pixel grid of a drawing: `x` (1, cols) and `y` (rows, 1) are degrees right and down from the fovea."""
 
     shape: tuple[int, int]
     px_per_deg: float
@@ -56,28 +57,28 @@ class Canvas:
 
     @classmethod
     def of(cls, shape: tuple[int, int], px_per_deg: float) -> "Canvas":
-        """A canvas whose middle looks at LOOK."""
+        """Return a canvas of `shape` (rows, cols) centred on FIELD_CENTRE_DEG."""
         down, right = (((np.arange(n) - (n - 1) / 2) / px_per_deg).astype(np.float32) for n in shape)
-        return cls(shape, px_per_deg, (right + LOOK[0])[None, :], (down + LOOK[1])[:, None])
+        return cls(shape, px_per_deg, (right + FIELD_CENTRE_DEG[0])[None, :], (down + FIELD_CENTRE_DEG[1])[:, None])
 
     def at(self, x: float, y: float) -> tuple[float, float]:
-        """The (row, col) of a place."""
+        """Return the (row, col) of a place (x, y) in degrees from the fovea."""
         row, col = ((n - 1) / 2 for n in self.shape)
-        return row + (y - LOOK[1]) * self.px_per_deg, col + (x - LOOK[0]) * self.px_per_deg
+        return row + (y - FIELD_CENTRE_DEG[1]) * self.px_per_deg, col + (x - FIELD_CENTRE_DEG[0]) * self.px_per_deg
 
     def distance(self, x: float, y: float) -> Image:
-        """How far every pixel is from a place, in degrees."""
+        """Return the distance of every pixel from a place (x, y), degrees, (rows, cols)."""
         away: Image = np.hypot(self.x - np.float32(x), self.y - np.float32(y))
         return away
 
     def noise(self, rng: np.random.Generator, scale_deg: float) -> Image:
-        """Smooth noise of unit variance, correlated over `scale_deg`."""
+        """Return noise of zero mean and unit variance, smoothed by a Gaussian of sigma `scale_deg`."""
         raw = rng.standard_normal(self.shape, dtype=np.float32)
         return smooth(raw, scale_deg * self.px_per_deg)
 
 
 def smooth(raw: Image, sigma_px: float) -> Image:
-    """Noise smoothed by a Gaussian and brought back to unit variance; coarse noise is drawn small and enlarged."""
+    """Return noise smoothed by a Gaussian, zero mean, unit variance; a wide Gaussian uses a small part, enlarged."""
     shrink = max(1, int(sigma_px / 3))
     few = raw[: -(-raw.shape[0] // shrink) + 3, : -(-raw.shape[1] // shrink) + 3]
     soft = ndimage.gaussian_filter(few, sigma_px / shrink, mode="wrap")
@@ -88,7 +89,7 @@ def smooth(raw: Image, sigma_px: float) -> Image:
 
 
 def field_mask(shape: tuple[int, int], radius_px: float) -> Mask:
-    """The round field in the middle of `shape`."""
+    """Return the mask of the round field in the middle of `shape` (rows, cols)."""
     return _radius(shape) <= radius_px
 
 
@@ -103,19 +104,21 @@ def fundus(
     microaneurysms: int = 0,
     exudates: int = 0,
 ) -> Fundus:
-    """Draw one retina in the middle of `shape` (rows, cols): the same for the same arguments.
+    """Return one retina drawn in the middle of `shape` (rows, cols), reproducible by its arguments.
 
-    The field is a disc of radius px_per_deg * field_deg / 2 (small angle, as in values.Geometry); what does not fit
-    into `shape` is left out. Reflectances are fractions of the light, about 0.01 in green.
+    The field is a disc of radius px_per_deg * field_deg / 2 (small angle, as in values.Geometry), cropped to `shape`.
+    Reflectances are fractions of the light, about 0.01 in green.
     """
     radius_px = px_per_deg * field_deg / 2
     wide = int(np.ceil(2 * radius_px)) + 2
-    size = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # middles of canvas and shape fall together
+    size = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # centres of canvas and shape coincide
     canvas = Canvas.of(size, px_per_deg)
     rng = np.random.default_rng((seed, 2))
-    vessels = grow(seed, field_deg / 2 + 1, LOOK)
-    ill = np.random.default_rng((seed, 3))  # lesions change nothing but themselves
-    lesions = scatter(canvas.x, canvas.y, ill, field_deg / 2, LOOK, haemorrhages, microaneurysms, exudates)
+    vessels = grow(seed, field_deg / 2 + 1, FIELD_CENTRE_DEG)
+    lesion_rng = np.random.default_rng((seed, 3))  # separate stream: lesions leave the rest of the picture unchanged
+    lesions = scatter(
+        canvas.x, canvas.y, lesion_rng, field_deg / 2, FIELD_CENTRE_DEG, haemorrhages, microaneurysms, exudates
+    )
     planes, mask = _paint(canvas, vessels, lesions, rng)
     edge = np.clip(radius_px + 0.5 - _radius(size), 0, 1)
     for colour in COLOURS:
@@ -128,7 +131,7 @@ def fundus(
 def _paint(
     canvas: Canvas, vessels: list[Vessel], lesions: Lesions, rng: np.random.Generator
 ) -> tuple[dict[Colour, Image], Mask]:
-    """The reflectances on the canvas before the field's edge, and the mask of the vessels."""
+    """Return the reflectances on the canvas, not yet cropped by the round field, and the mask of the vessels."""
     veins = draw([v for v in vessels if v.kind == "vein"], canvas.shape, canvas.px_per_deg, canvas.at)
     arteries = draw([v for v in vessels if v.kind == "artery"], canvas.shape, canvas.px_per_deg, canvas.at, reflex=0.4)
     ground = _ground(canvas, rng)
@@ -144,9 +147,9 @@ def _paint(
 
 
 def _ground(canvas: Canvas, rng: np.random.Generator) -> dict[Colour, Image]:
-    """The tissue without vessels and disc, about 1: shading, choroid, grain, macula and fovea."""
+    """Return the relative brightness of the tissue per colour, about 1, without retinal vessels and optic disc."""
     fovea = canvas.distance(0, 0)
-    shade = 1 + 0.04 * canvas.noise(rng, 4.5) - 0.0006 * canvas.distance(*LOOK) ** 2
+    shade = 1 + 0.04 * canvas.noise(rng, 4.5) - 0.0006 * canvas.distance(*FIELD_CENTRE_DEG) ** 2
     web = _choroid(canvas, rng)
     grain = 0.5 * canvas.noise(rng, 0.07) + 0.5 * canvas.noise(rng, 0.25)
     nerve = 0.16 * np.exp(-((canvas.distance(DISC[0] - 0.5, DISC[1]) / 5.5) ** 2))
@@ -160,7 +163,7 @@ def _ground(canvas: Canvas, rng: np.random.Generator) -> dict[Colour, Image]:
 
 
 def _choroid(canvas: Canvas, rng: np.random.Generator) -> Image:
-    """The web of choroidal vessels that shines through: ridges of smooth noise, weaker under the macula."""
+    """Return the pattern of the choroidal vessels, about -0.7 to 0.9: ridges of smooth noise, weaker at the macula."""
     ridges = (
         np.exp(-((canvas.noise(rng, 0.8) / 0.55) ** 2)) + 0.6 * np.exp(-((canvas.noise(rng, 0.45) / 0.5) ** 2)) - 0.7
     )
@@ -169,7 +172,7 @@ def _choroid(canvas: Canvas, rng: np.random.Generator) -> Image:
 
 
 def _disc(canvas: Canvas, rng: np.random.Generator) -> tuple[Image, Image]:
-    """How much of a pixel is optic disc, and how much cup, 0 to 1; the rim is paler on the temporal side."""
+    """Return the shares of optic disc and cup per pixel, 0 to 1; the rim is paler on the temporal side."""
     x, y = canvas.x - np.float32(DISC[0]), canvas.y - np.float32(DISC[1])
     angle = np.arctan2(y, x)
     wobble = 1 + 0.025 * np.cos(2 * angle + rng.uniform(0, 6)) + 0.015 * np.cos(3 * angle + rng.uniform(0, 6))
@@ -183,13 +186,14 @@ def _disc(canvas: Canvas, rng: np.random.Generator) -> tuple[Image, Image]:
 
 
 def _radius(shape: tuple[int, int]) -> Image:
+    """Return the distance of every pixel from the centre, px."""
     rows, cols = (np.arange(size, dtype=np.float32) - np.float32((size - 1) / 2) for size in shape)
     radius: Image = np.hypot(rows[:, None], cols[None, :])
     return radius
 
 
 def _placed(plane: NDArray[Any], shape: tuple[int, int], eye: Eye) -> NDArray[Any]:
-    """The plane in the middle of `shape`, mirrored for a left eye; what does not fit is cut off."""
+    """Return the plane centred in an array of `shape`, cropped or zero-padded, mirrored for a left eye."""
     out = np.zeros(shape, plane.dtype)
     rows, cols = (_overlap(*sizes) for sizes in zip(plane.shape, shape, strict=True))
     out[rows[1], cols[1]] = (plane if eye == "OD" else plane[:, ::-1])[rows[0], cols[0]]
@@ -197,13 +201,13 @@ def _placed(plane: NDArray[Any], shape: tuple[int, int], eye: Eye) -> NDArray[An
 
 
 def _overlap(size: int, wanted: int) -> tuple[slice, slice]:
-    """Which part of `size` lies in `wanted`, and where, when their middles agree."""
+    """Return the overlap of two ranges with one centre, of `size` and `wanted` pixels, as a slice of each."""
     first = (wanted - size) // 2
     kept = min(size, wanted)
     return slice(max(-first, 0), max(-first, 0) + kept), slice(max(first, 0), max(first, 0) + kept)
 
 
 def _moved(place: tuple[float, float], size: tuple[int, int], shape: tuple[int, int], eye: Eye) -> tuple[float, float]:
-    """The (row, col) on `shape` of a place on the canvas."""
+    """Return the (row, col) on `shape` of a (row, col) on the canvas of `size`, mirrored for a left eye."""
     row, col = (p + (wanted - n) // 2 for p, n, wanted in zip(place, size, shape, strict=True))
     return row, col if eye == "OD" else shape[1] - 1 - col

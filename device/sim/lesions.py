@@ -1,4 +1,4 @@
-"""What diabetes leaves on a retina: dots and blots of blood, and hard exudates."""
+"""Lesions of diabetic retinopathy: microaneurysms, haemorrhages and hard exudates."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from device.values import Image
 
 @dataclass(frozen=True)
 class Lesions:
-    """Blood outside the vessels, and lipid: both 0 to 1, (rows, cols)."""
+    """Coverage by blood outside the vessels (`dark`) and by lipid (`bright`), 0 to 1, (rows, cols)."""
 
     dark: Image
     bright: Image
@@ -25,28 +25,30 @@ def scatter(
     microaneurysms: int,
     exudates: int,
 ) -> Lesions:
-    """Strew lesions over the posterior pole; `x` (1, cols) and `y` (rows, 1) are degrees from the fovea.
+    """Return lesions at random places of the field; `x` (1, cols) and `y` (rows, 1) are degrees from the fovea.
 
-    Microaneurysms are dots of 0.15 to 0.3 degrees, haemorrhages blots of up to two, exudates lie in rings and heaps.
+    The field has the radius `reach_deg` and its centre at `centre`, degrees from the fovea. Microaneurysms are dots 0.2
+    to 0.3 degrees wide, haemorrhages blots of up to two degrees; exudates lie on a ring of about 1.3 degrees radius
+    around one random place.
     """
     dark = np.zeros((y.size, x.size), np.float32)
     bright = np.zeros_like(dark)
     for _ in range(haemorrhages):
-        _blot(dark, x, y, rng, _somewhere(rng, reach_deg, centre, 2.5), rng.uniform(0.3, 0.85), 0.85, rough=0.17)
+        _blot(dark, x, y, rng, _random_place(rng, reach_deg, centre, 2.5), rng.uniform(0.3, 0.85), 0.85, rough=0.17)
     for _ in range(microaneurysms):
-        _blot(dark, x, y, rng, _somewhere(rng, reach_deg, centre, 1.6), rng.uniform(0.09, 0.17), 0.75, rough=0.05)
-    heart = _somewhere(rng, 0.35 * reach_deg, (0.0, 0.0), 2.5)
+        _blot(dark, x, y, rng, _random_place(rng, reach_deg, centre, 1.6), rng.uniform(0.09, 0.17), 0.75, rough=0.05)
+    cluster = _random_place(rng, 0.35 * reach_deg, (0.0, 0.0), 2.5)
     for _ in range(exudates):
         turn, far = rng.uniform(0, 2 * np.pi), abs(rng.normal(1.3, 0.45))
-        place = (heart[0] + far * np.cos(turn), heart[1] + far * np.sin(turn))
+        place = (cluster[0] + far * np.cos(turn), cluster[1] + far * np.sin(turn))
         _blot(bright, x, y, rng, place, rng.uniform(0.1, 0.32), rng.uniform(0.7, 1), rough=0.25)
     return Lesions(dark, bright)
 
 
-def _somewhere(
+def _random_place(
     rng: np.random.Generator, reach_deg: float, centre: tuple[float, float], from_fovea: float
 ) -> tuple[float, float]:
-    """A place in the field, not in the disc (15 degrees nasal) and not closer to the fovea than asked."""
+    """Return a random (x, y) in the field, off the optic disc and more than `from_fovea` degrees from the fovea."""
     for _ in range(100):
         far, turn = 0.92 * reach_deg * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
         x, y = centre[0] + far * np.cos(turn), centre[1] + far * np.sin(turn)
@@ -65,7 +67,7 @@ def _blot(
     strength: float,
     rough: float,
 ) -> None:
-    """Add one spot with an uneven outline, at most 1."""
+    """Merge one spot with an irregular outline into the coverage `onto`, in place, as the pixel-wise maximum."""
     lean, turn = rng.uniform(0.7, 1), rng.uniform(0, np.pi)
     waves = rng.normal(0, rough, 3) / np.array([1, 1.5, 2])
     phases = rng.uniform(0, 2 * np.pi, 3)

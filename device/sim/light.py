@@ -1,115 +1,100 @@
-"""The simulated LED ring: it lights the shared world, and nothing else."""
+"""Simulated LED ring, and a real LED ring whose state a simulated camera uses."""
 
+from collections.abc import Callable
 from types import TracebackType
 
 from device.errors import LightFault
-from device.ports import Light, Lit
+from device.ports import Light
 from device.sim.world import World
-from device.values import Glow
+from device.values import Illumination
+
+
+class LampContext:
+    """Context manager during which a lamp is on: calls `turn_on` on entry, and `turn_off` at every exit."""
+
+    def __init__(self, turn_on: Callable[[], None], turn_off: Callable[[], None]) -> None:
+        self._turn_on, self._turn_off = turn_on, turn_off
+
+    def __enter__(self) -> "LampContext":
+        """Turn the lamp on."""
+        self._turn_on()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Turn the lamp off, also after an exception."""
+        self._turn_off()
 
 
 class SimLight:
-    """A lamp in a World; dark unless a context holds it on."""
+    """Simulated lamp of a World; dark outside a context of `on`."""
 
     def __init__(self, world: World) -> None:
         self._world = world
 
     @property
-    def glow(self) -> Glow | None:
-        """What it shines now; None when it is dark."""
-        return self._world.glow
+    def illumination(self) -> Illumination | None:
+        """Present illumination; None when dark."""
+        return self._world.illumination
 
-    def on(self, glow: Glow) -> "SimLit":
-        """Shine from the entry of the returned context to its end; a context that is never entered stays dark.
+    def on(self, illumination: Illumination) -> LampContext:
+        """Return a context during which the lamp is on; a context that is never entered stays dark.
 
-        Raises LightFault while the world's fault "light.fault" lasts, and is then dark.
+        LightFault, here or on entry, while the fault "light.fault" is active; the lamp is then dark. LightFault on
+        entry while "light.silent" is active.
         """
         self.check()
-        return SimLit(self, glow)
+        return LampContext(lambda: self._turn_on(illumination), self.off)
 
     def off(self) -> None:
-        """Be dark; always allowed, harmless when it is dark already.
+        """Turn the lamp off; idempotent.
 
-        LightFault while the world's fault "light.silent" lasts: LEDs keep their last colour when nobody reaches them.
+        LightFault while the fault "light.silent" is active: LEDs that receive no command keep their last colour.
         """
-        self._hear()
-        self._world.glow = None
+        self._refuse_if_silent()
+        self._world.illumination = None
 
-    def _hear(self) -> None:
-        if self._world.broken("light.silent"):
+    def _refuse_if_silent(self) -> None:
+        """Raise LightFault while the fault "light.silent" is active: commands do not reach the LEDs."""
+        if self._world.has_fault("light.silent"):
             raise LightFault("the simulated lamp does not hear what it is told")
 
-    def shine(self, glow: Glow) -> None:
-        """Shine now; for the context only."""
+    def _turn_on(self, glow: Illumination) -> None:
+        """Turn the lamp on; LightFault while "light.fault" or "light.silent" is active."""
         self.check()
-        self._hear()
-        self._world.glow = glow
+        self._refuse_if_silent()
+        self._world.illumination = glow
 
     def check(self) -> None:
-        """Raise LightFault, dark, if the ring is broken."""
-        if self._world.broken("light.fault"):
+        """Turn the lamp off and raise LightFault while the fault "light.fault" is active."""
+        if self._world.has_fault("light.fault"):
             self.off()
             raise LightFault("the simulated lamp does not answer")
 
 
-class SimLit:
-    """The time in which the lamp shines."""
-
-    def __init__(self, light: SimLight, glow: Glow) -> None:
-        self._light = light
-        self._glow = glow
-
-    def __enter__(self) -> "SimLit":
-        """The lamp is on."""
-        self._light.shine(self._glow)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """The lamp is off, whatever happened."""
-        self._light.off()
-
-
-class Mirrored:
-    """A real lamp in front of a simulated camera: the world sees what the lamp was told to show."""
+class MirroredLight:
+    """Real lamp whose illumination is copied to the `World` of a simulated camera."""
 
     def __init__(self, lamp: Light, world: World) -> None:
         self._lamp, self._world = lamp, world
 
     @property
-    def glow(self) -> Glow | None:
-        """What it shines now; None when it is dark."""
-        return self._lamp.glow
+    def illumination(self) -> Illumination | None:
+        """Present illumination; None when dark."""
+        return self._lamp.illumination
 
-    def on(self, glow: Glow) -> Lit:
-        """Shine from the entry of the returned context to its end, lamp and world together."""
-        return MirroredLit(self, self._lamp.on(glow))
+    def on(self, illumination: Illumination) -> LampContext:
+        """Return a context during which the lamp is on, in hardware and in the World."""
+        lit = self._lamp.on(illumination)
+
+        def turn_on() -> None:
+            lit.__enter__()
+            self._world.illumination = self._lamp.illumination
+
+        return LampContext(turn_on, self.off)
 
     def off(self) -> None:
-        """Be dark."""
-        self._world.glow = None
+        """Turn the lamp off, in hardware and in the World."""
+        self._world.illumination = None
         self._lamp.off()
-
-    def reflect(self) -> None:
-        """The world sees what the lamp shows; for the context only."""
-        self._world.glow = self._lamp.glow
-
-
-class MirroredLit:
-    """The time in which both shine."""
-
-    def __init__(self, light: Mirrored, lit: Lit) -> None:
-        self._light, self._lit = light, lit
-
-    def __enter__(self) -> "MirroredLit":
-        """The lamp is on."""
-        self._lit.__enter__()
-        self._light.reflect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """The lamp is off, whatever happened."""
-        self._light.off()

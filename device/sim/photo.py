@@ -1,4 +1,4 @@
-"""A photograph of a retina as the object behind the simulated optics."""
+"""Photograph of a retina as the object of a scene."""
 
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from device.values import Colour, Image
 
 
 def photograph(path: Path, shape: tuple[int, int], px_per_deg: float, field_deg: float) -> Fundus:
-    """Put the central square of a photograph into the field: float32 (rows, cols) per colour, 0 to 1.
+    """Return the central square of a photograph, scaled to the field's diameter and cropped by the round field.
 
-    The picture's values are taken as reflectances as they are: a photograph does not say which curve made them.
-    Its vessels and landmarks are not known. Raises SpecError if the file is no picture.
+    Reflectances are float32 (rows, cols) per colour, 0 to 1: the pixel values, taken as linear because the tone curve
+    of a photograph is unknown. Vessels and landmarks are None. SpecError if the file is missing or no picture.
     """
     try:
         with Pictures.open(path) as picture:
@@ -36,7 +36,7 @@ def photograph(path: Path, shape: tuple[int, int], px_per_deg: float, field_deg:
 
 
 def _centred(plane: Image, shape: tuple[int, int]) -> Image:
-    """The plane in the middle of `shape`, which must hold it."""
+    """Return the plane centred in a float32 array of zeros of `shape`, which must be at least as large."""
     out = np.zeros(shape, np.float32)
     top, left = shape[0] // 2 - plane.shape[0] // 2, shape[1] // 2 - plane.shape[1] // 2
     out[top : top + plane.shape[0], left : left + plane.shape[1]] = plane

@@ -1,7 +1,7 @@
-"""Which effects a scene calls for: each is asked for its size, and what would not be seen is left out.
+"""Plan of a simulation: selection of the effects by their size eta.
 
-The rule (optics.md 3.0): an effect that changes the reconstruction by less than a twentieth of its noise changes no
-picture (|dPCC| < 0.001 in every case of that table), and is skipped. tests/physics/test_plan_proof.py proves it.
+The rule (OPTICS.md 3.1): an effect that changes the reconstruction by less than a twentieth of its noise changes no
+picture (|dPCC| < 0.001 in every case of that table), and is skipped. Proof: tests/physics/test_plan_proof.py.
 """
 
 import difflib
@@ -9,17 +9,17 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from device.errors import SettingError
-from device.sim.effects import EFFECTS
 from device.sim.effects.effect import Effect
 from device.sim.fundus import Fundus
+from device.sim.installed_effects import effects_of
+from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.sensor import SensorModel
-from device.sim.setup import Scene, Setup
 
-SEEN = 0.05
+ETA_THRESHOLD = 0.05
 
 
 class Decision(NamedTuple):
-    """Whether one effect is simulated, the number that decided, and why."""
+    """Decision on one effect: simulated or not, its eta, and the text that explains the eta."""
 
     effect: Effect
     simulated: bool
@@ -28,7 +28,7 @@ class Decision(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As --only and --without call it."""
+        """Name of the effect, as in --only and --without."""
         return self.effect.name
 
 
@@ -38,25 +38,27 @@ def decide(
     everything: bool = False,
     only: Collection[str] = (),
     without: Collection[str] = (),
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
 ) -> tuple[Decision, ...]:
-    """Ask every effect, in the order of the light's way; nothing is rendered.
+    """Return the decision on every effect, in the order of the light path; nothing is rendered.
 
-    `everything` forces all of them, `only` just those named, `without` leaves those out. SettingError for a name that
-    no effect has.
+    By default the effects with eta >= 0.05 are simulated. `everything` selects all effects, `only` just those named;
+    `without` excludes those named in every case. `effects`: those to decide; None: the built-in ones, then those of
+    plug-ins that the scene names. SettingError for a name that no effect has, or for a plug-in that fails.
     """
-    _refuse_strangers([*only, *without], [effect.name for effect in effects])
+    effects = effects_of(scene) if effects is None else effects
+    _refuse_unknown_names([*only, *without], [effect.name for effect in effects])
     decisions = []
     for effect in effects:
         eta, why = effect.size(scene)
-        chosen = everything or (effect.name in only if only else eta >= SEEN)
+        chosen = everything or (effect.name in only if only else eta >= ETA_THRESHOLD)
         decisions.append(Decision(effect, chosen and effect.name not in without, eta, why))
     return tuple(decisions)
 
 
-def prepared(scene: Scene, subject: Fundus, decisions: Sequence[Decision]) -> Setup:
-    """The setup of a scene and its object, with the chosen effects in it."""
-    setup = Setup(scene, subject, SensorModel.ideal(scene.spec.camera))
+def build_setup(scene: Scene, subject: Fundus, decisions: Sequence[Decision]) -> OpticalSetup:
+    """Return the optical setup of a scene with `subject` as its object and the selected effects applied."""
+    setup = OpticalSetup(scene, subject, SensorModel.ideal(scene.spec.camera))
     for decision in decisions:
         if decision.simulated:
             with setup.timed(decision.name):
@@ -64,8 +66,8 @@ def prepared(scene: Scene, subject: Fundus, decisions: Sequence[Decision]) -> Se
     return setup
 
 
-def table(decisions: Sequence[Decision], spent_ms: dict[str, float] | None = None) -> str:
-    """The plan for people: what is simulated, the number that decided, and what it cost if it has been rendered."""
+def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None = None) -> str:
+    """Return the plan as a text table: decision, eta, reason, and with `spent_ms` the computing time of each effect."""
     head = f"{'effect':<14} {'':<9} {'eta':>8} {'ms':>7}  why"
     lines = [head]
     for one in decisions:
@@ -75,7 +77,8 @@ def table(decisions: Sequence[Decision], spent_ms: dict[str, float] | None = Non
     return "\n".join(lines)
 
 
-def _refuse_strangers(names: Sequence[str], known: Sequence[str]) -> None:
+def _refuse_unknown_names(names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise SettingError for a name that no effect has; the remedy names the closest known name, else all names."""
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)

@@ -1,7 +1,7 @@
-"""From a setup to electrons: the object through its caustics onto the sensor, no more work than the setup asks for.
+"""Forward model of the simulator: an optical setup to electrons per pixel, each part of the object through its PSF.
 
-The full linear convolution, cropped: nothing wraps round, and light from beyond the sensor's edge arrives on it. Not
-the solver's operator.
+Full linear convolution, cropped: no wrap-around, and light from beyond the sensor's edge is included. Independent of
+the solver's operator (no inverse crime).
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,45 +13,51 @@ import numpy as np
 from scipy import fft
 from scipy.special import j1
 
+from device.config.head_file import OpticsSpec
 from device.optics.diffuser import Beam, Refraction, caustic
-from device.sim.setup import Place, Setup
-from device.spec import OpticsSpec
+from device.sim.optical_setup import OpticalSetup, Place
 from device.values import Image
 
-LIT = 0.05  # of the peak: what is darker does not count as lit
-ROUNDOFF = 1e-6  # of the peak: darker than this is the rounding of a single-precision FFT, not light
-RINGS = (0.0, 0.45, 0.75, 1.0)  # where in the field a local effect is evaluated, of the half field; between: mixed
+LIT_THRESHOLD = 0.05  # of the peak: threshold of the lit pixels
+ROUNDOFF = 1e-6  # of the peak: below are rounding errors of the single-precision FFT
+RINGS = (0.0, 0.45, 0.75, 1.0)  # sampling of local effects, in units of the half field; interpolated between
 SPOKES = 8
 
 
 class Zone(NamedTuple):
-    """A part of the object that shares one caustic."""
+    """Isoplanatic zone: a weighted part of the object, (rows, cols), and the place whose PSF it shares."""
 
     place: Place
     object: Image
 
 
-def electrons_per_s(setup: Setup) -> Image:
-    """Expected electrons per second at full drive, float32 (rows, cols) of the sensor.
+def electrons_per_s(setup: OpticalSetup) -> Image:
+    """Return the expected electrons per second at full drive, float32 (rows, cols) of the sensor.
 
-    The peak before any veil reaches the scene's `peak_e` in one exposure. Leaves the mean of the lit pixels, to which
-    veils and the room's light refer, in the setup.
+    Before veils and pixel response the peak reaches the scene's `peak_e` in one exposure. With veils or ambient light,
+    sets `lit_e_per_s` of `setup.added_light`, the mean of the lit pixels to which they refer. Ambient light itself is
+    not included.
     """
     scene = setup.scene
-    arriving = _arriving(setup)
-    peak = float(arriving.max())
-    arriving *= np.float32(scene.peak_e / scene.spec.camera.exposure_s / max(peak, 1e-30))
-    if setup.veils or setup.ambient:
-        lit = arriving > LIT * float(arriving.max())
-        setup.lit_e_per_s = float(arriving[lit].mean()) if lit.any() else 0.0
-    for name, veil in setup.veils.items():
+    electrons = _image_on_sensor(setup)
+    peak = float(electrons.max())
+    electrons *= np.float32(scene.peak_e / scene.spec.camera.exposure_s / max(peak, 1e-30))
+    added = setup.added_light
+    if added.veils or added.ambient:
+        lit = electrons > LIT_THRESHOLD * float(electrons.max())
+        added.lit_e_per_s = float(electrons[lit].mean()) if lit.any() else 0.0
+    for name, veil in added.veils.items():
         with setup.timed(name):
-            arriving += veil * np.float32(setup.lit_e_per_s)
-    return arriving if setup.response is None else arriving * setup.response
+            electrons += veil * np.float32(added.lit_e_per_s)
+    return electrons if setup.response is None else electrons * setup.response
 
 
-def psf(setup: Setup, place: Place = (0.0, 0.0)) -> Image:
-    """The caustic of one place: float32 (n, n) at the sensor's pitch; its sum is what the iris lets pass."""
+def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
+    """Return the PSF of one place: float32 (n, n) at the sensor's pitch.
+
+    Refraction, aberrations and beam shift of the setup are included. The sum is 1, or the share of the iris that a
+    shifted beam fills. The array is read-only.
+    """
     m, j0, j45 = setup.refraction
     for aberration in setup.aberrations.values():
         more = aberration(place)
@@ -64,36 +70,37 @@ def psf(setup: Setup, place: Place = (0.0, 0.0)) -> Image:
     scene = setup.scene
     pitch_um = scene.spec.camera.pitch_um
     with setup.timed(*(["bandwidth"] if setup.lines > 1 else [])):
-        return traced(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
+        return cached_caustic(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
 
 
 @lru_cache(maxsize=4)
-def traced(
+def cached_caustic(
     optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None
 ) -> Image:
-    """A caustic, traced once: the frame, its truth's PSF and the calibration often share it. Read-only."""
+    """Return the PSF of `caustic` as a read-only array, from a cache of the last four sets of arguments."""
     point = caustic(optics, pitch_um, seed, refraction, lines, beam)
     point.flags.writeable = False
     return point
 
 
-def _arriving(setup: Setup) -> Image:
-    """The object through its caustics, in any unit."""
+def _image_on_sensor(setup: OpticalSetup) -> Image:
+    """Return the image of the object on the sensor, (rows, cols) in arbitrary units, with drift and rolling shutter."""
     with setup.timed(*setup.aberrations, *setup.beams):
         parts = [(part, psf(setup, place)) for place, part in zones(setup)]
         rows, cols = setup.shape
-        margin = ceil(abs(setup.lag_px) * rows / 2)  # what a rolling shutter may still bring in from beside the sensor
-        arriving = blurred(parts, (rows, cols + 2 * margin), setup.drift_px)
+        margin = ceil(abs(setup.lag_px) * rows / 2)  # columns beside the sensor that a rolling shutter may shift in
+        image = convolved(parts, (rows, cols + 2 * margin), setup.drift_px)
     if setup.lag_px:
         with setup.timed("shutter"):
-            arriving = _sheared(arriving, setup.lag_px)[:, margin : margin + cols]
-    return arriving
+            image = _shear_rows(image, setup.lag_px)[:, margin : margin + cols]
+    return image
 
 
-def blurred(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_px: Place = (0.0, 0.0)) -> Image:
-    """The light on a sensor of `shape` from parts of an object, each through its PSF, smeared by a drift.
+def convolved(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_px: Place = (0.0, 0.0)) -> Image:
+    """Return the image on a sensor of `shape` of parts of an object, each convolved with its PSF, with motion blur.
 
-    The parts (rows, cols) lie on one square around the middle, the PSFs have one shape.
+    `parts` are pairs of part and PSF; all parts have one shape and one centre, and all PSFs have one shape. `drift_px`
+    (right, down) is the length of the blur. Values below 1e-6 of the peak are set to 0.
     """
     part, point = parts[0]
     full = part.shape[0] + point.shape[0] - 1, part.shape[1] + point.shape[1] - 1
@@ -108,24 +115,24 @@ def blurred(parts: Sequence[tuple[Image, Image]], shape: tuple[int, int], drift_
         total *= np.sinc(down * fft.fftfreq(rows)[:, None] + right * fft.rfftfreq(cols)).astype(np.float32)
     whole = fft.irfft2(total, (rows, cols), overwrite_x=True, workers=2)[: full[0], : full[1]]
     middle = part.shape[0] // 2 + point.shape[0] // 2, part.shape[1] // 2 + point.shape[1] // 2
-    arriving = fitted(whole, shape, middle)
+    arriving = crop_or_pad(whole, shape, middle)
     arriving[arriving < ROUNDOFF * float(whole.max())] = 0
     return arriving
 
 
-def zones(setup: Setup) -> Iterator[Zone]:
-    """The object in parts that share a caustic: all of it where nothing changes over the field."""
+def zones(setup: OpticalSetup) -> Iterator[Zone]:
+    """Yield the isoplanatic zones of the object; only one for a point, or if no effect varies over the field."""
     spec, gaze = setup.scene.sim.object, setup.scene.sim.eye.gaze_deg
     if not setup.aberrations and not setup.beams:
         yield Zone((0.0, 0.0), setup.object)
-    elif spec.kind == "point":  # one place has one caustic, exactly
+    elif spec.kind == "point":  # a point has exactly one PSF
         yield Zone((spec.at_deg[0] + gaze[0], spec.at_deg[1] + gaze[1]), setup.object)
     else:
         yield from _ring_zones(setup)
 
 
-def _ring_zones(setup: Setup) -> Iterator[Zone]:
-    """A partition of unity in rings and spokes: between two places their caustics are mixed."""
+def _ring_zones(setup: OpticalSetup) -> Iterator[Zone]:
+    """Yield zones on rings and spokes; their weights sum to 1, so that PSFs are interpolated between the places."""
     half_deg = setup.scene.half_field_deg
     rows, cols = ((np.arange(n) - (n - 1) / 2) / setup.scene.geometry.px_per_deg for n in setup.object.shape)
     radius = np.hypot(rows[:, None], cols[None, :]) / half_deg
@@ -140,8 +147,8 @@ def _ring_zones(setup: Setup) -> Iterator[Zone]:
             yield Zone(place, (setup.object * share).astype(np.float32))
 
 
-def _sheared(image: Image, lag_px: float) -> Image:
-    """Each row as it is when it is read: moved along the rows by the drift until then (a rolling shutter)."""
+def _shear_rows(image: Image, lag_px: float) -> Image:
+    """Return the image with each row shifted right by `lag_px` per row from the middle row (rolling shutter)."""
     rows, cols = image.shape
     moved_px = (np.arange(rows) - rows // 2) * lag_px
     spectrum = fft.rfft(image, axis=1)
@@ -150,8 +157,8 @@ def _sheared(image: Image, lag_px: float) -> Image:
     return np.maximum(sheared, 0)
 
 
-def dotted(point: Image, diameter_px: float) -> Image:
-    """A caustic as a disc of that diameter makes it instead of a point: 2 J1(x) / x; float32, same sum."""
+def convolved_with_disc(point: Image, diameter_px: float) -> Image:
+    """Return a PSF convolved with a disc of that diameter: float32, same sum, enlarged by about a radius per side."""
     shape = [fft.next_fast_len(n + int(diameter_px) + 2, real=True) for n in point.shape]
     x = pi * diameter_px * np.hypot(fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None, :])
     disc = np.where(x > 1e-6, 2 * j1(np.maximum(x, 1e-6)) / np.maximum(x, 1e-6), 1.0)
@@ -162,18 +169,18 @@ def dotted(point: Image, diameter_px: float) -> Image:
 
 
 def azimuth_and_angle(place: Place) -> tuple[float, float]:
-    """A place in polar coordinates: radians from the right towards down, and degrees from the axis."""
+    """Return a place in polar coordinates: azimuth from the right towards down, rad; angle from the axis, degrees."""
     return atan2(place[1], place[0]), hypot(*place)
 
 
-def fitted(image: Image, shape: tuple[int, int], middle: tuple[int, int] | None = None) -> Image:
-    """A copy on `shape`, cropped or zero-filled, with `middle` (default rows//2, cols//2) brought to the middle."""
+def crop_or_pad(image: Image, shape: tuple[int, int], middle: tuple[int, int] | None = None) -> Image:
+    """Return a float32 copy cropped or zero-padded to `shape`, with `middle` (default: rows//2, cols//2) as centre."""
     out = np.zeros(shape, np.float32)
     into, of = [], []
     for size, have, centre in zip(
         shape, image.shape, middle or (image.shape[0] // 2, image.shape[1] // 2), strict=True
     ):
-        first = size // 2 - centre  # where the image's first row would come to lie
+        first = size // 2 - centre  # target index of the image's first row
         into.append(slice(max(first, 0), max(min(first + have, size), 0)))
         of.append(slice(max(-first, 0), max(min(size - first, have), 0)))
     out[tuple(into)] = image[tuple(of)]

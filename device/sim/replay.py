@@ -1,32 +1,41 @@
-"""A head that plays recordings: real raw frames through the whole path, with no eye and no lamp.
+"""Replay of recordings: camera and lamp that return recorded raw frames, with no eye and no hardware.
 
-The recording's folder may say what it is in `recording.toml` (a head file whose camera is `replay`); without one the
-files are told apart by their names, and what cannot be told apart is refused.
+The folder of a recording may contain `recording.toml` (a head file whose camera is `replay`). Without it, raws and PSFs
+are recognised by file names; SpecError if that does not find both.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from device.clock import Clock
+from device.config.head_file import CameraSpec, InstrumentSpec, LightSpec, ReplaySpec
+from device.config.image_files import (
+    SUFFIXES,
+    Raw,
+    as_raw,
+    is_marked_simulated,
+    read_image,
+    read_psf,
+    require_same_shape,
+)
 from device.errors import CameraMissing, FrameError, SpecError
-from device.images import SUFFIXES, Raw, as_raw, read_image, read_psf, refuse_other_sizes, says_simulated
-from device.spec import CameraSpec, InstrumentSpec, LightSpec, ReplaySpec
-from device.values import Calibration, Counts, Frame, Glow, Image, Mask, Psf, Sensor, Shot
+from device.sim.light import LampContext
+from device.values import Calibration, Counts, ExposureSettings, Frame, Illumination, Image, Mask, Psf, Sensor
 
-FLOAT_ZERO_DN, FLOAT_PEAK_DN = 1000.0, 60000.0  # a float recording is put on counts between these, with room outside
-LONGEST_SIDE = 8192
+FLOAT_ZERO_DN, FLOAT_PEAK_DN = 1000.0, 60000.0  # counts for zero and maximum of a float recording, with margins
+MAX_SIDE_PX = 8192
 
 
 def find_recording(folder: Path) -> ReplaySpec:
-    """Which files of a folder are raws and which the PSFs, by their names and shapes.
+    """Return the raws and PSFs of a folder by file names and shapes; SpecError if either is missing.
 
-    A path with "psf" in it is a PSF; raws have "raw", "diffuser" or "measurement" in theirs, or are the only other
-    image. PSFs of another shape than the raws (thumbnails, figures) are left out.
+    An image whose path below the folder contains "psf" is a PSF; raws contain "raw", "diffuser" or "measurement", or
+    are the only other image. PSFs of another shape than the first raw (thumbnails) and files that hold no counts
+    (figures with transparency) are left out; SpecError if none remains.
     """
     images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     names = {path: str(path.relative_to(folder)).lower() for path in images}
@@ -40,17 +49,23 @@ def find_recording(folder: Path) -> ReplaySpec:
             "Add a recording.toml that names them, or give them with --raw and --psf.",
         )
     shape = read_image(raws[0]).shape[:2]
-    fitting = [path for path in psfs if read_image(path).shape[:2] == shape]
+    fitting, unreadable = [], []
+    for path in psfs:
+        try:
+            fitting += [path] if read_image(path).shape[:2] == shape else []
+        except FrameError as error:  # a figure, whose pixels are no counts
+            unreadable.append(error.message)
     if not fitting:
-        raise SpecError(f"no PSF in {folder} has the {shape[0]} x {shape[1]} pixels of {raws[0].name}")
+        none = f"no PSF in {folder} has the {shape[0]} x {shape[1]} pixels of {raws[0].name}"
+        raise SpecError("; ".join([none, *unreadable]))
     return ReplaySpec(raws=tuple(raws), psfs=tuple(fitting))
 
 
 def recorded_head(recording: ReplaySpec, name: str) -> InstrumentSpec:
-    """A head for recordings about which nothing is known but their files."""
+    """Return the specification of a head for a recording without `recording.toml`; SpecError beyond 8192 px a side."""
     rows, cols = read_image(recording.raws[0]).shape[:2]
-    if max(rows, cols) > LONGEST_SIDE:
-        raise SpecError(f"{recording.raws[0]} has {rows} x {cols} pixels; no more than {LONGEST_SIDE} fit on a side")
+    if max(rows, cols) > MAX_SIDE_PX:
+        raise SpecError(f"{recording.raws[0]} has {rows} x {cols} pixels; no more than {MAX_SIDE_PX} fit on a side")
     camera = CameraSpec(
         backend="replay", rows=rows, cols=cols, pitch_um=1.0, bit_depth=16, black_dn=recording.black_dn,
         full_well_e=65535, read_noise_e=0, exposure_s=0.02, preview_exposure_s=0.02,
@@ -59,73 +74,67 @@ def recorded_head(recording: ReplaySpec, name: str) -> InstrumentSpec:
 
 
 class ReplayLight:
-    """A lamp that exists only as a promise: recordings were lit when they were made."""
+    """Lamp of a recording, which emits no light: while on, the camera returns the raws, while off the dark frame."""
 
     def __init__(self) -> None:
-        self.glow: Glow | None = None
+        self.illumination: Illumination | None = None
 
-    def on(self, glow: Glow) -> "ReplayLit":
-        """Show the recording from the entry of the returned context to its end."""
-        return ReplayLit(self, glow)
+    def on(self, illumination: Illumination) -> LampContext:
+        """Return a context during which the camera returns the recorded raws."""
+
+        def turn_on() -> None:
+            self.illumination = illumination
+
+        return LampContext(turn_on, self.off)
 
     def off(self) -> None:
-        """Show its dark level."""
-        self.glow = None
-
-
-class ReplayLit:
-    """The time in which the recorded lamp shines."""
-
-    def __init__(self, light: ReplayLight, glow: Glow) -> None:
-        self._light, self._glow = light, glow
-
-    def __enter__(self) -> "ReplayLit":
-        self._light.glow = self._glow
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._light.off()
+        """Select the dark frame."""
+        self.illumination = None
 
 
 class ReplayCamera:
-    """Plays the raws of a recording in turn while the lamp is on, and its dark level while it is off."""
+    """Camera that returns the raws of a recording in turn while the lamp is on, else its dark frame."""
 
     def __init__(self, recording: ReplaySpec, light: ReplayLight, clock: Clock) -> None:
         self._light, self._clock = light, clock
         raws = [as_raw(read_image(path)) for path in recording.raws]
         if len({raw.pixels.shape for raw in raws}) > 1:
             raise SpecError("the raws of one recording must all have the same rows and columns")
-        self._simulated = any(says_simulated(path) for path in recording.raws)
+        self._simulated = any(is_marked_simulated(path) for path in recording.raws)
         self.white_dn = max(min(raw.white_dn, 65535.0) for raw in raws)
         self.bad: Mask = np.logical_or.reduce([raw.bad for raw in raws])
         on_counts = _scale(raws)
         self.black_dn = float(on_counts(np.array(recording.black_dn)))
-        self._frames = [_counted(on_counts(raw.pixels)) for raw in raws]
+        self._frames = [_to_counts(on_counts(raw.pixels)) for raw in raws]
         self._dark = self._constant(self.black_dn)
         if recording.dark is not None:
-            self._dark = _counted(on_counts(_companion(recording.dark, raws[0])))
+            self._dark = _to_counts(on_counts(_dark_in_raw_units(recording.dark, raws[0])))
         self._number = self._shown = 0
         self._open = True
 
     def _constant(self, level_dn: float) -> Counts:
+        """Return uint16 counts of one level on every pixel, in the shape of the raws."""
         return np.full(self._frames[0].shape, round(level_dn), np.uint16)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, cols) of every frame."""
+        """(rows, cols) of every frame, without the channels of a colour recording."""
         rows, cols = self._frames[0].shape[:2]
         return rows, cols
 
-    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
-        """The next raw of the recording if the lamp is on, else its dark frame."""
+    @property
+    def facts(self) -> dict[str, str]:
+        """Empty: a recording has no sensor."""
+        return {}
+
+    def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
+        """Return the next raw if the lamp is on, else the dark frame; CameraMissing, or FrameError for a bad `into`."""
         if not self._open:
             raise CameraMissing("this recording was closed")
         if into is not None and (into.shape != self._dark.shape or into.dtype != np.uint16):
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this recording fills uint16 {self._dark.shape}")
         self._clock.sleep(shot.exposure_s)
-        glow = self._light.glow
+        glow = self._light.illumination
         counts = self._dark if glow is None else self._frames[self._shown % len(self._frames)]
         self._shown += glow is not None
         self._number += 1
@@ -134,16 +143,16 @@ class ReplayCamera:
             counts = into
         return Frame(counts, shot.exposure_s, self._number, glow, self._simulated)
 
-    def prepare(self, shot: Shot) -> None:
-        """Nothing to do: every exposure has its own time."""
+    def prepare(self, shot: ExposureSettings) -> None:
+        """Do nothing: recorded frames do not depend on the exposure time."""
 
     def close(self) -> None:
-        """Stop playing."""
+        """Close the recording; further exposures raise CameraMissing."""
         self._open = False
 
 
 def _scale(raws: list[Raw]) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """Float recordings on 16-bit counts, all by one scale, their zero at FLOAT_ZERO_DN; counts stay as they are."""
+    """Return the function from pixels to counts: identity if all raws are uint16, else one linear scale to 16 bits."""
     if all(raw.pixels.dtype == np.uint16 for raw in raws):
         return lambda pixels: pixels
     top = max(float(raw.pixels.max()) for raw in raws)
@@ -151,12 +160,16 @@ def _scale(raws: list[Raw]) -> Callable[[NDArray[Any]], NDArray[Any]]:
     return lambda pixels: pixels * scale + FLOAT_ZERO_DN
 
 
-def _counted(pixels: NDArray[Any]) -> Counts:
+def _to_counts(pixels: NDArray[Any]) -> Counts:
+    """Round and clip to uint16 counts."""
     return np.asarray(np.clip(np.rint(pixels), 0, 65535), np.uint16)
 
 
-def _companion(path: Path, raw: Raw) -> NDArray[Any]:
-    """A dark frame in the units of its raw, moved by the raw's bits: a dark one alone cannot tell its justification."""
+def _dark_in_raw_units(path: Path, raw: Raw) -> NDArray[Any]:
+    """Return the dark frame of a file in the units of its raw; SpecError if the shapes differ.
+
+    It is shifted by the raw's bits, because dark counts do not reveal whether they are left-justified. NaN becomes 0.
+    """
     pixels = read_image(path) / 2**raw.shift
     if pixels.ndim < raw.pixels.ndim:
         pixels = np.repeat(pixels[..., np.newaxis], 3, axis=2)
@@ -169,10 +182,10 @@ def _companion(path: Path, raw: Raw) -> NDArray[Any]:
 
 
 def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibration:
-    """The calibration that belongs to a recording: its PSFs, its pedestal, and its geometry where a head gives one."""
+    """Return a recording's calibration: PSFs, levels, flat frame, bad pixels, geometry; PsfError for another shape."""
     assert spec.replay is not None
     psfs: tuple[Psf, ...] = tuple(read_psf(path) for path in spec.replay.psfs)
-    refuse_other_sizes(psfs, camera.shape)
+    require_same_shape(psfs, camera.shape)
     flat: Image | None = None
     if spec.replay.flat is not None:
         flat = read_image(spec.replay.flat).astype(np.float32)

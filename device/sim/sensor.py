@@ -1,6 +1,7 @@
-"""Electrons that arrive become counts that are read: shot noise, full well, read noise, gain, black level, converter.
+"""Sensor model: electrons to counts with shot noise, full well, read noise, gain, black level and converter.
 
-optics.md 3.9: DN = round(black + min(bent(Poisson(e) + read + offset), well) / gain).
+OPTICS.md 3.8: DN = round(black + min(s (1 + k s / b), well) / gain), clipped to 0 to white, with s = Poisson(e) + read
+noise + offset, k the nonlinearity, and b the charge to which it refers (`bends_at_e`).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -9,21 +10,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from device.spec import CameraSpec
+from device.config.head_file import CameraSpec
 from device.values import Counts, Image
 
 # Above this mean a Gaussian of the same mean and variance stands for the Poisson law. Their distribution functions then
 # differ by at most 0.3041 / sqrt(mean) (Shevtsova 2014, Berry-Esseen for Poisson) = 0.03; below it the draw is exact.
 GAUSSIAN_FROM_E = 100.0
 STRIP_ROWS = 64
-ENDLESS_DN = 65535  # what uint16 holds
+UNCLIPPED_DN = 65535  # maximum of uint16
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What turns electrons into counts, in the units of a head's [camera] table.
+    """Conversion of electrons to counts, in the units of a head's [camera] table.
 
-    `offset_e` (rows, cols) is a fixed pattern; `nonlinearity` the relative bend at `bends_at_e`.
+    `offset_e` (rows, cols) is a fixed pattern; `nonlinearity` is the relative error of the response at `bends_at_e`
+    electrons, from a quadratic term. `shot` is false for a sensor without shot noise.
     """
 
     gain_e_per_dn: float
@@ -38,21 +40,21 @@ class SensorModel:
 
     @classmethod
     def of(cls, camera: CameraSpec) -> "SensorModel":
-        """The sensor that a head's file describes."""
+        """Return the sensor of a head file's [camera] table, with shot noise, linear and without fixed pattern."""
         return cls(camera.gain_e_per_dn, camera.black_dn, camera.white_dn, camera.full_well_e, camera.read_noise_e)
 
     @classmethod
     def ideal(cls, camera: CameraSpec) -> "SensorModel":
-        """The same without noise, and with wells and a converter that have no end: whole counts are left of it."""
+        """Return the noise-free sensor with unlimited full well; counts are only rounded and clipped to 0..65535."""
         well_e = camera.full_well_e
-        return cls(camera.gain_e_per_dn, camera.black_dn, ENDLESS_DN, float("inf"), 0.0, False, 0.0, well_e)
+        return cls(camera.gain_e_per_dn, camera.black_dn, UNCLIPPED_DN, float("inf"), 0.0, False, 0.0, well_e)
 
     def offset_by(self, pattern_e: Image) -> "SensorModel":
-        """With a fixed pattern more."""
+        """Return the sensor with an additional fixed pattern, electrons (rows, cols)."""
         return replace(self, offset_e=pattern_e if self.offset_e is None else self.offset_e + pattern_e)
 
-    def middle(self, shape: tuple[int, int]) -> "SensorModel":
-        """Only the pixels (rows, cols) in the middle."""
+    def crop_to_centre(self, shape: tuple[int, int]) -> "SensorModel":
+        """Return the sensor with its fixed pattern cropped to the central (rows, cols) of `shape`."""
         if self.offset_e is None:
             return self
         rows, cols = (
@@ -62,10 +64,10 @@ class SensorModel:
         return replace(self, offset_e=self.offset_e[rows, cols])
 
     def read(self, electrons: Image, seed: int | tuple[int, ...], into: Counts | None = None) -> Counts:
-        """One noisy frame of the expected `electrons` (rows, cols): uint16, the same for the same seed.
+        """Return one noisy frame of the expected `electrons` (rows, cols): uint16, reproducible by `seed`.
 
-        `into` is filled and returned if it is given. Strips of 64 rows have noise of their own, so the frame does not
-        depend on how many threads share the work.
+        `into` is filled and returned if given. Each strip of 64 rows has its own random stream, so the frame does not
+        depend on the number of threads.
         """
         counts = np.empty(electrons.shape, np.uint16) if into is None else into
         starts = range(0, electrons.shape[0], STRIP_ROWS)
@@ -80,9 +82,10 @@ class SensorModel:
         return counts
 
     def _read_strip(self, electrons: Image, rows: slice, stream: np.random.SeedSequence, counts: Counts) -> None:
+        """Fill `rows` of `counts` with the noisy counts of one strip, drawn from `stream`."""
         rng = np.random.Generator(np.random.SFC64(stream))
         if self.shot:
-            level = noisy(electrons[rows], self.read_noise_e, rng)
+            level = add_noise(electrons[rows], self.read_noise_e, rng)
         else:
             level = electrons[rows] + np.float32(self.read_noise_e) * rng.standard_normal(electrons[rows].shape, "f4")
         if self.offset_e is not None:
@@ -98,8 +101,8 @@ class SensorModel:
         np.copyto(counts[rows], level, casting="unsafe")
 
 
-def noisy(electrons: Image, read_noise_e: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """What is read when `electrons` (not negative) are expected: shot noise and read noise, float32 electrons.
+def add_noise(electrons: Image, read_noise_e: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return electrons with shot noise and read noise, float32, for expected `electrons` >= 0.
 
     Below 100 electrons the Poisson draw is exact. Above, one Gaussian stands for both noises.
     """

@@ -1,4 +1,4 @@
-"""Vessels as pixels: smooth, anti-aliased strokes that taper, from paths in degrees."""
+"""Rasterisation of vessels: anti-aliased, tapered strokes from paths in degrees."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from device.sim.vessels import Vessel
 from device.values import Image, Mask
 
 FAR = np.float32(1e3)
-SPACING_PX = 0.4  # between dabs along a vessel
-FULL_WIDTH_DEG = 0.34  # vessels this wide are as dark as vessels get
+SPACING_PX = 0.4  # between the discs that make up a stroke
+FULL_WIDTH_DEG = 0.34  # width at which a vessel reaches full contrast
 
 
 @dataclass(frozen=True)
 class Strokes:
-    """Drawn vessels: how much blood is in the way, 0 to 1, and where they are; (rows, cols)."""
+    """Rasterised vessels, (rows, cols): `blood` is the attenuation by blood, 0 to 1; `mask` marks vessel pixels."""
 
     blood: Image
     mask: Mask
@@ -29,15 +29,16 @@ def draw(
     at: Callable[[float, float], tuple[float, float]],
     reflex: float = 0.0,
 ) -> Strokes:
-    """Draw all vessels on a canvas of `shape`.
+    """Return the vessels rasterised on a canvas of `shape` (rows, cols).
 
-    `at` gives the (row, col) of a place; `reflex` is the strength of the bright line along arteries.
+    `at` maps (x, y) in degrees to (row, col). `reflex`, 0 to 1, is the strength of the bright central line of these
+    vessels; the caller sets it for arteries.
     """
     edge = np.full(shape, FAR)
     axis = np.full(shape, FAR)
     origin = at(0.0, 0.0)
     for vessel in vessels:
-        _dab(edge, axis, _dabs(vessel, px_per_deg, origin))
+        _update_distances(edge, axis, _stroke_discs(vessel, px_per_deg, origin))
     radius = np.maximum(axis - edge, np.float32(0.05))
     near = axis < radius + 1
     thin = np.minimum(1, 2 * radius) / np.minimum(1, radius + 0.5)  # less than a pixel wide
@@ -51,8 +52,8 @@ def draw(
     return Strokes(blood, near & ((edge < 0) | (axis < 0.6)))
 
 
-def _dabs(vessel: Vessel, px_per_deg: float, origin: tuple[float, float]) -> NDArray[np.float32]:
-    """(n, 3) of row, col and radius in px, evenly spaced along the vessel."""
+def _stroke_discs(vessel: Vessel, px_per_deg: float, origin: tuple[float, float]) -> NDArray[np.float32]:
+    """Return the discs along a vessel, (n, 3) of row, col and radius in px, evenly spaced."""
     row = origin[0] + vessel.points[:, 1] * px_per_deg
     col = origin[1] + vessel.points[:, 0] * px_per_deg
     radius = vessel.points[:, 2] * px_per_deg / 2
@@ -61,8 +62,8 @@ def _dabs(vessel: Vessel, px_per_deg: float, origin: tuple[float, float]) -> NDA
     return np.stack([np.interp(places, along, values) for values in (row, col, radius)], 1).astype(np.float32)
 
 
-def _dab(edge: Image, axis: Image, dabs: NDArray[np.float32]) -> None:
-    """Lower the distance to the nearest edge and to the nearest axis around every dab."""
+def _update_distances(edge: Image, axis: Image, dabs: NDArray[np.float32]) -> None:
+    """Lower, in place, the px distances to the nearest edge (negative inside) and centre of the discs `dabs`."""
     reach = int(np.ceil(dabs[:, 2].max() + 2))
     around = np.arange(-reach, reach + 1)
     rows = np.rint(dabs[:, 0]).astype(np.intp)[:, None, None] + around[None, :, None]

@@ -1,7 +1,7 @@
-"""How retinal vessels grow: out of the disc, in arcades round the macula, branching as Murray's law says.
+"""Growth of retinal vessels: trunks out of the disc, arcades around the macula, branching by Murray's law.
 
 All places are (x, y) in degrees, right and down, with the fovea at the origin and the disc at positive x (a right eye).
-Arteries never cross arteries, nor veins veins; nothing enters the avascular zone.
+Arteries never cross arteries, nor veins veins; no vessel enters the avascular zone.
 """
 
 import math
@@ -16,16 +16,16 @@ Kind = Literal["artery", "vein"]
 
 DISC = (15.2, -1.5)  # nasal of the fovea, and a little above it
 STEP = 0.12  # between points of a path
-THINNEST = 0.05  # thinner vessels are not drawn
+MIN_WIDTH_DEG = 0.05  # thinner vessels are not drawn
 AVASCULAR = 1.15  # radius of the zone around the fovea
-CELL = 0.3  # what a vessel keeps to itself
-CURL = 1.7  # radians that a vessel may turn in all; the arches may turn as they must
-WANDER = 1.3  # over which length a vessel forgets its bend
+CELL = 0.3  # grid cell reserved by one vessel of a kind
+MAX_TOTAL_TURN_RAD = 1.7  # largest total turn of a vessel, radians; arches are exempt
+CURVATURE_LENGTH_DEG = 1.3  # correlation length of the random curvature
 
 
 @dataclass(frozen=True)
 class Vessel:
-    """One vessel from its beginning to its end: points (n, 3) of x, y and width_deg."""
+    """Path of one vessel: points (n, 3) of x, y and width_deg."""
 
     kind: Kind
     points: NDArray[np.float32]
@@ -33,7 +33,7 @@ class Vessel:
 
 @dataclass(frozen=True)
 class Trunk:
-    """How a main vessel leaves the disc: which way (clockwise from the right), how wide, how high it arches."""
+    """Main vessel at the optic disc: heading clockwise from the right, width, and y of its arch (None: no arch)."""
 
     kind: Kind
     heading_deg: float
@@ -57,7 +57,7 @@ TRUNKS = (
 
 @dataclass
 class Tip:
-    """The growing end of a vessel."""
+    """Growing end of a vessel: `bend` is its random curvature, rad per degree, `side` that of the next branch, +-1."""
 
     kind: Kind
     x: float
@@ -66,51 +66,56 @@ class Tip:
     width_deg: float
     arch: float | None = None
     inward: bool = False  # towards the macula
-    family: tuple[int, ...] = ()  # itself and those it came from
+    lineage: tuple[int, ...] = ()  # numbers of the vessel's ancestors and its own
     bend: float = 0.0
-    spun: float = 0.0  # how far it has turned since it was born
+    total_turn_rad: float = 0.0  # total turn since the branch, radians
     side: int = 1
 
 
 @dataclass
-class Garden:
-    """The ground on which the vessels of one eye grow: a circle of `reach_deg` around `centre`."""
+class GrowthState:
+    """Growth state of one eye's vessels: a circle of `reach_deg` around `centre` with its occupied cells."""
 
     rng: np.random.Generator
     reach_deg: float
     centre: tuple[float, float]
-    taken: dict[tuple[Kind, int, int], int] = field(default_factory=dict)
-    born: int = 0
+    occupied: dict[tuple[Kind, int, int], int] = field(default_factory=dict)
+    tip_count: int = 0
 
-    def seed(self, tip: Tip) -> Tip:
-        """Give a new tip its number."""
-        tip.family = (*tip.family, self.born)
-        self.born += 1
+    def number_tip(self, tip: Tip) -> Tip:
+        """Append the next number to the lineage of a new tip, and return the tip."""
+        tip.lineage = (*tip.lineage, self.tip_count)
+        self.tip_count += 1
         return tip
 
-    def take(self, tip: Tip) -> None:
-        """Remember that this vessel was here first."""
-        self.taken.setdefault((tip.kind, round(tip.x / CELL), round(tip.y / CELL)), tip.family[-1])
+    def occupy(self, tip: Tip) -> None:
+        """Mark the tip's cell as occupied by its vessel, unless a vessel of the same kind occupies it already."""
+        self.occupied.setdefault((tip.kind, round(tip.x / CELL), round(tip.y / CELL)), tip.lineage[-1])
 
-    def free(self, tip: Tip, turn_rad: float, ahead: float) -> bool:
-        """Whether no strange vessel of the same kind lies ahead, if the tip turned."""
+    def is_free(self, tip: Tip, turn_rad: float, ahead: float) -> bool:
+        """Return true if no other vessel of the same kind occupies the cell `ahead` degrees away after a turn."""
         x = tip.x + ahead * math.cos(tip.heading_rad + turn_rad)
         y = tip.y + ahead * math.sin(tip.heading_rad + turn_rad)
-        owner = self.taken.get((tip.kind, round(x / CELL), round(y / CELL)))
-        return owner is None or owner == tip.family[-1]
+        owner = self.occupied.get((tip.kind, round(x / CELL), round(y / CELL)))
+        return owner is None or owner == tip.lineage[-1]
 
-    def ends(self, tip: Tip) -> bool:
-        """Whether the tip has left the ground, become too thin, curled up, or come past the fovea."""
+    def has_ended(self, tip: Tip) -> bool:
+        """Return true if the tip is outside the circle, too thin, turned too far, at the fovea, or has passed it."""
         away = math.hypot(tip.x - self.centre[0], tip.y - self.centre[1])
         from_fovea = math.hypot(tip.x, tip.y)
         leaving = math.cos(tip.heading_rad) * tip.x + math.sin(tip.heading_rad) * tip.y > 0
         past = from_fovea < AVASCULAR or (leaving and tip.inward and from_fovea < 6)
-        return away > self.reach_deg or tip.width_deg < THINNEST or past or abs(tip.spun) > CURL
+        return (
+            away > self.reach_deg
+            or tip.width_deg < MIN_WIDTH_DEG
+            or past
+            or abs(tip.total_turn_rad) > MAX_TOTAL_TURN_RAD
+        )
 
 
 def grow(seed: int, reach_deg: float, centre: tuple[float, float]) -> list[Vessel]:
-    """All vessels of one eye within `reach_deg` of `centre`: the same for the same seed, the widest first."""
-    garden = Garden(np.random.default_rng((seed, 1)), reach_deg, centre)
+    """Return the vessels of one eye within `reach_deg` of `centre` (x, y), widest first, reproducible by the seed."""
+    garden = GrowthState(np.random.default_rng((seed, 1)), reach_deg, centre)
     waiting = [_sprout(garden, trunk) for trunk in TRUNKS]
     vessels = []
     while waiting:
@@ -124,55 +129,58 @@ def grow(seed: int, reach_deg: float, centre: tuple[float, float]) -> list[Vesse
     return vessels
 
 
-def _sprout(garden: Garden, trunk: Trunk) -> Tip:
-    """A main vessel where it comes out of the cup."""
+def _sprout(garden: GrowthState, trunk: Trunk) -> Tip:
+    """Return the tip of a main vessel at the cup of the optic disc, with random deviations from the trunk's values."""
     rng = garden.rng
     heading = math.radians(trunk.heading_deg + rng.normal(0, 6))
     arch = None if trunk.arch is None else trunk.arch + rng.normal(0, 0.5)
     x, y = DISC[0] + 0.35 + 0.3 * math.cos(heading), DISC[1] + 0.5 * math.sin(heading)
     side = 1 if rng.random() < 0.5 else -1
-    return garden.seed(Tip(trunk.kind, x, y, heading, trunk.width_deg * rng.uniform(0.9, 1.1), arch, side=side))
+    return garden.number_tip(Tip(trunk.kind, x, y, heading, trunk.width_deg * rng.uniform(0.9, 1.1), arch, side=side))
 
 
-def _lengthen(garden: Garden, tip: Tip, points: list[tuple[float, float, float]]) -> Iterator[Tip]:
-    """Grow one vessel to its end, writing its points and yielding its branches."""
+def _lengthen(garden: GrowthState, tip: Tip, points: list[tuple[float, float, float]]) -> Iterator[Tip]:
+    """Grow one vessel to its end: append its (x, y, width) to `points` and yield the tips of its branches."""
     rng = garden.rng
     until_branch = rng.uniform(2.2, 4.0)
     grown = 0.0
-    while not garden.ends(tip):
+    while not garden.has_ended(tip):
         _steer(garden, tip, grown)
         tip.x += STEP * math.cos(tip.heading_rad)
         tip.y += STEP * math.sin(tip.heading_rad)
         tip.width_deg *= 1 - 0.012 * STEP
         grown += STEP
-        if grown > 0.7 and not garden.free(tip, 0, 0.3):
+        if grown > 0.7 and not garden.is_free(tip, 0, 0.3):
             return
-        garden.take(tip)
+        garden.occupy(tip)
         points.append((tip.x, tip.y, tip.width_deg))
         until_branch -= STEP
-        if until_branch < 0 and tip.width_deg > 1.5 * THINNEST:
+        if until_branch < 0 and tip.width_deg > 1.5 * MIN_WIDTH_DEG:
             yield _branch(garden, tip)
             until_branch = rng.uniform(0.7, 1.5) * (1.3 + 3.0 * math.sqrt(tip.width_deg))
 
 
-def _steer(garden: Garden, tip: Tip, grown: float) -> None:
-    """Turn a little: at random, towards where this vessel belongs, and away from others of its kind."""
+def _steer(garden: GrowthState, tip: Tip, grown: float) -> None:
+    """Change the tip's heading by random curvature, attraction to its course, and avoidance of vessels of its kind."""
     rough = 0.14 if tip.width_deg > 0.2 else 0.22
-    tip.bend += -tip.bend * STEP / WANDER + rough * math.sqrt(2 * STEP / WANDER) * garden.rng.standard_normal()
+    tip.bend += (
+        -tip.bend * STEP / CURVATURE_LENGTH_DEG
+        + rough * math.sqrt(2 * STEP / CURVATURE_LENGTH_DEG) * garden.rng.standard_normal()
+    )
     wanted, pull = _course(tip)
     error = math.remainder(wanted - tip.heading_rad, math.tau)
     before = tip.heading_rad
     tip.heading_rad += STEP * (tip.bend + pull * error)
-    if grown > 0.7 and not (garden.free(tip, 0, 0.6) and garden.free(tip, 0, 1.0)):
-        left = garden.free(tip, -0.7, 0.7) + garden.free(tip, -0.5, 1.1)
-        right = garden.free(tip, 0.7, 0.7) + garden.free(tip, 0.5, 1.1)
+    if grown > 0.7 and not (garden.is_free(tip, 0, 0.6) and garden.is_free(tip, 0, 1.0)):
+        left = garden.is_free(tip, -0.7, 0.7) + garden.is_free(tip, -0.5, 1.1)
+        right = garden.is_free(tip, 0.7, 0.7) + garden.is_free(tip, 0.5, 1.1)
         if left != right:
             tip.heading_rad += STEP * (1.6 if right > left else -1.6)
-    tip.spun += tip.heading_rad - before if tip.arch is None else 0
+    tip.total_turn_rad += tip.heading_rad - before if tip.arch is None else 0
 
 
 def _course(tip: Tip) -> tuple[float, float]:
-    """Where a vessel here wants to go, in rad, and how strongly, per degree of length."""
+    """Return the target heading, rad, and the strength of attraction per degree of length."""
     if tip.arch is not None:
         u = DISC[0] - tip.x
         rise = 1 - math.exp(-max(u + 0.8, 0) / 3.2)
@@ -186,8 +194,8 @@ def _course(tip: Tip) -> tuple[float, float]:
     return math.atan2(tip.y - DISC[1], tip.x - DISC[0]), 0.10
 
 
-def _branch(garden: Garden, tip: Tip) -> Tip:
-    """Split: the thinner daughter leaves at a wide angle, the thicker one goes on; w0^3 = w1^3 + w2^3 (Murray 1926)."""
+def _branch(garden: GrowthState, tip: Tip) -> Tip:
+    """Return the tip of a thinner branch; `tip`, which continues, is thinned and turned; w0^3 = w1^3 + w2^3."""
     rng = garden.rng
     ratio = rng.uniform(0.38, 0.62) if tip.width_deg > 0.2 else rng.uniform(0.55, 0.95)
     wide = tip.width_deg / (1 + ratio**3) ** (1 / 3)
@@ -198,13 +206,13 @@ def _branch(garden: Garden, tip: Tip) -> Tip:
     tip.heading_rad -= side * angle * 0.35 * ratio**2
     tip.width_deg = wide
     to_fovea = math.cos(heading - math.atan2(-tip.y, -tip.x))
-    return garden.seed(
-        Tip(tip.kind, tip.x, tip.y, heading, ratio * wide, None, to_fovea > 0.25, tip.family, side=-side)
+    return garden.number_tip(
+        Tip(tip.kind, tip.x, tip.y, heading, ratio * wide, None, to_fovea > 0.25, tip.lineage, side=-side)
     )
 
 
 def _tapered(points: list[tuple[float, float, float]], tip: Tip) -> NDArray[np.float32]:
-    """The path, with the last degree thinned where the vessel ends inside the eye."""
+    """Return the path (n, 3), with the width tapered over the last 1.2 degrees to a quarter."""
     path = np.array(points, np.float32)
     left = STEP * np.arange(len(path))[::-1]
     path[:, 2] *= np.clip(0.25 + left / 1.6, 0, 1)

@@ -9,7 +9,7 @@ from math import cos, radians, sin, sqrt, tan
 from pathlib import Path
 
 from device.optics.light_path import LightPath, load_light_path, relay_of
-from device.optics.matrix import places_mm, ring
+from device.optics.matrix import led_positions_mm, ring
 
 OPTICS = Path(__file__).parents[1] / "optics.toml"
 Place = tuple[float, float]
@@ -117,7 +117,7 @@ class Dimensions:
     @property
     def led_places_mm(self) -> list[Place]:
         """(x, z) of every LED of the board."""
-        return [(right, self.plate_z_mm + up) for right, up in places_mm(self.path.ring)]
+        return [(right, self.plate_z_mm + up) for right, up in led_positions_mm(self.path.ring)]
 
     @property
     def ring_places_mm(self) -> list[Place]:
@@ -161,7 +161,7 @@ class Dimensions:
     def light_mm(self, z_mm: float) -> float:
         """Width of the field's light so far before the iris, with room for a part around it."""
         relay = relay_of(self.path, self.path.optics)
-        return relay.clear_before_iris_mm(self.path.optics.field_deg, -z_mm) + 1.0
+        return relay.beam_before_iris_mm(self.path.optics.field_deg, -z_mm) + 1.0
 
     @property
     def block_z_mm(self) -> Place:

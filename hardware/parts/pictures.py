@@ -5,12 +5,13 @@ from pathlib import Path
 
 from build123d import Part
 
+from device.optics import field_extent
 from device.optics.light_path import relay_of
 from hardware.parts import assembly
 from hardware.parts.dimensions import Dimensions
 from hardware.parts.sheet import MEASURE, Sheet, labels
 from hardware.parts.view import Drawn, Offset, View, cut
-from services.instrument.plot import text
+from services.lab.plot import text
 
 BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring are
 UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
@@ -74,10 +75,10 @@ def section(d: Dimensions) -> str:
 def _light(d: Dimensions) -> str:
     """The field's outermost light: from the plate's front through the iris to the sensor."""
     relay, field, begin = relay_of(d.path, d.path.optics), d.path.optics.field_deg, d.block_z_mm[0]
-    before, iris = relay.clear_before_iris_mm(field, -begin) / 2, d.iris_mm / 2
-    end, sensor = d.image_z_mm, d.iris_mm / 2 + relay.half_shift_tan_mm(field)
+    before, iris = relay.beam_before_iris_mm(field, -begin) / 2, d.iris_mm / 2
+    end, sensor = d.image_z_mm, d.iris_mm / 2 + field_extent.half_shift_tan_mm(relay, field)
     upper = [(0, iris), (end, sensor), (end, -sensor), (0, -iris)]
-    plate, at_plate = d.plate_z_mm, relay.clear_before_iris_mm(field, -d.plate_z_mm) / 2
+    plate, at_plate = d.plate_z_mm, relay.beam_before_iris_mm(field, -d.plate_z_mm) / 2
     low, high = d.lens_y_mm - before, d.lens_y_mm + before
     return _outline([*upper, (plate, -at_plate), (begin, low), (begin, high), (plate, at_plate)])
 

@@ -1,28 +1,26 @@
-"""Whether the instrument could take a picture now: a list of checks, each with its limit and what to do.
+"""Health checks: whether the instrument can take a picture now, each with its value, limit and remedy.
 
-A check is one function from `Facts` to a `Check`, and a place in `CHECKS`. The instrument gathers the facts about
-itself (`services/instrument/wellbeing.py`), because it alone holds the head; this file judges and touches nothing.
+A check is a function from `StatusSnapshot` to `Check`, listed in `CHECKS`. services/health/collector.py collects the
+snapshot in the process of the instrument, which alone owns the head; the checks have no side effects.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 
+from device.config.operating_limits import is_battery_low, is_too_hot
 from device.errors import DiffuscopeError, StoreError
-
-PEOPLE_LEFT = 10  # a morning in a village, both eyes of each
-PLENTY = 200  # the page says no number above it either: it changes with every picture, and nobody plans by it
-LATE_S = 1.0  # beside its budget a picture needs an exposure and the writing
-HOTTEST_C = 80.0  # a Raspberry Pi slows down from here
-EARLIEST = datetime(2026, 1, 1, tzinfo=UTC)  # nobody had this instrument before
+from services.health import thresholds
+from services.health.thresholds import MAX_COMPUTER_C, MAX_LATENESS_S, MAX_SHOWN_VISITS, MIN_VISITS_LEFT
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the list; `of_release` says that another version could be the cause, so an update is judged by it.
+    """Result of one health check: measured value, limit, and remedy as texts.
 
-    Not `known`: the check is ok, but there were no data to judge by.
+    `of_release`: the release of the software may be the cause of a failure, so an update must pass this check.
+    `known`: False if the check is ok only because there were no data.
     """
 
     name: str
@@ -35,13 +33,15 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What an instrument knows of itself at one moment; None where it has no such part.
+class StatusSnapshot:
+    """Inputs of the health checks at one moment; None where the instrument has no such part.
 
-    `battery` is a share; `newest` when the last capture was; `presses` how long the last presses took, and by how much
-    each was later than it was allowed to be; `torn_bytes` the size of each incomplete capture; `orphans` the number of
-    capture folders without a row; `damaged` the number of captures and visits whose row cannot be read; `unsent` the
-    number of visits that wait to be sent, and how many of them need manual help (None: sending is not set up).
+    `problem`, `calibration`, `store`: error of that part or None; `captures_left`, `people_left`: captures and visits
+    that fit on the disk; `battery`: charge, 0 to 1, or the error of its reading; `emptiest`: lowest charge; `newest`:
+    time of the last capture; `presses`: (duration, lateness) in s of the last captures, where lateness is the duration
+    minus the time budget; `torn_bytes`: size of each quarantined capture; `orphans`: number of complete capture folders
+    without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
+    upload queue and of those that need help from a user (None: upload is not set up).
     """
 
     state: str
@@ -66,8 +66,8 @@ class Facts:
     unsent: tuple[int, int] | None = None
 
 
-def camera(facts: Facts) -> Check:
-    """The head is open, plans are made, and nothing has gone wrong since the last frame."""
+def camera(facts: StatusSnapshot) -> Check:
+    """Check that no problem prevents captures and that the instrument has started; fails during a calibration too."""
     value, remedy = "open", ""
     if facts.problem is not None:
         value, remedy = facts.problem.message, facts.problem.remedy
@@ -76,116 +76,128 @@ def camera(facts: Facts) -> Check:
     return Check("camera", not remedy, value, "open, and nothing wrong", remedy, of_release=True)
 
 
-def lamp(facts: Facts) -> Check:
-    """The lamp is dark at least once within 2 `max_on_s`."""
+def lamp(facts: StatusSnapshot) -> Check:
+    """Check that the lamp was dark at least once within twice the longest permitted light (`max_on_s`)."""
     value = "dark" if facts.lamp_is_dark else "does not go out"
-    return Check("lamp", facts.lamp_is_dark, value, "dark when nobody looks", STAY_AWAY, of_release=True)
+    return Check("lamp", facts.lamp_is_dark, value, "dark when nobody looks", LAMP_REMEDY, of_release=True)
 
 
-STAY_AWAY = "Keep every eye away from the device. Turn it off, and call the technician."
+LAMP_REMEDY = "Keep every eye away from the device. Turn it off, and call the technician."
 
 
-def calibration(facts: Facts) -> Check:
-    """It belongs to this head and to this mode of its sensor."""
-    return _unless(facts.calibration, "calibration", "fits", "fits this head", of_release=True)
+def calibration(facts: StatusSnapshot) -> Check:
+    """Check that no calibration error forbids captures (missing, of another head or sensor mode, expired, stale)."""
+    return _result(facts.calibration, "calibration", "fits", "fits this head", of_release=True)
 
 
-def captures(facts: Facts) -> Check:
-    """The store accepts a file and returns the newest capture; no capture folder without a row, no damaged row."""
+def captures(facts: StatusSnapshot) -> Check:
+    """Check that the store accepts a file and returns the newest capture, and has no orphans and no damaged rows.
+
+    Orphan: complete capture folder without a row.
+    """
     limit = "can be written and read"
     if facts.store is not None:
-        return _unless(facts.store, "captures", "", limit, of_release=True)
-    said, remedies = [], []
+        return _result(facts.store, "captures", "", limit, of_release=True)
+    problems, remedies = [], []
     if facts.orphans:
-        many = _number(facts.orphans, "capture is", "captures are")
-        said.append(f"{many} on the disk without an entry in the database")
-        remedies.append(ORPHANED)
+        many = _count(facts.orphans, "capture is", "captures are")
+        problems.append(f"{many} on the disk without an entry in the database")
+        remedies.append(ORPHANS_REMEDY)
     if facts.damaged:
-        many = _number(facts.damaged, "entry", "entries")
-        said.append(f"{many} of the database cannot be read")
-        remedies.append(DAMAGED)
-    return Check("captures", not said, "; ".join(said) or "safe", limit, " ".join(remedies), of_release=True)
+        many = _count(facts.damaged, "entry", "entries")
+        problems.append(f"{many} of the database cannot be read")
+        remedies.append(DAMAGED_REMEDY)
+    return Check("captures", not problems, "; ".join(problems) or "safe", limit, " ".join(remedies), of_release=True)
 
 
-ORPHANED = (
+ORPHANS_REMEDY = (
     "Pictures without an entry are not listed. They stay on the disk: remove nothing, copy the folder of the captures "
     "to another disk, and call the technician."
 )
-DAMAGED = "What has such an entry is not listed. Its pictures stay on the disk. Call the technician."
+DAMAGED_REMEDY = "What has such an entry is not listed. Its pictures stay on the disk. Call the technician."
 
 
-def _number(number: int, one: str, more: str) -> str:
+def _count(number: int, one: str, more: str) -> str:
     return f"{number} {one if number == 1 else more}"
 
 
-def space(facts: Facts) -> Check:
-    """Room for the people of a morning; what is half-kept gives its room up, so it is told and counted as free."""
+def space(facts: StatusSnapshot) -> Check:
+    """Check that the disk has space for MIN_VISITS_LEFT visits.
+
+    Quarantined captures count as free space; their number and size are in the value.
+    """
     people, torn = facts.people_left, facts.torn_bytes
-    value = f"{people} people" if people <= PLENTY else f"plenty, more than {PLENTY} people"
+    value = f"plenty, more than {MAX_SHOWN_VISITS} people" if thresholds.are_many_visits(people) else f"{people} people"
     if torn:
         value += f"; half-kept pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
-    ok = people >= PEOPLE_LEFT
-    return Check("space", ok, value, f"at least {PEOPLE_LEFT}", "Copy captures away and make room.")
+    ok = not thresholds.are_few_visits(people)
+    return Check("space", ok, value, f"at least {MIN_VISITS_LEFT}", "Copy captures away and make room.")
 
 
-def battery(facts: Facts) -> Check:
-    """Enough for the next pictures."""
-    limit = f"more than {facts.emptiest:.0%}"
+def battery(facts: StatusSnapshot) -> Check:
+    """Check that the charge of the battery is at least `emptiest`; ok but not known without a gauge."""
+    limit = f"at least {facts.emptiest:.0%}"
     if facts.battery is None:
         return Check("battery", True, "no gauge", limit, "", known=False)
     if isinstance(facts.battery, DiffuscopeError):
-        return _unless(facts.battery, "battery", "", limit)
+        return _result(facts.battery, "battery", "", limit)
     return Check(
         "battery",
-        facts.battery > facts.emptiest,
+        not is_battery_low(facts.battery, facts.emptiest),
         f"{facts.battery:.0%}",
         limit,
         "Charge the device before the next patient.",
     )
 
 
-def heat(facts: Facts) -> Check:
-    """Neither the head nor the computer is too warm."""
-    limit = f"head {facts.warmest_c:.0f} C, computer {HOTTEST_C:.0f} C"
+def heat(facts: StatusSnapshot) -> Check:
+    """Check that head and computer are at most at their temperature limits; ok but not known without a reading."""
+    limit = f"head {facts.warmest_c:.0f} C, computer {MAX_COMPUTER_C:.0f} C"
     if isinstance(facts.head_c, DiffuscopeError):
-        return _unless(facts.head_c, "heat", "", limit)
-    warm = [(facts.head_c, facts.warmest_c, "head"), (facts.computer_c, HOTTEST_C, "computer")]
-    said = ", ".join(f"{name} {is_c:.0f} C" for is_c, _, name in warm if is_c is not None)
-    ok = all(is_c is None or is_c <= most_c for is_c, most_c, _ in warm)
-    if not said:
+        return _result(facts.head_c, "heat", "", limit)
+    temperatures = [(facts.head_c, facts.warmest_c, "head"), (facts.computer_c, MAX_COMPUTER_C, "computer")]
+    readings = ", ".join(f"{name} {is_c:.0f} C" for is_c, _, name in temperatures if is_c is not None)
+    ok = all(is_c is None or not is_too_hot(is_c, most_c) for is_c, most_c, _ in temperatures)
+    if not readings:
         return Check("heat", True, "not measured", limit, "", known=False)
-    return Check("heat", ok, said, limit, "Turn the device off, and let it cool in the shade.")
+    return Check("heat", ok, readings, limit, "Turn the device off, and let it cool in the shade.")
 
 
-def clock(facts: Facts) -> Check:
-    """Not before the newest capture, nor before there was such an instrument: dates on pictures depend on it."""
-    earliest = max(EARLIEST, facts.newest or EARLIEST)
+def clock(facts: StatusSnapshot) -> Check:
+    """Check that the date is not before EARLIEST_DATE or the newest capture: pictures carry this date.
+
+    Ok but not known if the network has not set the clock.
+    """
+    earliest = thresholds.earliest_date(facts.newest)
     how = "set by the network" if facts.clock_was_set else "never compared with another clock"
     value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
-    ok, remedy = facts.now >= earliest, "Set date and time before the next picture."
+    ok, remedy = not thresholds.is_date_wrong(facts.now, facts.newest), "Set date and time before the next picture."
     return Check("clock", ok, value, limit, remedy, known=facts.clock_was_set or not ok)
 
 
-def speed(facts: Facts) -> Check:
-    """The 99th percentile of the lateness of the last hundred presses, over their time budget, is at most LATE_S."""
-    limit = f"99 of 100 at most {LATE_S:g} s over their budget"
+def speed(facts: StatusSnapshot) -> Check:
+    """Check that the 99th percentile of the lateness of the last 100 captures is at most MAX_LATENESS_S.
+
+    Lateness: duration of a capture minus its time budget, s. Ok but not known without captures.
+    """
+    limit = f"99 of 100 at most {MAX_LATENESS_S:g} s over their budget"
     if not facts.presses:
         return Check("speed", True, "no pictures yet", limit, "", known=False)
     took_s, late_s = (sorted(column) for column in zip(*facts.presses, strict=True))
-    p50_s, p99_s, p99_late_s = _of(took_s, 0.5), _of(took_s, 0.99), _of(late_s, 0.99)
+    p50_s, p99_s, p99_late_s = _percentile(took_s, 0.5), _percentile(took_s, 0.99), _percentile(late_s, 0.99)
     value = f"half of {len(took_s)} pictures within {p50_s:.1f} s, 99 of 100 within {p99_s:.1f} s"
     if p99_late_s > 0:
         value += f", {p99_late_s:.1f} s over"
     remedy = "Turn the device off and on, and let it cool. If it stays slow, call the technician."
-    return Check("speed", p99_late_s <= LATE_S, value, limit, remedy)
+    return Check("speed", not thresholds.is_late(p99_late_s), value, limit, remedy)
 
 
-def _of(ordered_s: Sequence[float], share: float) -> float:
+def _percentile(ordered_s: Sequence[float], share: float) -> float:
     return ordered_s[math.ceil(share * len(ordered_s)) - 1]
 
 
-def sending(facts: Facts) -> Check:
-    """No finished visit needs manual help to reach the receiver."""
+def sending(facts: StatusSnapshot) -> Check:
+    """Check that no visit in the upload queue is stuck; ok but not known if upload is not set up."""
     limit = "nobody needs help to be sent"
     if facts.unsent is None:
         return Check("sending", True, "not set up", limit, "", known=False)
@@ -194,17 +206,17 @@ def sending(facts: Facts) -> Check:
     return Check("sending", stuck == 0, f"{waiting} wait, {stuck} of them need help", limit, remedy)
 
 
-def _unless(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
+def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
     return Check(name, False, error.message, limit, error.remedy, of_release)
 
 
-CHECKS: tuple[Callable[[Facts], Check], ...] = (
+CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, space, battery, heat, clock, speed, sending,
 )  # fmt: skip
 
 
-def judged(facts: Facts) -> list[Check]:
-    """Every check, in order; a check that is ok needs no remedy."""
+def run_checks(facts: StatusSnapshot) -> list[Check]:
+    """Return the result of every check, in the order of CHECKS."""
     return [check(facts) for check in CHECKS]

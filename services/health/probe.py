@@ -1,76 +1,114 @@
-"""Ask the running instrument from outside, over HTTP, as a page does: does it serve, and what do its checks say.
+"""External probe of the running instrument over HTTP: availability, version, health checks, and a live picture.
 
-Never unit state: a release whose server dies and is started anew for ever is "running" to systemd.
+The probe does not use the unit state: systemd calls a release "running" even if its server crashes in a restart loop.
 """
 
 import json
-import urllib.request
 from collections.abc import Sequence
 from dataclasses import asdict
-from http.client import HTTPException
 from importlib.metadata import version
-from typing import Any
+
+import httpx
+from pydantic import BaseModel
 
 from services.health.checks import Check
 
-AT = "http://127.0.0.1:8000"
-PATIENCE_S = 15.0  # for one answer; while the instrument starts anew its address accepts, and nobody answers
-BACK = "Turn the device off and on. If it does not come back, go back to the version before."
+BASE_URL = "http://127.0.0.1:8000"
+TIMEOUT_S = 15.0  # timeout of one answer; a restarting instrument accepts connections and does not answer
+RESTART_REMEDY = "Turn the device off and on. If it does not come back, go back to the version before."
 
 
-def ask(at: str, path: str, patience_s: float = PATIENCE_S) -> tuple[int, bytes]:
-    """The status and the body of one answer; OSError or HTTPException if there is none."""
-    request = urllib.request.Request(at + path, headers={"X-Controller": "health"})  # the lamp shines for no stranger
-    with urllib.request.urlopen(request, timeout=patience_s) as answer:  # the caller's own device, plain HTTP
-        return answer.status, answer.read()
+class ReportedUploads(BaseModel):
+    """Counts of the upload queue, as reported: `waiting` visits."""
+
+    waiting: int = 0
 
 
-def status(at: str = AT, patience_s: float = PATIENCE_S) -> dict[str, Any] | None:
-    """What the instrument says it does; None if it does not answer."""
+class ReportedStatus(BaseModel):
+    """Status of an instrument of any release, as reported: version, state, and counts of the upload queue.
+
+    None where the release does not report it, and for `sending` if upload is not set up.
+    """
+
+    version: str | None = None
+    state: str | None = None
+    sending: ReportedUploads | None = None
+
+
+def http_get(base_url: str, path: str, timeout_s: float = TIMEOUT_S) -> tuple[int, bytes]:
+    """Send a GET request; return status code and body of a successful answer.
+
+    httpx.HTTPError without an answer, and for an error status (400 or above). Each wait for the network takes at most
+    `timeout_s` seconds.
+    """
+    headers = {"X-Controller": "health"}  # required for a request that lights the lamp
+    with httpx.Client(timeout=timeout_s, trust_env=False) as client:  # this device: no proxy
+        answer = client.get(base_url + path, headers=headers).raise_for_status()
+    return answer.status_code, answer.content
+
+
+def status(base_url: str = BASE_URL, timeout_s: float = TIMEOUT_S) -> ReportedStatus | None:
+    """Return the status of the instrument, from `/api/status`; None without a valid answer within `timeout_s`."""
     try:
-        return dict(json.loads(ask(at, "/api/status", patience_s)[1]))
-    except (OSError, HTTPException, ValueError):
+        return ReportedStatus.model_validate_json(http_get(base_url, "/api/status", timeout_s)[1])
+    except (httpx.HTTPError, ValueError):
         return None
 
 
-def examine(at: str = AT, look: bool = False, patience_s: float = PATIENCE_S) -> list[Check]:
-    """Every check: those from outside first, then the instrument's own.
+def probe_instrument(base_url: str = BASE_URL, with_picture: bool = False, timeout_s: float = TIMEOUT_S) -> list[Check]:
+    """Return the checks of the probe (`page`, `version`), and those of the instrument; only `page` without an answer.
 
-    `look` also asks for one live picture, which shines for a moment as aiming does: lamp, camera and computation.
+    `with_picture` adds the check `picture`, unless the instrument is starting: one live picture, which lights the lamp
+    for a moment as aiming does, and tests lamp, camera and computation.
     """
-    said = status(at, patience_s)
+    reply = status(base_url, timeout_s)
     answers = Check(
-        "page", said is not None, "answers" if said else "does not answer", f"in {patience_s:g} s", BACK, True
+        "page",
+        reply is not None,
+        "answers" if reply else "does not answer",
+        f"in {timeout_s:g} s",
+        RESTART_REMEDY,
+        True,
     )
-    if said is None:
+    if reply is None:
         return [answers]
-    here = version("diffuscope")
-    runs = Check("version", said.get("version") == here, f"{said.get('version')}", f"{here}, as installed", BACK, True)
-    own = _own(at, patience_s)
-    ready = said.get("state") != "starting"
-    return [answers, runs, *own, *([_picture(at, patience_s)] if look and ready else [])]
+    installed = version("diffuscope")
+    version_check = Check(
+        "version",
+        reply.version == installed,
+        f"{reply.version}",
+        f"{installed}, as installed",
+        RESTART_REMEDY,
+        True,
+    )
+    own = _instrument_checks(base_url, timeout_s)
+    ready = reply.state != "starting"
+    return [answers, version_check, *own, *([_picture(base_url, timeout_s)] if with_picture and ready else [])]
 
 
-def _own(at: str, patience_s: float) -> list[Check]:
+def _instrument_checks(at: str, patience_s: float) -> list[Check]:
     try:
-        return [Check(**one) for one in json.loads(ask(at, "/api/health", patience_s)[1])["checks"]]
-    except (OSError, HTTPException, ValueError, KeyError, TypeError) as error:
-        return [Check("checks", False, f"cannot be read: {error}", "a list", BACK, True)]
+        return [Check(**one) for one in json.loads(http_get(at, "/api/health", patience_s)[1])["checks"]]
+    except (httpx.HTTPError, ValueError, KeyError, TypeError) as error:
+        return [Check("checks", False, f"cannot be read: {error}", "a list", RESTART_REMEDY, True)]
 
 
 def _picture(at: str, patience_s: float) -> Check:
-    """A live picture went all the way from the lamp to a JPEG."""
+    """Request one live picture and return the check `picture`: ok if the answer is a JPEG."""
     try:
-        code, body = ask(at, "/api/preview", patience_s)
-    except (OSError, HTTPException) as error:
-        return Check("picture", False, f"does not come: {error}", "a live picture", BACK, True)
+        code, body = http_get(at, "/api/preview", patience_s)
+    except httpx.HTTPError as error:
+        return Check("picture", False, f"does not come: {error}", "a live picture", RESTART_REMEDY, True)
     ok = code == 200 and body.startswith(b"\xff\xd8")
     value = f"{len(body)} bytes" if ok else "none came"
-    return Check("picture", ok, value, "a live picture", BACK, True)
+    return Check("picture", ok, value, "a live picture", RESTART_REMEDY, True)
 
 
 def table(checks: Sequence[Check]) -> str:
-    """The list for people: what is well, what is not, and what to do."""
+    """Return the checks as a text table: result, name, value, limit, and the remedy below each failed check.
+
+    Result: `ok`, `FAIL`, or `-` for a check that is ok only because there were no data.
+    """
     lines = []
     for check in checks:
         mark = "FAIL" if not check.ok else "ok  " if check.known else "-   "
@@ -81,5 +119,5 @@ def table(checks: Sequence[Check]) -> str:
 
 
 def as_json(checks: Sequence[Check]) -> list[dict[str, object]]:
-    """The list for machines."""
+    """Return the checks as objects for JSON, one dict of the fields of `Check` each."""
     return [asdict(check) for check in checks]

@@ -1,13 +1,13 @@
-"""`python -m services.identity`: run once by every boot, before the journal is kept and before there is a network."""
+"""Entry point `python -m services.identity`, run once per boot before the journal is flushed and the network starts."""
 
 import sys
 
 from device.clock import SystemClock
-from services.identity.birth import born
-from services.identity.boot import Computer
+from services.identity.apply_at_boot import Computer
+from services.identity.provision import load_or_create_identity
 
 if __name__ == "__main__":
     computer, clock = Computer(), SystemClock()
-    identity = born(computer.data / "identity", computer.serial(), clock)
-    computer.becomes(identity, clock)
+    identity = load_or_create_identity(computer.data / "identity", computer.serial(), clock)
+    computer.apply_identity(identity, clock)
     sys.stdout.write(f"This device is {identity.name}, serial {identity.serial}\n")

@@ -1,6 +1,6 @@
-"""A small authority per device, which can vouch for that device's own addresses and for nothing else.
+"""Certificate authority of one device, limited by name constraints (RFC 5280) to that device's own names and networks.
 
-A tablet that trusts it trusts this one device: its names and networks are written into it (RFC 5280, name constraints).
+A tablet that trusts the authority trusts this one device only.
 """
 
 from datetime import UTC, datetime, timedelta
@@ -13,23 +13,27 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from device.clock import Clock
 
-SHARED = "diffuscope.local"  # avahi publishes this name, whichever device it is
-ADDRESS = IPv4Address("10.42.0.1")  # of the access point, by NetworkManager's custom
+SHARED_HOST_NAME = "diffuscope.local"  # published by avahi on every device
+ACCESS_POINT_ADDRESS = IPv4Address("10.42.0.1")  # of the access point: NetworkManager's default
 NETWORKS = (IPv4Network("10.42.0.0/24"), IPv4Network("127.0.0.0/8"))
-# The first start may think it is 2020 or 2035: the authority must not depend on that.
-BEGIN, END = datetime(2020, 1, 1, tzinfo=UTC), datetime(2060, 1, 1, tzinfo=UTC)
-DAYS = 390  # of a server's certificate: browsers refuse those of more than 825
+# The clock at the first boot may be years wrong: the authority's validity does not depend on it.
+AUTHORITY_BEGIN, AUTHORITY_END = datetime(2020, 1, 1, tzinfo=UTC), datetime(2060, 1, 1, tzinfo=UTC)
+SERVER_CERTIFICATE_DAYS = 390  # validity of a server certificate; browsers refuse more than 825 days
 
 
-def authority(name: str, clock: Clock) -> tuple[bytes, bytes]:
-    """A new key and the certificate of its own that says for what it may speak, as PEM."""
+def create_authority(name: str, clock: Clock) -> tuple[bytes, bytes]:
+    """Return a new private key and a self-signed authority certificate limited to device `name`, both as PEM."""
     key = ec.generate_private_key(ec.SECP256R1())
-    permitted = [x509.DNSName(SHARED), x509.DNSName(f"{name}.local"), *(x509.IPAddress(one) for one in NETWORKS)]
-    whose = _named(f"{name} made {clock.wall():%Y-%m-%d}")
+    permitted = [
+        x509.DNSName(SHARED_HOST_NAME),
+        x509.DNSName(f"{name}.local"),
+        *(x509.IPAddress(one) for one in NETWORKS),
+    ]
+    subject = _distinguished_name(f"{name} made {clock.wall():%Y-%m-%d}")
     certificate = (
-        _builder(whose, whose, key.public_key())
-        .not_valid_before(BEGIN)
-        .not_valid_after(END)
+        _builder(subject, subject, key.public_key())
+        .not_valid_before(AUTHORITY_BEGIN)
+        .not_valid_after(AUTHORITY_END)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(x509.NameConstraints(permitted, None), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
@@ -38,18 +42,23 @@ def authority(name: str, clock: Clock) -> tuple[bytes, bytes]:
     return _pem(key), certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def server(authority_key: bytes, authority_crt: bytes, name: str, clock: Clock) -> tuple[bytes, bytes]:
-    """A new key and certificate for this device's server, as PEM: made at every boot, and never kept."""
+def create_server_certificate(
+    authority_key: bytes, authority_crt: bytes, name: str, clock: Clock
+) -> tuple[bytes, bytes]:
+    """Return a new private key and server certificate, signed by the authority, as PEM.
+
+    Made at every boot, never stored; valid for `SERVER_CERTIFICATE_DAYS`, beginning one day before the current time.
+    """
     signer = serialization.load_pem_private_key(authority_key, None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
     issuer = x509.load_pem_x509_certificate(authority_crt)
     key = ec.generate_private_key(ec.SECP256R1())
-    names = [x509.DNSName(SHARED), x509.DNSName(f"{name}.local"), x509.IPAddress(ADDRESS)]
-    start = clock.wall() - timedelta(days=1)  # for a tablet whose clock is a little behind
+    names = [x509.DNSName(SHARED_HOST_NAME), x509.DNSName(f"{name}.local"), x509.IPAddress(ACCESS_POINT_ADDRESS)]
+    start = clock.wall() - timedelta(days=1)  # tolerance for a tablet whose clock is behind
     certificate = (
-        _builder(_named(name), issuer.subject, key.public_key())
+        _builder(_distinguished_name(name), issuer.subject, key.public_key())
         .not_valid_before(start)
-        .not_valid_after(start + timedelta(days=DAYS))
+        .not_valid_after(start + timedelta(days=SERVER_CERTIFICATE_DAYS))
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
@@ -66,7 +75,7 @@ def _builder(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicK
     return started.serial_number(x509.random_serial_number()).add_extension(own, critical=False)
 
 
-def _named(common: str) -> x509.Name:
+def _distinguished_name(common: str) -> x509.Name:
     organisation = x509.NameAttribute(NameOID.ORGANIZATION_NAME, "Diffuscope")
     return x509.Name([organisation, x509.NameAttribute(NameOID.COMMON_NAME, common)])
 

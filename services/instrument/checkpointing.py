@@ -1,73 +1,69 @@
-"""Checkpoints of the SQLite write-ahead log (WAL) into the main database file while no picture is taken.
+"""Checkpoints of the SQLite write-ahead log (WAL) into the main database file while no capture is in progress.
 
-In the WAL, one wrong byte loses every row behind it.
+A wrong byte in the WAL loses every later row, so rows stay in it for a short time only.
 """
 
-import logging
 from collections.abc import Callable
-from threading import Event, Thread
+from threading import Event
 
 from device.clock import Clock
-from device.errors import StoreError
-from services.records.store import Store
+from services.periodic_worker import PeriodicWorker
+from services.records.capture_store import CaptureStore
 
-log = logging.getLogger(__name__)
-
-IDLE_S = 30.0  # without a press and without aiming, before a checkpoint
+IDLE_S = 30.0  # time without a press and live pictures before a checkpoint
 LOOK_S = 2.0
 
 
 class Checkpoints:
     """Background thread that checkpoints the WAL.
 
-    After `soon`: as soon as no picture is being taken (`takes_none`); otherwise: after IDLE_S without a press or aiming
-    (`is_idle`).
+    After `request`: as soon as no capture is in progress (`is_capture_free`); otherwise after IDLE_S without a press
+    or live pictures (`is_idle`).
     """
 
-    def __init__(self, store: Store, is_idle: Callable[[], bool], takes_none: Callable[[], bool], clock: Clock) -> None:
-        self._store, self._is_idle, self._takes_none, self._clock = store, is_idle, takes_none, clock
+    def __init__(
+        self, store: CaptureStore, is_idle: Callable[[], bool], is_capture_free: Callable[[], bool], clock: Clock
+    ) -> None:
+        self._store, self._is_idle, self._takes_none, self._clock = store, is_idle, is_capture_free, clock
         self._idle_since_s: float | None = None
-        self._soon, self._wake, self._closing = Event(), Event(), Event()
-        self._thread: Thread | None = None
+        self._soon = Event()
+        self._worker = PeriodicWorker("checkpoints", self._look, LOOK_S, "WAL checkpoint failed")
 
     def begin(self) -> None:
         """Start the thread, which calls `step` every LOOK_S."""
-        self._closing.clear()
-        self._thread = Thread(target=self._watch, name="checkpoints", daemon=True)
-        self._thread.start()
+        self._worker.begin()
 
     def close(self) -> None:
-        """Stop the thread and wait for its end; `Store.close` makes the last checkpoint."""
-        self._closing.set()
-        self._wake.set()
-        if self._thread is not None:
-            self._thread.join()
+        """Stop the thread and wait for its end; `CaptureStore.close` makes the last checkpoint."""
+        self._worker.close()
 
-    def soon(self) -> None:
+    def request(self) -> None:
         """Request a checkpoint; called after a visit is finished."""
         self._soon.set()
-        self._wake.set()
+        self._worker.wake()
 
     def step(self) -> bool:
-        """Checkpoint the WAL if a condition for it holds; return whether it was emptied."""
+        """Checkpoint a WAL that is not empty if a condition of the class holds; return whether this emptied the WAL.
+
+        Raises StoreError if the disk fails.
+        """
         now_s = self._clock.now_s()
         if not self._is_idle():
             self._idle_since_s = None
         elif self._idle_since_s is None:
             self._idle_since_s = now_s
-        rests = self._idle_since_s is not None and now_s - self._idle_since_s >= IDLE_S
-        if not self._takes_none() or not (rests or self._soon.is_set()) or self._store.log_bytes() == 0:
+        is_at_rest = self._idle_since_s is not None and now_s - self._idle_since_s >= IDLE_S
+        if (
+            not self._takes_none()
+            or not (is_at_rest or self._soon.is_set())
+            or self._store.write_ahead_log.length_bytes() == 0
+        ):
             return False
-        emptied = self._store.checkpoint()
+        emptied = self._store.write_ahead_log.checkpoint()
         if emptied:
             self._soon.clear()
         return emptied
 
-    def _watch(self) -> None:
-        while not self._closing.is_set():
-            try:
-                self.step()
-            except StoreError as error:  # the rows stay in the log; the next press says what the disk lacks
-                log.warning("the log of the database cannot be emptied: %s", error, extra={"code": error.code})
-            self._wake.wait(LOOK_S)
-            self._wake.clear()
+    def _look(self) -> bool:
+        self.step()
+        return False

@@ -1,13 +1,13 @@
-"""`diffuscope snapshots list|restore`: the way back, for a technician, from a migration that did harm."""
+"""Command `diffuscope snapshots list|restore`: list the snapshots of the database; restore one of them."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from device import atomic_io
 from device.clock import SystemClock
-from device.errors import NotKept
-from services.records import disk
+from services.errors import RecordNotFound
 from services.records.snapshots import Snapshots
 
 app = typer.Typer(help="The tables as they were before each migration, and the way back.", no_args_is_help=True)
@@ -16,12 +16,12 @@ Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 def _snapshots(data: Path) -> Snapshots:
     if not (data / "captures").is_dir():
-        raise NotKept(f"{data} holds no captures", "Give the folder of the captures with --data.")
+        raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
     return Snapshots(data / "shelf.sqlite", SystemClock())
 
 
 @app.command("list")
-def list_them(data: Data) -> None:
+def list_snapshots(data: Data) -> None:
     """Name the snapshots, the oldest tables first."""
     for name in _snapshots(data).names():
         typer.echo(name)
@@ -34,14 +34,14 @@ def restore(
     sure: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Put a snapshot in the place of the tables; stop the instrument first."""
-    from services.records.store import told  # the database library, which the other commands do not need
+    from services.records.storage_errors import storage_errors  # deferred: imports SQLAlchemy
 
     snapshots = _snapshots(data)
-    with told(), disk.alone(data / ".lock"):
+    with storage_errors(), atomic_io.file_lock(data / ".lock"):
         if name in snapshots.names() and (missing := snapshots.missing_from(name, data / "captures")):
             typer.echo(f"{len(missing)} captures were kept since, from {missing[0]} on.")
             typer.echo("They stay on the disk without an entry; answers given since are in the tables put aside only.")
         if not sure:
             typer.confirm(f"Go back to {name}?", abort=True)
-        aside = snapshots.put_back(name)
+        aside = snapshots.restore(name)
     typer.echo(f"The tables are those of {name}. What they replaced is in {aside}.")

@@ -1,25 +1,27 @@
-"""What a screening consists of, read from a TOML file: its pictures, its retakes, and the programme's own numbers."""
+"""Screening protocol, read from a TOML file: picture slots, retakes, reasons, and the settings of the programme."""
 
 from pathlib import Path
 from typing import Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from device.errors import NotKept
-from device.tables import Table, load_toml
+from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
+from services.errors import RecordNotFound
 
-STANDARD = Path(__file__).parent / "protocol.toml"
-CHOOSE = "Choose one of the pictures on the page."
+DEFAULT_PROTOCOL = Path(__file__).parent / "protocol.toml"
+CHOOSE_REMEDY = "Choose one of the pictures on the page."
 
 Reason = Literal["lids", "pupil", "cloudy", "still", "refused", "device", "other"]
 REASONS: tuple[Reason, ...] = get_args(Reason)
 Vision = Literal["6/6", "6/9", "6/12", "6/18", "6/24", "6/36", "6/60", "CF", "HM", "LP", "NLP"]
-VISIONS: tuple[Vision, ...] = get_args(Vision)  # the ladder, best first: counts fingers, hand movement, light, none
+VISIONS: tuple[Vision, ...] = get_args(
+    Vision
+)  # visual acuity, best first; CF counting fingers, HM hand motion, LP and NLP light perception and none
 
 
 class Slot(Table):
-    """One picture that a visit should have: of which eye, looking where."""
+    """One picture slot: id, eye, name of the field of view, and whether its picture is required."""
 
     id: str = Field(pattern="^[A-Za-z0-9-]{1,40}$")
     eye: Eye
@@ -28,7 +30,10 @@ class Slot(Table):
 
 
 class Programme(Table):
-    """The programme's own numbers: `vision_limit` is the least vision that is not referred."""
+    """Settings of the programme.
+
+    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers.
+    """
 
     vision_limit: Vision
     prefix: str = Field(pattern="^[A-Z]{0,4}$")
@@ -36,7 +41,10 @@ class Programme(Table):
 
 
 class Protocol(Table):
-    """Slots in the order in which they are taken, the reasons for which one cannot be, and the programme."""
+    """Screening protocol: picture slots in their order, permitted reasons why a picture is not possible, programme.
+
+    `retakes`: number of permitted retakes of a slot.
+    """
 
     slots: tuple[Slot, ...] = Field(min_length=1, max_length=16)
     reasons: tuple[Reason, ...] = REASONS
@@ -50,18 +58,18 @@ class Protocol(Table):
         return self
 
     def slot(self, id: str) -> Slot:
-        """The slot of that name; NotKept if there is none."""
+        """Return the slot with that id; RecordNotFound if there is none."""
         for slot in self.slots:
             if slot.id == id:
                 return slot
-        raise NotKept(f"there is no picture named {id!r} in the protocol", CHOOSE)
+        raise RecordNotFound(f"there is no picture named {id!r} in the protocol", CHOOSE_REMEDY)
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
-        """The eyes of which it wants a picture."""
+        """Return the eyes that have a required slot, OD first."""
         return tuple(eye for eye in EYES if any(slot.eye == eye and slot.required for slot in self.slots))
 
 
-def load_protocol(path: Path = STANDARD) -> Protocol:
-    """Read a protocol; SpecError names the file, the line and the key of the first mistake."""
+def load_protocol(path: Path = DEFAULT_PROTOCOL) -> Protocol:
+    """Return the protocol in a TOML file; SpecError with file, line and key of the first mistake."""
     return load_toml(path, Protocol)

@@ -1,4 +1,4 @@
-"""The index of the shelf: which captures were kept, and what each of their files must be."""
+"""SQLite schema of the capture store: tables, connections (WAL, synchronous=FULL), migrations, conversion to rows."""
 
 import json
 import math
@@ -17,6 +17,7 @@ from sqlalchemy import (
     REAL,
     URL,
     CheckConstraint,
+    Computed,
     Connection,
     Engine,
     ForeignKey,
@@ -32,12 +33,13 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
-from device.values import Capture
+from services.records.capture import Capture
+from services.records.capture_report import report_as_json
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 
 # WAL with FULL is the fastest pair that lost no acknowledged row in power-cut trials; NORMAL lost the last ones.
-BUSY_MS, CHECKPOINT_BUSY_MS = 5000, 200  # whoever writes waits; a checkpoint gives up and is tried again later
+BUSY_MS, CHECKPOINT_BUSY_MS = 5000, 200  # a writer waits; a checkpoint gives up and is retried later
 PRAGMAS = (
     f"PRAGMA busy_timeout = {BUSY_MS}",
     "PRAGMA journal_mode = WAL",
@@ -46,14 +48,26 @@ PRAGMAS = (
 )
 
 
-class Shelf(DeclarativeBase):
-    """All tables."""
+class Base(DeclarativeBase):
+    """Declarative base of all tables."""
 
 
-class CaptureRow(Shelf):
-    """One kept press; `taken_at` is UTC with six decimals, so that text sorts as time does."""
+def _report_entry(name: str, kind: str) -> Computed:
+    """Return the generated column of an entry of the report with that JSON type; null for another type or damage."""
+    entry = f"CASE json_type(report, '$.{name}') WHEN '{kind}' THEN json_extract(report, '$.{name}') END"
+    return Computed(f"CASE WHEN json_valid(report) THEN {entry} END", persisted=False)
+
+
+class CaptureRow(Base):
+    """One stored capture; `report` is JSON, `simulated` 0 or 1.
+
+    `taken_at` is UTC text with six decimals of the second, so that text order is time order. SQLite computes `visit`,
+    `slot`, `verdict` and `laterality` (the last two JSON objects) from the report: they stand in one place, also after
+    a write by an earlier release.
+    """
 
     __tablename__ = "captures"
+    __mapper_args__: Mapping[str, bool] = {"eager_defaults": False}  # an insert reads no generated column back
 
     id: Mapped[str] = mapped_column(Text, primary_key=True)
     eye: Mapped[str] = mapped_column(Text)
@@ -61,6 +75,10 @@ class CaptureRow(Shelf):
     simulated: Mapped[int]
     calibration_id: Mapped[str] = mapped_column(Text)
     report: Mapped[str] = mapped_column(Text)
+    visit: Mapped[str | None] = mapped_column(Text, _report_entry("visit", "text"))
+    slot: Mapped[str | None] = mapped_column(Text, _report_entry("slot", "text"))
+    verdict: Mapped[str | None] = mapped_column(Text, _report_entry("verdict", "object"))
+    laterality: Mapped[str | None] = mapped_column(Text, _report_entry("laterality", "object"))
     files: Mapped[list["FileRow"]] = relationship(order_by="FileRow.name")
 
     __table_args__ = (
@@ -72,11 +90,13 @@ class CaptureRow(Shelf):
     )
 
 
-KEPT = literal_column("captures.rowid", Integer).label("kept")  # grows with each one that is kept, as no date does
+CAPTURE_ROWID = literal_column("captures.rowid", Integer).label(
+    "kept"
+)  # grows with each stored capture, independently of the clock
 
 
-class FileRow(Shelf):
-    """One kept file: its SHA-256 in hexadecimal digits and its length in bytes."""
+class FileRow(Base):
+    """One stored file of a capture: name, SHA-256 in hexadecimal digits, and length in bytes."""
 
     __tablename__ = "files"
 
@@ -92,8 +112,11 @@ class FileRow(Shelf):
     )
 
 
-class LightRow(Shelf):
-    """What an eye got in one slot of observed time (device/ledger.py), reservations that were not settled included."""
+class DoseRow(Base):
+    """Dose (J/cm2) of one eye in one interval of observed time, including reservations that were not settled.
+
+    `slot`: number of the interval, counted in SLOT_S from observed time 0.
+    """
 
     __tablename__ = "light_doses"
 
@@ -108,8 +131,11 @@ class LightRow(Shelf):
     )
 
 
-class SeenRow(Shelf):
-    """One row: how much time was seen until a moment of a boot, by which light ages."""
+class ObservedTimeRow(Base):
+    """Observed time of the dose ledger, by which doses expire; a table of one row.
+
+    `boot` and `now_s`: boot id and monotonic time (s) of the last observation; `observed_s`: total observed time (s).
+    """
 
     __tablename__ = "light_time"
 
@@ -121,8 +147,8 @@ class SeenRow(Shelf):
     __table_args__ = (CheckConstraint("id = 1", name="time_is_one"), {"sqlite_strict": True})
 
 
-class PersonRow(Shelf):
-    """Somebody who was here, known by a number alone."""
+class PatientRow(Base):
+    """One patient: patient number, and time of creation (UTC); no identifying field."""
 
     __tablename__ = "persons"
 
@@ -135,8 +161,8 @@ class PersonRow(Shelf):
     )
 
 
-class IdentifierRow(Shelf):
-    """What tells who a number is, apart from everything else: a name, a phone, a village; `value` is JSON."""
+class IdentifierRow(Base):
+    """One identifying field of a patient (name, phone, village), in a table of its own; `value` is JSON."""
 
     __tablename__ = "identifiers"
 
@@ -154,8 +180,11 @@ class IdentifierRow(Shelf):
 UNSENT = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
 
 
-class VisitRow(Shelf):
-    """One visit; `day` is the calendar's where the instrument stands, moments are UTC; `outcome` is JSON."""
+class VisitRow(Base):
+    """One visit of the patient with number `person`; `day` is the local date of its start, timestamps are UTC.
+
+    `finished_at` and `outcome` (JSON) are null in an unfinished visit.
+    """
 
     __tablename__ = "visits"
 
@@ -165,20 +194,22 @@ class VisitRow(Shelf):
     begun_at: Mapped[str] = mapped_column(Text)
     finished_at: Mapped[str | None] = mapped_column(Text)
     outcome: Mapped[str | None] = mapped_column(Text)
-    sent: Mapped[str | None] = mapped_column(Text)  # the `finished_at` of what was sent last
+    sent: Mapped[str | None] = mapped_column(Text)  # the `finished_at` of the last uploaded state
 
     __table_args__ = (
         CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="what_is_finished_has_an_outcome"),
         CheckConstraint("outcome IS NULL OR json_valid(outcome)", name="outcome_is_json"),
         Index("visits_by_time", "begun_at", "id"),
         Index("visits_by_day", "day"),
-        Index("visits_to_send", "finished_at", sqlite_where=text(UNSENT)),  # as small as what waits
+        Index(
+            "visits_to_send", "finished_at", sqlite_where=text(UNSENT)
+        ),  # partial index: only visits in the upload queue
         {"sqlite_strict": True},
     )
 
 
-class FieldRow(Shelf):
-    """One answer of a visit, written as soon as it was given; `value` is JSON."""
+class AnswerRow(Base):
+    """One answer of a visit to the form field `name`; `value` is JSON, `set_at` the UTC time of the answer."""
 
     __tablename__ = "fields"
 
@@ -194,8 +225,8 @@ class FieldRow(Shelf):
     )
 
 
-class ShotRow(Shelf):
-    """To which slot of which visit a capture belongs."""
+class CaptureSlotRow(Base):
+    """Visit and picture slot of a capture; a test picture has no such row."""
 
     __tablename__ = "shots"
 
@@ -206,8 +237,8 @@ class ShotRow(Shelf):
     __table_args__ = (Index("shots_by_visit", "visit"), {"sqlite_strict": True})
 
 
-class SlotRow(Shelf):
-    """What somebody decided about a slot: this capture, or could not and why, or neither: it is empty again."""
+class SlotDecisionRow(Base):
+    """Decision on one slot: the chosen `capture`, or the `reason` why no picture was possible, or neither (emptied)."""
 
     __tablename__ = "slots"
 
@@ -222,11 +253,12 @@ class SlotRow(Shelf):
     )
 
 
-class SendingRow(Shelf):
-    """What became of sending a visit as it was finished at that moment; before the first try there is none.
+class UploadRow(Base):
+    """State of the upload of a visit as finished at `finished_at`; no row before the first attempt.
 
-    `failing_since`, `error` and `said`: since when and why not. `confirmed` is by what the receiver proved that it has
-    it: the SHA-256 of the parcel, or its length alone.
+    `tries`: number of attempts; `failing_since`: time of the first failure; `error` and `said`: code and message of the
+    last one, null after success. `sent_at`, `sha256`, `confirmed`: time of the upload, digest of the archive, and
+    method of the receiver's confirmation ("sha256", or "length" only); null before success.
     """
 
     __tablename__ = "sendings"
@@ -249,8 +281,8 @@ class SendingRow(Shelf):
     )
 
 
-class CounterRow(Shelf):
-    """The last automatic number that was given under a prefix."""
+class CounterRow(Base):
+    """Counter of the last automatic patient number of a prefix, without check digit."""
 
     __tablename__ = "counters"
 
@@ -260,8 +292,8 @@ class CounterRow(Shelf):
     __table_args__ = (CheckConstraint("last >= 0", name="counters_count"), {"sqlite_strict": True})
 
 
-class KeyRow(Shelf):
-    """A request that was done, and its answer, so that its repetition does nothing."""
+class IdempotencyKeyRow(Base):
+    """Idempotency key of a completed request, with the SHA-256 of the request and the answer, such as a visit id."""
 
     __tablename__ = "keys"
 
@@ -278,9 +310,9 @@ class KeyRow(Shelf):
 
 
 def open_engine(path: Path) -> Engine:
-    """Connections to one SQLite file, safe to use from any thread; a connection that asks for `writing` waits its turn.
+    """Return an engine for one SQLite file, usable from any thread; transactions of `for_writing` are serialised.
 
-    The driver's own transaction handling is off: it would commit before schema changes and so tear a migration in two.
+    The driver's own transaction handling is off: its commit before each schema change would split a migration.
     """
     engine = create_engine(URL.create("sqlite", database=str(path)))
     event.listen(engine, "connect", _prepare)
@@ -289,7 +321,7 @@ def open_engine(path: Path) -> Engine:
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
-    """Set up one new connection of the driver."""
+    """Set up one new connection: no transaction handling by the driver, text decoding by `_decoded`, PRAGMAS."""
     connection.isolation_level = None
     connection.text_factory = _decoded
     for pragma in PRAGMAS:
@@ -297,27 +329,30 @@ def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
 
 
 def _decoded(content: bytes) -> str:
-    """Text as it is, also where it is no UTF-8: `reading` refuses that for its row, the driver would for all rows."""
+    """Decode stored text; bytes that are not UTF-8 become lone surrogates, which row_validation refuses row by row."""
     return content.decode(errors="surrogateescape")
 
 
 def _begin(connection: Connection) -> None:
-    """Begin for reading, or take the one place for writing at once: taking it halfway through cannot be waited for."""
+    """Begin a transaction; with `for_writing` take the write lock at once: an upgrade of a read lock cannot wait."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
 def for_writing(engine: Engine) -> Engine:
-    """The same connections, for a transaction that writes."""
+    """Return the engine with the option that makes its transactions take the write lock at the beginning."""
     return engine.execution_options(writing=True)
 
 
 def checkpoint(engine: Engine) -> bool:
-    """Write the rows of the write-ahead log into the main file, on the disk when this returns, and empty the log.
+    """Write the rows of the write-ahead log into the main file, with fsync, and truncate the log; return True.
 
-    False if another connection reads or writes longer than CHECKPOINT_BUSY_MS: then no row has moved, or some have.
+    Return False if another connection reads or writes longer than CHECKPOINT_BUSY_MS: then none or only some of the
+    rows were written, and the log is not truncated.
     """
-    with closing(engine.raw_connection()) as pooled:  # a transaction, which `connect` would begin, may not checkpoint
+    with closing(
+        engine.raw_connection()
+    ) as pooled:  # `connect` would begin a transaction, in which a checkpoint is impossible
         connection: Any = pooled.driver_connection
         connection.execute(f"PRAGMA busy_timeout = {CHECKPOINT_BUSY_MS}").close()
         try:
@@ -328,10 +363,11 @@ def checkpoint(engine: Engine) -> bool:
 
 
 def migrate(engine: Engine, before: Callable[[str], None]) -> None:
-    """Bring the tables to this version in one transaction, and leave tables of a newer version as they are.
+    """Migrate the tables to the schema of this release in one transaction; leave tables of a newer schema unchanged.
 
-    A newer version is met after an update was rolled back. It only added (README, "add a column"), so we can go on.
-    `before` hears the version of tables that are about to change; what it raises leaves them as they are.
+    A newer schema is present after a rollback of an update. Releases only add to the schema (README), so this release
+    works with a newer one. `before` is called with the present revision before the migration of existing tables; an
+    exception of `before` cancels the migration.
     """
     config = migration_config()
     scripts = ScriptDirectory.from_config(config)
@@ -348,21 +384,24 @@ def migrate(engine: Engine, before: Callable[[str], None]) -> None:
 
 
 def migration_config() -> Config:
-    """Alembic's settings; the migrations travel inside the package."""
+    """Return Alembic's configuration, with the folder of the migrations in this package."""
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
     return config
 
 
 def utc_text(moment: datetime) -> str:
-    """A moment as UTC text that sorts as time does; refuses a time without a zone (SettingError)."""
+    """Return a timestamp as UTC text (ISO 8601, microseconds) that sorts by time; SettingError without a time zone."""
     if moment.tzinfo is None:
         raise SettingError(f"the moment {moment} has no time zone, so nobody can say when it was")
     return moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 
-def report_text(report: Mapping[str, Any]) -> str:
-    """A report as JSON; a number that is none (NaN, infinite) becomes null, for no picture is lost over a footnote."""
+def report_text(report: Mapping[str, object]) -> str:
+    """Return a report as JSON text; NaN and infinity become null, numpy values plain numbers and lists.
+
+    SettingError if a value of another type cannot be written as JSON.
+    """
     try:
         return json.dumps(_plain(report), allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -370,7 +409,7 @@ def report_text(report: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The same value in what JSON knows."""
+    """Convert numpy values, mappings and tuples to JSON types, NaN and infinity to None; return others unchanged."""
     match value:
         case np.generic() | np.ndarray():
             return _plain(value.tolist())
@@ -384,13 +423,16 @@ def _plain(value: Any) -> Any:
 
 
 def row_of(capture: Capture, lengths_bytes: Mapping[str, int]) -> CaptureRow:
-    """The rows to insert for a capture whose `files` holds the digests."""
+    """Return the row to insert for a capture, with one FileRow per file; `capture.files` holds the SHA-256 by name.
+
+    `lengths_bytes`: length by file name. SettingError for an invalid report or a timestamp without a time zone.
+    """
     return CaptureRow(
         id=capture.id,
         eye=capture.eye,
         taken_at=utc_text(capture.taken_at),
         simulated=int(capture.simulated),
         calibration_id=capture.calibration_id,
-        report=report_text(capture.report),
+        report=report_text(report_as_json(capture.report)),
         files=[FileRow(name=name, sha256=digest, bytes=lengths_bytes[name]) for name, digest in capture.files.items()],
     )

@@ -1,50 +1,51 @@
-"""The tables as an earlier release left them: copied before every migration, and put back by hand if it must be.
+"""Snapshots of the database before each migration, and their restoration by a technician.
 
-    FOLDER/<schema>-<date>.db     one for each of the last three versions of the tables, whole or not there
-    FOLDER/replaced-<n>/          tables in whose place a snapshot was put
+    FOLDER/<schema>-<date>.db     one for each of the last three schema versions, written atomically
+    FOLDER/replaced-<n>/          database files that a restored snapshot replaced
 
-A release that is rolled back reads the newer tables (README, "add a column"), so nobody needs these in ordinary life:
-they are for a migration that did harm. Only tables are copied; the files of captures never change.
+After a rollback of an update the older release reads the newer tables (README, "Add a column"), so snapshots are needed
+only after a harmful migration. They hold the database only: migrations do not change the files of captures.
 """
 
-import os
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+from device import atomic_io
 from device.clock import Clock
-from device.errors import NotKept, StoreDamaged, StoreError, StoreFull
-from services.records import disk
+from device.errors import StoreError, StoreFull
+from services.errors import RecordNotFound, StoreDamaged
 
-KEPT = 3
-LOGS = ("journal", "wal", "shm")  # SQLite would apply what is left of them to whatever lies beside them
-SLACK_BYTES = 10_000_000  # what the system may write meanwhile
+KEPT_VERSIONS = 3
+LOG_SUFFIXES = ("journal", "wal", "shm")  # SQLite would apply a leftover log to the restored database
+MARGIN_BYTES = 10_000_000  # margin for other writers
 
 
 class Snapshots:
-    """The snapshots of one shelf, in a folder of their own."""
+    """Snapshots of one database file, in the folder `snapshots` beside it."""
 
-    def __init__(self, shelf: Path, clock: Clock, free_bytes: Callable[[Path], int] = disk.free_bytes) -> None:
-        self.shelf, self.folder = shelf, shelf.parent / "snapshots"
+    def __init__(self, database: Path, clock: Clock, free_bytes: Callable[[Path], int] = atomic_io.free_bytes) -> None:
+        self.database, self.folder = database, database.parent / "snapshots"
         self._clock, self._free_bytes = clock, free_bytes
 
     def names(self) -> list[str]:
-        """Those that there are, the oldest tables first."""
+        """Return the names of the snapshots, oldest schema first."""
         return sorted(path.name for path in self.folder.glob("*.db"))
 
-    def make(self, schema: str) -> None:
-        """Copy the tables, which are of the version `schema`; on the disk when this returns.
+    def create(self, schema: str) -> None:
+        """Copy the database, whose schema version is `schema`; the copy is durable when the call returns.
 
-        StoreFull if there is no room for the copy and for what the migration writes. A power cut leaves it whole, or
-        not there; the next start, which still has the migration before it, makes another in its place.
+        Atomic write: after a power cut the copy is complete or absent, and the next start repeats it before the
+        migration. Snapshots older than the last KEPT_VERSIONS schema versions are deleted. StoreFull if the space does
+        not suffice for the copy and the migration; OSError or sqlite3.Error if the copy fails.
         """
-        disk.make_folder(self.folder)
+        atomic_io.make_folder(self.folder)
         name = f"{schema}-{self._clock.wall():%Y%m%dT%H%M%S}.db"
         part = self.folder / ".part"
         part.unlink(missing_ok=True)
-        with _connected(self.shelf) as tables:
+        with _connected(self.database) as tables:
             size_bytes = _number(tables, "page_count") * _number(tables, "page_size")
             self._refuse_without_room(size_bytes)
             try:
@@ -52,63 +53,68 @@ class Snapshots:
             except sqlite3.Error:
                 part.unlink(missing_ok=True)
                 raise
-        _settle_file(part)
-        part.rename(self.folder / name)
-        disk.settle(self.folder)
-        self._thin_out(name)
+        atomic_io.fsync_file(part)
+        atomic_io.replace_durably(part, self.folder / name)
+        self._delete_old(name)
 
-    def put_back(self, name: str) -> Path:
-        """Put a snapshot in the place of the tables, and those aside; the folder they are in.
+    def restore(self, name: str) -> Path:
+        """Replace the database by a snapshot; return the folder that holds the replaced files.
 
-        Errors: NotKept, StoreDamaged (the snapshot is not whole), StoreError (the instrument runs). A power cut in
-        between leaves a shelf that refuses to open; putting back once more mends it.
+        Errors: RecordNotFound (unknown name), StoreDamaged (the snapshot fails the integrity check), StoreError
+        (another process uses the database), OSError. After a power cut during the replacement the store may refuse to
+        open; a second restoration repairs it.
         """
         if name not in self.names():
-            raise NotKept(f"there is no snapshot {name!r}", "`diffuscope snapshots list` names them.")
+            raise RecordNotFound(f"there is no snapshot {name!r}", "`diffuscope snapshots list` names them.")
         _refuse_damaged(self.folder / name)
-        _refuse_in_use(self.shelf)
-        new = self.shelf.with_name(".shelf.part")
+        _refuse_in_use(self.database)
+        new = self.database.with_name(".shelf.part")
         shutil.copyfile(self.folder / name, new)
-        _settle_file(new)
-        disk.settle(self.shelf.parent)
-        aside = self._aside()
-        for present in (self.shelf, *(self.shelf.with_name(f"{self.shelf.name}-{log}") for log in LOGS)):
+        atomic_io.fsync_file(new)
+        atomic_io.fsync_folder(self.database.parent)
+        replaced = self._new_replaced_folder()
+        for present in (
+            self.database,
+            *(self.database.with_name(f"{self.database.name}-{log}") for log in LOG_SUFFIXES),
+        ):
             if present.exists():
-                present.rename(aside / present.name)
-                disk.settle(aside)
-                disk.settle(self.shelf.parent)  # the tables first: without them the shelf refuses to open
-        new.rename(self.shelf)
-        disk.settle(self.shelf.parent)
-        return aside
+                # The database first: the store refuses to open without it.
+                atomic_io.replace_durably(present, replaced / present.name)
+        atomic_io.replace_durably(new, self.database)
+        return replaced
 
     def missing_from(self, name: str, captures: Path) -> list[str]:
-        """The captures in a folder that a snapshot does not know: kept since."""
+        """Return the sorted names of the folders in `captures` without a row in the snapshot `name`: stored later."""
         with _connected(self.folder / name) as tables:
             known = {id for (id,) in tables.execute("SELECT id FROM captures")}
         return sorted(path.name for path in captures.glob("[!.]*") if path.name not in known)
 
-    def _aside(self) -> Path:
+    def _new_replaced_folder(self) -> Path:
+        """Create and return the next free folder `replaced-<n>`."""
         number = 1
         while (self.folder / f"replaced-{number}").exists():
             number += 1
-        disk.make_folder(self.folder / f"replaced-{number}")
+        atomic_io.make_folder(self.folder / f"replaced-{number}")
         return self.folder / f"replaced-{number}"
 
     def _refuse_without_room(self, size_bytes: int) -> None:
-        """The reserve of captures may be used: it is there so that the computer can start and be updated."""
-        need, free = 2 * size_bytes + SLACK_BYTES, self._free_bytes(self.shelf.parent)
-        if free < need:
+        """Raise StoreFull if less space than 2 `size_bytes` + MARGIN_BYTES is free, for the copy and the migration.
+
+        The reserve that captures leave free may be used, because it is meant for updates.
+        """
+        need, free = 2 * size_bytes + MARGIN_BYTES, self._free_bytes(self.database.parent)
+        if not atomic_io.has_room(need, free, reserve_bytes=0):
             raise StoreFull(
                 f"{free} bytes are free; {need} are needed to copy the tables before they are changed",
                 "No space left, so nothing was changed. Remove files from the disk, or go back to the version before.",
             )
 
-    def _thin_out(self, newest: str) -> None:
-        """The last one of each of the last versions stays, and the one just made whatever the clock says."""
-        last = {name.split("-")[0]: name for name in (*self.names(), newest)}
-        stay = {*sorted(last.values())[-KEPT:], newest}
+    def _delete_old(self, newest: str) -> None:
+        """Delete the snapshots except `newest` and the last one of each of the last KEPT_VERSIONS schema versions."""
+        newest_of_schema = {name.split("-")[0]: name for name in (*self.names(), newest)}
+        kept = {*sorted(newest_of_schema.values())[-KEPT_VERSIONS:], newest}
         for name in self.names():
-            if name not in stay:
+            if name not in kept:
                 (self.folder / name).unlink()
 
 
@@ -122,29 +128,27 @@ def _number(tables: sqlite3.Connection, pragma: str) -> int:
     return int(tables.execute(f"PRAGMA {pragma}").fetchone()[0])
 
 
-def _settle_file(path: Path) -> None:
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-
-
 def _refuse_damaged(path: Path) -> None:
     try:
         with _connected(path) as tables:
-            said = tables.execute("PRAGMA integrity_check").fetchone()[0]
+            result = tables.execute("PRAGMA integrity_check").fetchone()[0]
     except sqlite3.DatabaseError as error:
-        said = str(error)
-    if said != "ok":
-        raise StoreDamaged(f"{path.name} is damaged: {said}", "Choose another snapshot.")
+        result = str(error)
+    if result != "ok":
+        raise StoreDamaged(f"{path.name} is damaged: {result}", "Choose another snapshot.")
 
 
-def _refuse_in_use(shelf: Path) -> None:
-    """StoreError while anybody else has the tables open; those that cannot be read may be replaced as well."""
-    if not shelf.exists():
+def _refuse_in_use(database: Path) -> None:
+    """Raise StoreError if another process has the database open: then its journal mode cannot be changed to DELETE.
+
+    A missing or unreadable database is no error, because it may be replaced.
+    """
+    if not database.exists():
         return
-    with _connected(shelf) as tables:
+    with _connected(database) as tables:
         try:
             tables.execute("PRAGMA journal_mode = DELETE")
         except sqlite3.OperationalError as error:
             raise StoreError("the instrument is running", "Stop it first: systemctl stop diffuscope.") from error
         except sqlite3.DatabaseError:
-            return  # this is what snapshots are for
+            return  # unreadable: to be replaced

@@ -1,34 +1,36 @@
-"""A visit as a value, and its rules: which picture stands for a slot, what comes next, how it ends."""
+"""Visit as an immutable value, and its rules: chosen capture of a slot, next empty slot, outcome."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 from device.values import Eye
+from services.records.capture import PictureVerdict
+from services.records.json_values import FormValue
 from services.records.protocol import VISIONS, Protocol, Vision
 
-SIDE = {"OD": "right", "OS": "left"}
-URGENT = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
+EYE_WORDS = {"OD": "right", "OS": "left"}
+URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
 OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "send"]
 
 
 @dataclass(frozen=True)
-class Taken:
-    """One capture of a slot, and what was thought of it when it was made (None: nothing)."""
+class SlotCapture:
+    """One capture of a slot: capture id, and the verdict on its image quality (None: no verdict)."""
 
     capture: str
-    verdict: dict[str, Any] | None
+    verdict: PictureVerdict | None
 
     @property
-    def good(self) -> bool:
-        """Whether it was called good."""
-        return self.verdict is not None and self.verdict.get("word") == "good"
+    def is_good(self) -> bool:
+        """Return whether the verdict is "good"."""
+        return self.verdict is not None and self.verdict.is_good
 
 
 @dataclass(frozen=True)
-class Decided:
-    """What somebody decided about a slot: this capture, could not for a reason, or neither: empty again."""
+class SlotDecision:
+    """A user's decision on a slot: chosen capture id, or reason why a picture is not possible, or neither (emptied)."""
 
     capture: str | None = None
     reason: str | None = None
@@ -36,29 +38,32 @@ class Decided:
 
 @dataclass(frozen=True)
 class SlotState:
-    """One slot of a visit: everything that was taken, oldest first, and the one that stands for it."""
+    """One slot of a visit: all its captures, oldest first, and the user's decision (None: no decision)."""
 
-    taken: tuple[Taken, ...] = ()
-    decided: Decided | None = None
+    captures: tuple[SlotCapture, ...] = ()
+    decision: SlotDecision | None = None
 
     @property
     def state(self) -> Literal["empty", "taken", "could_not"]:
-        """Where it stands."""
-        if self.decided is not None and self.decided.reason is not None:
+        """Return `could_not` for a decision with a reason, `taken` if there is a chosen capture, else `empty`."""
+        if self.decision is not None and self.decision.reason is not None:
             return "could_not"
         return "empty" if self.chosen is None else "taken"
 
     @property
-    def chosen(self) -> Taken | None:
-        """What somebody chose; else the newest good one, or the newest of all."""
-        if self.decided is not None:
-            return next((one for one in self.taken if one.capture == self.decided.capture), None)
-        return max(enumerate(self.taken), key=lambda one: (one[1].good, one[0]), default=(0, None))[1]
+    def chosen(self) -> SlotCapture | None:
+        """Return the capture that the user chose; None if the decision names no capture of this slot.
+
+        Without a decision: the newest good capture, else the newest of all, None without captures.
+        """
+        if self.decision is not None:
+            return next((one for one in self.captures if one.capture == self.decision.capture), None)
+        return max(enumerate(self.captures), key=lambda one: (one[1].is_good, one[0]), default=(0, None))[1]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a visit ends: a code for the log, and one sentence for the person in charge."""
+    """Outcome of a visit: a code for programs, and the same as one sentence for the health worker."""
 
     code: OutcomeCode
     sentence: str
@@ -66,69 +71,82 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Visit:
-    """One visit of one person, with all that is known of it; moments are in UTC, `day` is the place's own."""
+    """One visit of the patient with that number; timestamps are UTC, `day` is the local date (ISO 8601).
+
+    `fields`: answers by form field; `slots`: state by slot id. `finished_at`, `outcome`: None in an unfinished visit.
+    """
 
     id: str
     number: str
     day: str
     begun_at: datetime
-    fields: Mapping[str, Any]
+    fields: Mapping[str, FormValue]
     slots: Mapping[str, SlotState]
     finished_at: datetime | None = None
     outcome: Outcome | None = None
 
     @property
     def next_slot(self) -> str | None:
-        """The first slot of which there is neither a picture nor a reason."""
+        """Return the id of the first empty slot in the order of the protocol; None if there is none."""
         return next((id for id, slot in self.slots.items() if slot.state == "empty"), None)
 
 
-def decided_after(slot: SlotState, new: Taken) -> Decided | None:
-    """What stays of a decision when the slot gets a new capture.
+def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:
+    """Return the decision that is valid for a slot after a new capture; `slot` is its state before, without `new`.
 
-    A better picture is worth more than an earlier choice; a picture ends a "could not"; where the slot had been
-    emptied, the new one stands alone.
+    None, so that the newest good capture counts: without a decision, after a decision with a reason, or if `new` is
+    good and the chosen capture is not. In an emptied slot `new` is chosen. Otherwise the decision stays.
     """
-    before = slot.decided
+    before = slot.decision
     if before is None or before.reason is not None:
         return None
     if before.capture is None:
-        return Decided(new.capture)
+        return SlotDecision(new.capture)
     chosen = slot.chosen
-    return None if new.good and not (chosen and chosen.good) else before
+    return None if new.is_good and not (chosen and chosen.is_good) else before
 
 
-def outcome(protocol: Protocol, fields: Mapping[str, Any], slots: Mapping[str, SlotState]) -> Outcome:
-    """How a visit ends by the programme's rules, the most urgent first; never a disease, never "normal"."""
-    urgent = [words for complaint, words in URGENT.items() if complaint in (fields.get("complaints") or ())]
+def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: Mapping[str, SlotState]) -> Outcome:
+    """Return the outcome of a visit by the rules of the programme: the first that applies, most urgent first.
+
+    Order: urgent complaint (`refer_today`), vision below the programme's limit (`refer_vision`), an eye without a
+    picture or with a required one not possible (`refer_picture`), else `send`. The sentence names no disease.
+    """
+    complaints = fields.get("complaints")
+    named = complaints if isinstance(complaints, list) else ()
+    urgent = [words for complaint, words in URGENT_COMPLAINTS.items() if complaint in named]
     if urgent:
         return Outcome("refer_today", f"See the doctor today: {' and '.join(urgent)}.")
     limit = protocol.programme.vision_limit
-    weak = [eye for eye in SIDE if _sees_less(fields.get(f"vision_{eye.lower()}"), limit)]
-    if weak:
-        return Outcome("refer_vision", f"Refer: vision of {_eyes(weak)} below {limit}.")
-    if lacking := _lacking(protocol, slots):
-        return Outcome("refer_picture", f"Refer: {'; '.join(lacking)}.")
+    low_vision = [eye for eye in EYE_WORDS if _is_below(fields.get(f"vision_{eye.lower()}"), limit)]
+    if low_vision:
+        return Outcome("refer_vision", f"Refer: vision of {_eyes(low_vision)} below {limit}.")
+    if missing_phrases := _missing_pictures(protocol, slots):
+        return Outcome("refer_picture", f"Refer: {'; '.join(missing_phrases)}.")
     empty = sum(slot.required and slots[slot.id].state == "empty" for slot in protocol.slots)
     missing = f", {empty} not taken" if empty else ""
     return Outcome("send", f"The pictures are kept{missing}. They are for an eye specialist.")
 
 
-def _sees_less(vision: Any, limit: Vision) -> bool:
+def _is_below(vision: FormValue, limit: Vision) -> bool:
     return vision is not None and VISIONS.index(cast(Vision, vision)) > VISIONS.index(limit)
 
 
-def _lacking(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[str]:
-    """What is said of eyes without a picture, or without a required one; what nobody tried was not impossible."""
+def _missing_pictures(protocol: Protocol, slots: Mapping[str, SlotState]) -> list[str]:
+    """Return a phrase for each group of eyes without any picture, or with a required picture that was not possible.
+
+    Not possible: the slot has the state `could_not`. A required slot that is only empty adds no phrase if the eye has
+    another picture.
+    """
     failed = {slot.eye for slot in protocol.slots if slot.required and slots[slot.id].state == "could_not"}
     seen = {slot.eye for slot in protocol.slots if slots[slot.id].state == "taken"}
-    said: tuple[tuple[str, list[Eye]], ...] = (
+    phrases: tuple[tuple[str, list[Eye]], ...] = (
         ("picture of {} not possible", [eye for eye in protocol.eyes if eye in failed and eye not in seen]),
         ("not every picture of {} possible", [eye for eye in protocol.eyes if eye in failed and eye in seen]),
         ("picture of {} not taken", [eye for eye in protocol.eyes if eye not in failed and eye not in seen]),
     )
-    return [words.format(_eyes(eyes)) for words, eyes in said if eyes]
+    return [words.format(_eyes(eyes)) for words, eyes in phrases if eyes]
 
 
 def _eyes(eyes: Sequence[str]) -> str:
-    return f"the {SIDE[eyes[0]]} eye" if len(eyes) == 1 else "both eyes"
+    return f"the {EYE_WORDS[eyes[0]]} eye" if len(eyes) == 1 else "both eyes"

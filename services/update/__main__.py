@@ -1,6 +1,7 @@
-"""`python -m services.update`: the words of `diffuscope update` without the rest of the program.
+"""Entry point `python -m services.update`: the subcommands of `diffuscope update` without the rest of the program.
 
-What judges a new version must not need what it judges: no numerics, no drivers, no server. The units call this.
+The systemd units run it. It commits a new version only if that version is healthy, so it must not depend on the
+checked parts: numerics, drivers and server are not imported.
 """
 
 from services.update.command import main

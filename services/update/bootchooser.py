@@ -1,13 +1,14 @@
 #!/usr/bin/python3 -IS
-"""Which slot a Raspberry Pi boots: RAUC's custom boot chooser over `autoboot.txt` and tryboot.
+"""Boot slot selection on a Raspberry Pi: RAUC's custom boot chooser over `autoboot.txt` and tryboot.
 
-    autoboot.txt   [all] names the committed slot, which every boot takes; [tryboot] the other one
-    tryboot        a word given to the firmware with an orderly restart: it boots [tryboot], once
+    autoboot.txt   [all] names the committed slot, used by every normal boot; [tryboot] names the other slot
+    tryboot        reboot argument for the firmware: it boots [tryboot] once
 
-So a slot is tried once. If nobody commits it, the next boot is the committed one again, whatever happened.
-`autoboot.txt` is written when a tried slot is committed, and never else. It lies on FAT, which has no journal, and the
-firmware has no second one: so its two numbers are swapped where they stand, in the file's one sector, and nothing else
-of that filesystem is touched. Standard library only: it must work where the release does not.
+A slot ("A" or "B") is an operating system with its boot partition. The uncommitted slot is tried for one boot: without
+a commit the next boot uses the committed slot again. `autoboot.txt` is written at a commit only. It is on FAT, which
+has no journal, and the firmware reads no second file: so the commit swaps its two numbers in place, in the file's only
+sector, and changes nothing else on that file system. Standard library only: this program must run when the release does
+not.
 """
 
 import os
@@ -16,30 +17,30 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-PARTITIONS = {"A": 2, "B": 3}  # of the boot partitions; the first one holds autoboot.txt and nothing else
+PARTITIONS = {"A": 2, "B": 3}  # boot partitions; partition 1 holds autoboot.txt only
 SLOTS = {number: slot for slot, number in PARTITIONS.items()}
-TRY = "0 tryboot\n"
-SECTOR_BYTES = 512  # what a disk writes as one, and all that the firmware reads of autoboot.txt
-CHOICE = re.compile(
+TRYBOOT_ARGUMENT = "0 tryboot\n"
+SECTOR_BYTES = 512  # unit of an atomic disk write; the firmware reads no more of autoboot.txt
+AUTOBOOT_FORMAT = re.compile(
     rb"([^[]*\[all\]\s[^[]*\nboot_partition=)([23])(\s[^[]*\[tryboot\]\s+boot_partition=)([23])((?:\s[^[]*)?)"
 )
 
 
 @dataclass(frozen=True)
 class BootChooser:
-    """The choice and where it is kept; `autoboot` is the file, `state` a folder that both slots see.
+    """Slot selection and its files: `autoboot` is autoboot.txt, `state` the shared folder of the bad marks.
 
-    `reboot_word` is the file whose line systemd hands to the firmware with a restart; it is gone after every boot, and
-    so is the wish to try. `command_line` is the kernel's: `rauc.slot=` says which slot was booted.
+    `reboot_argument` is the file whose line systemd passes to the firmware at a reboot; it is on a tmpfs, so the
+    request to try a slot ends with each boot. `command_line` is the kernel's: `rauc.slot=` names the booted slot.
     """
 
     autoboot: Path = Path("/boot/chooser/autoboot.txt")
     state: Path = Path("/var/lib/diffuscope-update")
-    reboot_word: Path = Path("/run/systemd/reboot-param")
+    reboot_argument: Path = Path("/run/systemd/reboot-param")
     command_line: Path = Path("/proc/cmdline")
 
     def booted(self) -> str:
-        """The slot that runs; ValueError if the kernel was not told."""
+        """Return the running slot, "A" or "B"; ValueError if the kernel command line does not name it."""
         words = self.command_line.read_text().split()
         slot = next((word.removeprefix("rauc.slot=") for word in words if word.startswith("rauc.slot=")), "")
         if slot not in PARTITIONS:
@@ -47,56 +48,62 @@ class BootChooser:
         return slot
 
     def committed(self) -> str:
-        """The slot that every boot takes which is not a try; ValueError if `autoboot.txt` does not say."""
+        """Return the slot of every normal boot, "A" or "B"; ValueError if `autoboot.txt` is invalid."""
         return SLOTS[int(self._choice()[2])]
 
     def is_trying(self) -> bool:
-        """Whether the slot that runs has yet to be committed."""
+        """Return whether the running slot is not yet committed."""
         return self.booted() != self.committed()
 
     def primary(self) -> str:
-        """The slot that an orderly restart would boot now."""
-        wanted = self.reboot_word.read_text() if self.reboot_word.exists() else ""
-        return other(self.committed()) if wanted == TRY else self.committed()
+        """Return the slot of the next orderly reboot: the other slot if a try is requested, else the committed one."""
+        wanted = self.reboot_argument.read_text() if self.reboot_argument.exists() else ""
+        return other(self.committed()) if wanted == TRYBOOT_ARGUMENT else self.committed()
 
     def set_primary(self, slot: str) -> None:
-        """RAUC's last step of an install: the slot is whole. The committed slot is chosen by taking a try back."""
+        """Clear the bad mark of a slot and select it for the next boot; RAUC's last step of an install.
+
+        The committed slot: cancel a requested try. The running, uncommitted slot: commit it. Otherwise: request a try.
+        """
         self._bad(slot).unlink(missing_ok=True)
         if slot == self.committed():
-            self.reboot_word.unlink(missing_ok=True)
+            self.reboot_argument.unlink(missing_ok=True)
         elif slot == self.booted():
             self._commit(slot)
         else:
-            write_whole(self.reboot_word, TRY)
+            write_atomically(self.reboot_argument, TRYBOOT_ARGUMENT)
 
     def is_good(self, slot: str) -> bool:
-        """False for a slot whose install was begun and not finished, or that was tried and did not do."""
+        """Return whether the slot has no bad mark; the mark means an unfinished install or a failed try."""
         return not self._bad(slot).exists()
 
     def set_good(self, slot: str) -> None:
-        """Of a slot that is being tried: commit it."""
+        """Clear the bad mark of a slot; if it is the running, uncommitted slot, commit it."""
         self._bad(slot).unlink(missing_ok=True)
         if slot == self.booted() and slot != self.committed():
             self._commit(slot)
 
     def set_bad(self, slot: str) -> None:
-        """RAUC's first step of an install; ValueError for the committed slot, which nobody may overwrite."""
+        """Set the bad mark of a slot (also RAUC's first step of an install); ValueError for the committed slot."""
         if slot == self.committed():
             raise ValueError(f"slot {slot} is the committed one: every boot that is not a try needs it")
-        write_whole(self._bad(slot), "")
+        write_atomically(self._bad(slot), "")
 
     def _bad(self, slot: str) -> Path:
         return self.state / f"slot-{slot.lower()}-is-bad"
 
     def _choice(self) -> re.Match[bytes]:
-        said = self.autoboot.read_bytes()
-        choice = CHOICE.fullmatch(said)
-        if choice is None or len(said) > SECTOR_BYTES:
-            raise ValueError(f"{self.autoboot} does not say which slot is committed: {said[:SECTOR_BYTES]!r}")
+        content = self.autoboot.read_bytes()
+        choice = AUTOBOOT_FORMAT.fullmatch(content)
+        if choice is None or len(content) > SECTOR_BYTES:
+            raise ValueError(f"{self.autoboot} does not say which slot is committed: {content[:SECTOR_BYTES]!r}")
         return choice
 
     def _commit(self, slot: str) -> None:
-        """Same file, same length, one sector: whatever a power cut leaves of this names a slot that works."""
+        """Make `slot` the committed one: write both partition numbers of autoboot.txt in place.
+
+        Length and sector stay the same, so that the file names a working slot after a power cut.
+        """
         choice = self._choice()
         now, next_try = (str(PARTITIONS[one]).encode() for one in (slot, other(slot)))
         descriptor = os.open(self.autoboot, os.O_WRONLY)
@@ -108,12 +115,12 @@ class BootChooser:
 
 
 def other(slot: str) -> str:
-    """The slot beside `slot`."""
+    """Return the other of the two slots."""
     return "B" if slot == "A" else "A"
 
 
-def write_whole(path: Path, content: str) -> None:
-    """The file is the old one or the new one, also after a power cut; not on FAT."""
+def write_atomically(path: Path, content: str) -> None:
+    """Write a file atomically: after a power cut it has the old or the new content. Not safe on FAT."""
     part = path.with_name(f"{path.name}.part")
     descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     try:
@@ -130,7 +137,10 @@ def write_whole(path: Path, content: str) -> None:
 
 
 def main(words: list[str], chooser: BootChooser) -> int:
-    """Answer RAUC (get-primary, set-primary, get-state, set-state) or systemd (`trying`); the exit status."""
+    """Run one command of RAUC (get-primary, set-primary, get-state, set-state) or systemd (`trying`).
+
+    Return the exit status: 0, 1 (`trying`: the slot is committed), or 254 after an error message.
+    """
     try:
         match words:
             case ["get-primary"]:

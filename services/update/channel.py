@@ -1,7 +1,7 @@
-"""The channel: one small signed file on a web server that says which bundle is the newest, and what it must be.
+"""Update channel: one small signed file on a web server that names the newest bundle, its size and its SHA-256.
 
-`channel.cms` is JSON inside a CMS signature by the same signer as the bundles, made with
-`openssl cms -sign -nodetach -binary -outform DER`. Its validity in time is not judged: the device has no trusted clock.
+`channel.cms` is JSON in a CMS signature by the signer of the bundles, made with `openssl cms -sign -nodetach -binary
+-outform DER`. The validity period is not checked: the device has no trusted clock.
 """
 
 import hashlib
@@ -10,16 +10,16 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from device.errors import UpdateDamaged, UpdateForeign
-from services.records.update_notes import Found
+from services.errors import UpdateDamaged, UpdateUntrusted
+from services.update.ipc import FoundUpdate
 
-NAME = "channel.cms"
+CHANNEL_FILE = "channel.cms"
 
 
 class Offer(BaseModel):
-    """What a channel offers."""
+    """Content of the channel file: device type, version, file name, size and SHA-256 of the newest bundle."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)  # a later release may say more
+    model_config = ConfigDict(extra="ignore", frozen=True)  # later releases may add fields
     compatible: str
     version: str
     bundle: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.raucb$")
@@ -27,21 +27,26 @@ class Offer(BaseModel):
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
 
-def opened(signed: bytes, keyring: Path) -> Offer:
-    """The offer inside a signed file; UpdateForeign if somebody else signed it, UpdateDamaged if it cannot be read."""
-    words = ["openssl", "cms", "-verify", "-inform", "DER", "-binary", "-CAfile", str(keyring), "-no_check_time"]
-    done = subprocess.run(words, input=signed, capture_output=True, timeout=30)
+def verify_channel(signed: bytes, keyring: Path) -> Offer:
+    """Return the offer in `signed` (CMS, DER); `keyring` is the file of trusted CA certificates.
+
+    UpdateUntrusted for a signer outside the keyring; UpdateDamaged for another signature error or invalid content.
+    """
+    command = ["openssl", "cms", "-verify", "-inform", "DER", "-binary", "-CAfile", str(keyring), "-no_check_time"]
+    done = subprocess.run(command, input=signed, capture_output=True, timeout=30)
     if done.returncode != 0:
-        said = done.stderr.decode(errors="replace")
-        kind = UpdateForeign if "certificate verify error" in said or "issuer" in said else UpdateDamaged
-        raise kind(f"the channel's signature does not hold: {said.strip().splitlines()[-1] if said.strip() else ''}")
+        stderr = done.stderr.decode(errors="replace")
+        kind = UpdateUntrusted if "certificate verify error" in stderr or "issuer" in stderr else UpdateDamaged
+        raise kind(
+            f"the channel's signature does not hold: {stderr.strip().splitlines()[-1] if stderr.strip() else ''}"
+        )
     try:
         return Offer.model_validate_json(done.stdout)
     except ValidationError as error:
         raise UpdateDamaged(f"the channel is signed and says nothing that can be used: {error}") from error
 
 
-def as_found(offer: Offer) -> Found:
-    """An offer as a technician chooses it, by a name that only this offer has."""
+def as_found_update(offer: Offer) -> FoundUpdate:
+    """Return an offer as an entry of the list of found updates; its id is a hash of version and SHA-256."""
     id = hashlib.sha256(f"channel {offer.version} {offer.sha256}".encode()).hexdigest()[:16]
-    return Found(id=id, where="channel", name=offer.bundle, bytes=offer.bytes, version=offer.version)
+    return FoundUpdate(id=id, where="channel", name=offer.bundle, bytes=offer.bytes, version=offer.version)

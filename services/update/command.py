@@ -1,4 +1,4 @@
-"""`diffuscope update check|install|restart|settle|answer|tidy|status`: what a technician, a timer and a boot call."""
+"""Command line `diffuscope update check|install|restart|settle|answer|tidy|status`, for technician, timer and boot."""
 
 import json
 import sys
@@ -9,8 +9,8 @@ import typer
 
 from device.clock import SystemClock
 from device.errors import DiffuscopeError
-from services.update.gate import unsent
-from services.update.settings import PLACE, load
+from services.update.preconditions import waiting_uploads
+from services.update.settings import SETTINGS_PATH, load_settings
 from services.update.updater import Updater
 
 app = typer.Typer(help="Look for another version, install it, and see what became of it.", no_args_is_help=True)
@@ -18,20 +18,20 @@ Settings = Annotated[Path, typer.Option(help="Where updates come from and when t
 
 
 def _updater(settings: Path) -> Updater:
-    return Updater(load(settings), SystemClock(), typer.echo)
+    return Updater(load_settings(settings), SystemClock(), typer.echo)
 
 
 @app.command()
 def check(
-    settings: Settings = PLACE,
+    settings: Settings = SETTINGS_PATH,
     download: Annotated[bool, typer.Option("--download", help="Fetch it already, and install nothing.")] = False,
 ) -> None:
     """Ask the channel whether there is a newer version."""
     updater = _updater(settings)
     updater.tidy()
     offer = updater.check(download)
-    typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.runs}.")
-    if offer and (waiting := unsent(load(settings).instrument)):
+    typer.echo(f"Version {offer.version} is offered." if offer else f"Nothing is newer than {updater.running_version}.")
+    if offer and (waiting := waiting_uploads(load_settings(settings).instrument)):
         typer.echo(f"Waiting to be sent: {waiting}. They stay on the device, and are sent after the update.")
 
 
@@ -40,7 +40,7 @@ def install(
     source: Annotated[
         Path | None, typer.Argument(help="A bundle or a stick's folder; else any stick, else the channel.")
     ] = None,
-    settings: Settings = PLACE,
+    settings: Settings = SETTINGS_PATH,
     restart: Annotated[bool, typer.Option(help="Restart at once to try it.")] = True,
 ) -> None:
     """Install a newer version beside the one that runs, and restart to try it."""
@@ -48,32 +48,32 @@ def install(
 
 
 @app.command("restart")
-def restart_device(settings: Settings = PLACE) -> None:
+def restart_device(settings: Settings = SETTINGS_PATH) -> None:
     """Restart to try what is installed and waits."""
     _updater(settings).restart()
 
 
 @app.command()
-def settle(settings: Settings = PLACE) -> None:
+def settle(settings: Settings = SETTINGS_PATH) -> None:
     """In a version that is being tried: commit it if it is well, else fail, which restarts into the one before."""
     _updater(settings).settle()
 
 
 @app.command()
-def answer(settings: Settings = PLACE) -> None:
+def answer(settings: Settings = SETTINGS_PATH) -> None:
     """Do what was tapped on the technician's page; systemd calls this when the page has left a wish."""
     _updater(settings).answer()
 
 
 @app.command()
-def tidy(settings: Settings = PLACE) -> None:
+def tidy(settings: Settings = SETTINGS_PATH) -> None:
     """Write down that an update was interrupted, if nobody is at it any more."""
     _updater(settings).tidy()
 
 
 @app.command()
 def status(
-    settings: Settings = PLACE,
+    settings: Settings = SETTINGS_PATH,
     as_json: Annotated[bool, typer.Option("--json", help="Print it for a program.")] = False,
 ) -> None:
     """Say which version runs and what became of the last update."""
@@ -82,7 +82,7 @@ def status(
 
 
 def main() -> None:
-    """Run the command line without the rest of `diffuscope`; an error of ours is a sentence and a remedy."""
+    """Run the update commands alone; on a DiffuscopeError print message and remedy to stderr, exit status 2."""
     try:
         app(prog_name="python -m services.update")
     except DiffuscopeError as error:

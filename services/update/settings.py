@@ -1,4 +1,4 @@
-"""Where updates come from, and what must be so before one is installed: one TOML file, unknown keys refused."""
+"""Update settings: sources, preconditions, paths and timeouts in one TOML file; unknown keys are an error."""
 
 import tomllib
 from pathlib import Path
@@ -6,37 +6,39 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from device.errors import SpecError
-from services.records.update_notes import TABLET
+from services.update.ipc import TABLET
 
-PLACE = Path("/etc/diffuscope/update.toml")
+SETTINGS_PATH = Path("/etc/diffuscope/update.toml")
 
 
 class UpdateSettings(BaseModel):
-    """What /etc/diffuscope/update.toml may say."""
+    """Content of /etc/diffuscope/update.toml; folders, URLs and commands have the defaults of the device."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-    channel: str = Field(default="", pattern="^(https://.+[^/])?$")  # folder of a web server; empty: sticks only
-    authority: Path | None = None  # who vouches for that web server, if not the usual ones
-    sticks: Path = Path("/media")  # where sticks appear, one folder each
+    channel: str = Field(default="", pattern="^(https://.+[^/])?$")  # URL of a folder; empty: USB drives only
+    authority: Path | None = None  # CA file for the web server; None: system CAs
+    sticks: Path = Path("/media")  # mount points of USB drives, one folder each
     folder: Path = Path("/var/lib/diffuscope-update")
-    wishes: Path = Path("/run/diffuscope-update")  # where the page leaves what a technician tapped
+    wishes: Path = Path("/run/diffuscope-update")  # where the page writes requests
     keyring: Path = Path("/etc/rauc/keyring.pem")
     rauc: tuple[str, ...] = ("rauc",)
     restart: tuple[str, ...] = ("systemctl", "reboot")
     instrument: str = "http://127.0.0.1:8000"
-    modules: Path = Path("/lib/modules")  # of the kernels that the running version came with
+    modules: Path = Path("/lib/modules")  # kernel modules of the running version
     lowest_battery: float = Field(default=0.5, ge=0, le=1)
-    answer_s: float = Field(default=15.0, gt=0)  # within which the page must answer
-    patience_s: float = Field(default=300.0, gt=0)  # within which a tried version must be well; it may have to compile
+    answer_s: float = Field(default=15.0, gt=0)  # timeout of requests to the instrument
+    patience_s: float = Field(
+        default=300.0, gt=0
+    )  # timeout of the health checks of a tried version, including compilation
 
     @property
     def tablet(self) -> Path:
-        """Where the page puts what a tablet sent."""
+        """Folder of the update file that a tablet uploads through the page."""
         return self.folder / TABLET
 
 
-def load(path: Path) -> UpdateSettings:
-    """The settings in a file; SpecError if it is not there or says what cannot be."""
+def load_settings(path: Path) -> UpdateSettings:
+    """Return the settings in a file; SpecError if it is missing or invalid."""
     try:
         return UpdateSettings(**tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:

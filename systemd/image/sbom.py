@@ -1,7 +1,7 @@
-"""What is inside a root filesystem, as a CycloneDX list: every Debian package and every Python package.
+"""Software bill of materials (CycloneDX) of a root file system: every Debian and every Python package.
 
-Run by `systemd/image/bundle`: `python systemd/image/sbom.py ROOT VERSION GIT_ID` writes JSON to standard output. It
-reads what lies in the root, not what was asked for. Standard library only.
+Run by `systemd/image/release`: `python systemd/image/sbom.py ROOT VERSION GIT_ID` writes JSON to standard output. The
+source is the content of the root, not the list of requested packages. Standard library only.
 """
 
 import json
@@ -14,34 +14,36 @@ from pathlib import Path
 
 
 def debian(root: Path) -> Iterator[dict[str, object]]:
-    """The packages that dpkg has installed."""
+    """Yield the packages that dpkg has installed."""
     for paragraph in (root / "var/lib/dpkg/status").read_text(encoding="utf-8").split("\n\n"):
-        said = message_from_string(paragraph)
-        if said["Status"] == "install ok installed":
-            name, version, arch = said["Package"], said["Version"], said["Architecture"]
+        fields = message_from_string(paragraph)
+        if fields["Status"] == "install ok installed":
+            name, version, arch = fields["Package"], fields["Version"], fields["Architecture"]
             purl = f"pkg:deb/debian/{name}@{version}?arch={arch}"
             yield {"type": "library", "bom-ref": purl, "name": name, "version": version, "purl": purl}
 
 
 def python(root: Path) -> Iterator[dict[str, object]]:
-    """The packages in the virtual environment."""
+    """Yield the packages of the virtual environment."""
     for metadata in root.glob("opt/diffuscope/.venv/lib/python*/site-packages/*.dist-info/METADATA"):
-        said = message_from_string(metadata.read_text(encoding="utf-8"))
-        name = re.sub(r"[-_.]+", "-", said["Name"]).lower()
-        purl = f"pkg:pypi/{name}@{said['Version']}"
-        found = {"type": "library", "bom-ref": purl, "name": said["Name"], "version": said["Version"], "purl": purl}
-        licence = licence_of(said)
+        fields = message_from_string(metadata.read_text(encoding="utf-8"))
+        name = re.sub(r"[-_.]+", "-", fields["Name"]).lower()
+        purl = f"pkg:pypi/{name}@{fields['Version']}"
+        found = {"type": "library", "bom-ref": purl, "name": fields["Name"], "version": fields["Version"], "purl": purl}
+        licence = licence_of(fields)
         yield found | ({"licenses": [{"license": {"name": licence}}]} if licence else {})
 
 
-def licence_of(said: Message) -> str:
-    """What a package says of its licence: the expression, else the classifiers, else the first line of its text."""
-    classifiers = [str(c).split(" :: ")[-1] for c in said.get_all("Classifier", []) if str(c).startswith("License ::")]
-    return str(said["License-Expression"] or " / ".join(classifiers) or (said["License"] or "").split("\n")[0])
+def licence_of(fields: Message) -> str:
+    """Return a package's licence: the expression, else the classifiers, else the first line of the text."""
+    classifiers = [
+        str(c).split(" :: ")[-1] for c in fields.get_all("Classifier", []) if str(c).startswith("License ::")
+    ]
+    return str(fields["License-Expression"] or " / ".join(classifiers) or (fields["License"] or "").split("\n")[0])
 
 
 def bill(root: Path, version: str, git_id: str) -> dict[str, object]:
-    """The whole list; its order does not depend on the disk."""
+    """Return the bill of materials; its order does not depend on the file system."""
     parts = sorted([*debian(root), *python(root)], key=lambda part: str(part["purl"]))
     about = {"type": "firmware", "bom-ref": "diffuscope", "name": "diffuscope", "version": version}
     about["properties"] = [{"name": "git", "value": git_id}]  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""Real RAUC on this computer: its service on a bus of its own, two small slots on loop devices, our boot chooser."""
+"""Real RAUC on this computer: its service on a private D-Bus, small slots on loop devices, and our boot chooser."""
 
 import os
 import subprocess
@@ -15,9 +15,9 @@ from services.update.settings import UpdateSettings
 from services.update.updater import Updater
 from tests.appliance.device import run
 from tests.appliance.releases import Workshop
-from tests.house import ROOT
+from tests.project_files import ROOT
 
-NOWHERE = "http://127.0.0.1:9"  # no instrument: a device whose page does not answer may be updated
+NOWHERE = "http://127.0.0.1:9"  # no instrument; a device whose page does not answer may be updated
 SLOT_KB, BOOT_KB = 32_768, 64
 BACKEND = """\
 #!{python} -I
@@ -35,12 +35,12 @@ sys.exit(main(sys.argv[1:], BootChooser(*places)))
 
 @dataclass
 class Bench:
-    """A device without a body: what its firmware, RAUC and the updater need, and nothing to boot."""
+    """Emulated device for RAUC and the updater: boot selection and slots; nothing boots."""
 
     here: Path
     workshop: Workshop
     loops: dict[str, str] = field(default_factory=dict)
-    said: list[str] = field(default_factory=list)
+    reports: list[str] = field(default_factory=list)
     bus: str = ""
 
     @property
@@ -49,7 +49,7 @@ class Bench:
         return BootChooser(here / "chooser/autoboot.txt", here / "state", here / "word", here / "cmdline")
 
     def rauc(self, *before: str) -> tuple[str, ...]:
-        """The words that call RAUC on this bench; `before` them others, such as a wrong clock."""
+        """Return the command line of RAUC on this bench; `before` are prefix words, such as faketime."""
         bus = ("DBUS_STARTER_BUS_TYPE=session", f"DBUS_SESSION_BUS_ADDRESS={self.bus}")
         return ("env", *bus, *before, "rauc", "-c", str(self.here / "system.conf"))
 
@@ -60,11 +60,11 @@ class Bench:
         return UpdateSettings(**known | rest | changed)  # type: ignore[arg-type]
 
     def updater(self, runs: str = "1.0", **changed: object) -> Updater:
-        return Updater(self.settings(**changed), SystemClock(), self.said.append, self.chooser, runs)
+        return Updater(self.settings(**changed), SystemClock(), self.reports.append, self.chooser, runs)
 
     @contextmanager
     def service(self, *before: str) -> Iterator[subprocess.Popen[bytes]]:
-        """RAUC's service, in the slot that the firmware booted."""
+        """Run RAUC's service, in the slot that the firmware booted."""
         words = [*self.rauc(*before), "service", f"--override-boot-slot={self.chooser.booted()}"]
         with (self.here / "service.log").open("ab") as log:
             service = subprocess.Popen(words, stdout=log, stderr=log, start_new_session=True)
@@ -79,14 +79,14 @@ class Bench:
             service.wait(10)
 
     def boot(self) -> str:
-        """What the firmware does with the word of an orderly restart; the slot that runs then."""
+        """Emulate the firmware after an orderly restart; return the slot that runs."""
         slot = self.chooser.primary()
         (self.here / "word").unlink(missing_ok=True)
         (self.here / "cmdline").write_text(f"rauc.slot={slot}\n")
         return slot
 
     def version(self, slot: str) -> str:
-        """What is in a slot, by mounting it and reading all of it; an OSError of the kernel if it is not whole."""
+        """Mount a slot and read it completely; return its version. OSError from the kernel if it is damaged."""
         root = self.here / "root"
         run("mount", "-t", "squashfs", "-o", "ro", self.loops[slot], root)
         try:
@@ -96,7 +96,7 @@ class Bench:
             run("umount", root)
 
     def fill(self, slot: str, bundle: Path) -> None:
-        """Put the image of a bundle into a slot, as the factory does."""
+        """Write the image of a bundle into a slot, as in the factory."""
         folder = self.here / f"{bundle.stem}-image"
         run("unsquashfs", "-q", "-n", "-f", "-d", folder, bundle, "rootfs.img")
         run("dd", f"if={folder / 'rootfs.img'}", f"of={self.loops[slot]}", "bs=4M", "conv=fsync", "status=none")
@@ -104,7 +104,7 @@ class Bench:
 
 @contextmanager
 def opened(here: Path, workshop: Workshop, slot_kb: int = SLOT_KB) -> Iterator[Bench]:
-    """A bench with the committed slot A running, both slots empty."""
+    """Yield a bench with the committed slot A running and both slots empty."""
     bench = Bench(here, workshop)
     for name in ("chooser", "state", "media", "root"):
         (here / name).mkdir(parents=True)
@@ -131,14 +131,14 @@ def opened(here: Path, workshop: Workshop, slot_kb: int = SLOT_KB) -> Iterator[B
 
 
 def clear(bench: Bench) -> None:
-    """Clear what a killed RAUC leaves behind, as a restart of the computer would: its mount, and with it its loop."""
+    """Unmount what a killed RAUC left, which also frees its loop device, as a reboot would."""
     for mounted in sorted((bench.here / "mnt").glob("*"), reverse=True):
         if os.path.ismount(mounted):
             run("umount", "-l", mounted)
 
 
 def _conf(bench: Bench) -> str:
-    """The configuration that ships, with this bench's paths."""
+    """Return the system.conf of a release with this bench's paths."""
     text = (ROOT / "systemd" / "image" / "system.conf").read_text()
     for theirs, ours in {
         "@FORMATS@": "plain verity",

@@ -1,7 +1,7 @@
-"""A device with two slots, as the Raspberry Pi's firmware sees it: which slot boots, and a real systemd in it.
+"""Emulated device with two boot slots: emulated Raspberry Pi firmware, and a real systemd in the booted slot.
 
-The slots and the data partition are loop devices. The firmware reads `autoboot.txt` and the word of the last restart,
-and boots the chosen slot's own image in a container, in which RAUC finds the devices under the names of the real ones.
+Slots and data partition are loop devices. The firmware reads `autoboot.txt` and the reboot argument, and boots the
+selected slot's image in a container, where RAUC finds the loop devices under the names of the real partitions.
 """
 
 import os
@@ -21,7 +21,7 @@ NAMES = {"A": "root-a", "B": "root-b", "boot-a": "boot-a", "boot-b": "boot-b"}
 SLOT_MB, BOOT_MB, DATA_MB = 500, 4, 1600
 FOLDERS = ("captures", "compiled", "update", "journal")
 
-# The kernel's words are the host's: ours are laid over them, and once more in the units that have a /proc of their own.
+# The container shows the host's kernel command line; ours is mounted over it, also in units with their own /proc.
 FIRST = """\
 mount --bind /run/cmdline /proc/cmdline
 for unit in settle wish; do
@@ -41,7 +41,7 @@ def run(*words: object, **options: object) -> str:
 
 @dataclass
 class Device:
-    """The board with its card; `folder` holds the files behind the loop devices."""
+    """Board and card; `folder` holds the files of the loop devices."""
 
     folder: Path
     loops: dict[str, str] = field(default_factory=dict)
@@ -57,14 +57,14 @@ class Device:
         return self.folder / "data"
 
     def autoboot(self) -> tuple[str, str]:
-        """The committed slot and the other one."""
+        """Return the committed slot and the other one."""
         every, once = (self.chooser / "autoboot.txt").read_text().split("[tryboot]")
         slots = [PARTITIONS[part.split("boot_partition=")[1].split()[0]] for part in (every, once)]
         return slots[0], slots[1]
 
     @contextmanager
     def on(self, *more: str) -> Iterator[Machine]:
-        """Switched on until it switches itself off, restarts, or the test is done with it."""
+        """Boot the selected slot; yield the machine until it powers off, restarts, or the test ends."""
         self.booted = self.autoboot()[1 if self.tried else 0]
         self.tried = False
         (self.folder / "cmdline").write_text(f"console=tty1 rauc.slot={self.booted} systemd.volatile=overlay\n")
@@ -102,26 +102,26 @@ class Device:
             nspawn.wait(60)
         finally:
             if nspawn.poll() is None:
-                os.kill(pid if pid > 0 else nspawn.pid, SIGKILL)  # the first process inside: all others end with it
+                os.kill(pid if pid > 0 else nspawn.pid, SIGKILL)  # the first process inside; all others end with it
             nspawn.wait(20)
             if word >= 0:
                 self.tried = nspawn.returncode == 133 and "tryboot" in _read_at(word, "reboot-param")
                 os.close(word)
 
     def restarts(self, machine: Machine, patience_s: float = 180.0) -> None:
-        """Wait until it has switched itself off."""
+        """Wait until the machine is off."""
         end = time.monotonic() + patience_s
         while machine.is_on():
             assert time.monotonic() < end, f"it did not restart{machine.journal()}"
             time.sleep(0.1)
 
-    def diary(self) -> str:
-        """The last lines of the journal on the data partition, also of a machine that is off."""
+    def journal_tail(self) -> str:
+        """Return the last lines of the journal on the data partition, also of a machine that is off."""
         words = ["journalctl", "-D", str(self.data / "journal"), "--no-pager", "-n", "60"]
         return subprocess.run(words, capture_output=True, text=True, check=False).stdout
 
     def captures(self) -> dict[str, str]:
-        """Every file of every capture, with its SHA-256."""
+        """Return the SHA-256 of every file of every capture, by path."""
         folder = self.data / "captures" / "captures"
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
         sums = run("sha256sum", *paths).splitlines() if paths else []
@@ -129,7 +129,7 @@ class Device:
 
 
 def _loop_devices() -> list[Path]:
-    """More than are in use: RAUC takes a free one for the bundle, and a container sees none that comes later."""
+    """Create more loop device nodes than are in use: RAUC needs a free one, and a container does not see later ones."""
     nodes = [Path(f"/dev/loop{number}") for number in range(64)]
     for number, node in enumerate(nodes):
         if not node.exists():
@@ -138,7 +138,7 @@ def _loop_devices() -> list[Path]:
 
 
 def _read_at(folder: int, name: str) -> str:
-    """What systemd would have handed to the firmware: the memory disk outlives the container while we look at it."""
+    """Return a file of the container's tmpfs, which stays readable through its descriptor after the container's end."""
     try:
         descriptor = os.open(name, os.O_RDONLY, dir_fd=folder)
     except FileNotFoundError:
@@ -148,8 +148,8 @@ def _read_at(folder: int, name: str) -> str:
 
 
 @contextmanager
-def made(folder: Path, image: Path) -> Iterator[Device]:
-    """A device from the factory: `image` in slot A, slot B empty, an empty data partition."""
+def factory_new(folder: Path, image: Path) -> Iterator[Device]:
+    """Yield a factory-new device: `image` in slot A, slot B and the data partition empty."""
     device = Device(folder)
     for name in ("chooser", "data", "root", "media"):
         (folder / name).mkdir(parents=True)
@@ -166,7 +166,7 @@ def made(folder: Path, image: Path) -> Iterator[Device]:
         run("mount", device.loops["data"], device.data)
         for name in FOLDERS:
             (device.data / name).mkdir()
-        if (CACHE / "appliance").is_dir():  # what numba compiled on this machine before
+        if (CACHE / "appliance").is_dir():  # numba's cache of earlier runs
             run("cp", "-a", CACHE / "appliance" / ".", device.data / "compiled")
         yield device
         (CACHE / "appliance").mkdir(parents=True, exist_ok=True)

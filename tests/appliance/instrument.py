@@ -1,4 +1,4 @@
-"""An instrument that is made up: what it says on its page is whatever a test wants, over real HTTP."""
+"""Fake instrument: a page over real HTTP with configurable answers."""
 
 import json
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ def check(name: str, ok: bool = True) -> Check:
 
 @dataclass
 class Page:
-    """What an instrument says on its page."""
+    """Answers of the fake page."""
 
     at: str = ""
     state: str = "aim"
@@ -27,7 +27,7 @@ class Page:
     checks: list[Check] = field(default_factory=lambda: [check("camera"), check("captures")])
     sees: bool = True
     hangs: bool = False
-    visit_begun: timedelta | None = None  # how long ago the visit was begun that is open
+    visit_begun: timedelta | None = None  # age of the open visit; None: no open visit
     closing: Event = field(default_factory=Event)
 
     def answer(self, path: str) -> tuple[int, bytes]:
@@ -45,7 +45,7 @@ class Page:
 
 @contextmanager
 def served() -> Iterator[Page]:
-    """A page that answers."""
+    """Yield a running page."""
     page = Page()
 
     class Handler(BaseHTTPRequestHandler):
@@ -61,7 +61,7 @@ def served() -> Iterator[Page]:
             pass
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    server.handle_error = lambda request, address: None  # type: ignore[method-assign]  # who asked did not wait
+    server.handle_error = lambda request, address: None  # type: ignore[method-assign]  # the client closed the connection
     page.at = f"http://127.0.0.1:{server.server_port}"
     Thread(target=server.serve_forever, daemon=True).start()
     try:

@@ -1,6 +1,6 @@
-"""The victim of power cuts: an update as a technician does it, with real RAUC, from the stick to the commit.
+"""Update procedure for the power cut tests, with real RAUC: search, install, restart, settle.
 
-Run as a module it looks, installs what it finds, and settles after a restart; what it says is how far it is.
+Run as a module; its output marks the progress.
 """
 
 import sys
@@ -12,23 +12,23 @@ from tests.appliance.instrument import served
 from tests.appliance.releases import Workshop
 
 
-def updated(bench: Bench) -> None:
+def run_update(bench: Bench) -> None:
     with served() as page:
         first: Updater = bench.updater("1.0", instrument=page.at)
         with bench.service():
-            (found,) = first.look()
+            (found,) = first.search()
             first.install_found(found.id)
-        say("installed")
+        print_mark("installed")
         bench.boot()
         with bench.service():
             bench.updater("2.0", instrument=page.at).settle()
-        say("committed")
+        print_mark("committed")
 
 
-def say(word: str) -> None:
-    print(f"<{word}>", flush=True)  # noqa: T201  # read by whoever traces it
+def print_mark(word: str) -> None:
+    print(f"<{word}>", flush=True)  # noqa: T201  # read by the tracing test
 
 
 if __name__ == "__main__":
     here, keys, loop_a, loop_b, bus = sys.argv[1:]
-    updated(Bench(Path(here), Workshop(Path(keys)), {"A": loop_a, "B": loop_b}, bus=bus))
+    run_update(Bench(Path(here), Workshop(Path(keys)), {"A": loop_a, "B": loop_b}, bus=bus))

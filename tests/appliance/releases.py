@@ -1,4 +1,4 @@
-"""Releases to try: built by the recipe that ships, signed with keys made for these tests."""
+"""Releases for tests: built by the release recipe, signed with test keys."""
 
 import random
 import subprocess
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.appliance.device import run
-from tests.house import ROOT
+from tests.project_files import ROOT
 
 BROKEN = '"""A release that dies as soon as it is asked to serve."""\n\nraise SystemExit("broken release")\n'
-IMPATIENT = 'sticks = "/media"\npatience_s = 25.0\n'  # a broken release takes its whole patience
+IMPATIENT = 'sticks = "/media"\npatience_s = 25.0\n'  # a broken release uses the whole timeout
 
 
 @dataclass(frozen=True)
 class Workshop:
-    """Where bundles are made."""
+    """Folder in which bundles are built."""
 
     folder: Path
 
@@ -23,7 +23,7 @@ class Workshop:
         return self.folder / "keys"
 
     def bundle(self, version: str, files: dict[str, str] | None = None) -> Path:
-        """A signed release of this checkout as `version`; `files` replace some of its own."""
+        """Build a signed release of this checkout as `version`; `files` replace some of its files."""
         overlay, out = self.folder / f"overlay-{version}", self.folder / f"diffuscope-{version}.raucb"
         overlay.mkdir()
         for name, content in (files or {}).items():
@@ -34,7 +34,7 @@ class Workshop:
         return out
 
     def image(self, bundle: Path) -> Path:
-        """The root filesystem in a bundle."""
+        """Return the root file system of a bundle."""
         folder = self.folder / f"{bundle.stem}-content"
         run("unsquashfs", "-q", "-n", "-d", folder, bundle, "rootfs.img")
         return folder / "rootfs.img"
@@ -49,7 +49,7 @@ class Workshop:
         noise_bytes: int = 12_000_000,
         boot: bytes | None = None,
     ) -> Path:
-        """A bundle whose slot is a small filesystem with a number and noise: quick to write, and to check."""
+        """Build a bundle with a small file system of a version file and noise, fast to write and check."""
         keys, folder, out = keys or self.keys, self.folder / f"{name}-parts", self.folder / f"{name}.raucb"
         (folder / "tree").mkdir(parents=True)
         (folder / "tree" / "version").write_text(version)
@@ -69,7 +69,7 @@ class Workshop:
 
 
 def opened(folder: Path) -> Workshop:
-    """A workshop with keys of its own."""
+    """Return a workshop with its own keys."""
     folder.mkdir(parents=True, exist_ok=True)
     run(ROOT / "systemd" / "image" / "keys", folder / "keys")
     return Workshop(folder)

@@ -1,7 +1,7 @@
-"""The card as a technician writes it, and its first boot: genimage and systemd-repart do it for real, on files.
+"""SD card image and its first boot: real genimage and systemd-repart, on files.
 
-The kernel and Raspberry Pi's firmware are stand-ins, for they come from an archive of its own; layout, names, what the
-firmware reads and what the first boot adds are those that ship.
+Kernel and Raspberry Pi firmware are replaced by fakes, because they come from another archive; partition layout, names,
+firmware configuration and the first boot's changes are those of a release.
 """
 
 import configparser
@@ -18,7 +18,7 @@ import pytest
 
 from services.update.bootchooser import PARTITIONS, BootChooser
 from tests.appliance.device import FOLDERS, run
-from tests.house import ROOT
+from tests.project_files import ROOT
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
 
@@ -35,13 +35,13 @@ SHIPPED = {
 
 
 def tree_of(folder: Path, encrypt: str = "n") -> Path:
-    """A root filesystem as small as it can be, with everything in it that a card needs."""
+    """Create a minimal root file system with everything that a card needs; return its path."""
     tree = folder / "tree"
     for name in ("opt/diffuscope/.venv/lib/python3.11/site-packages", "boot/firmware", "boot/chooser", "data", "proc"):
         (tree / name).mkdir(parents=True)
     for ours, theirs in SHIPPED.items():
         run("install", "-D", "--mode=644", IMAGE / ours, tree / theirs)
-    kernel = gzip.compress(b"a kernel" * 1000 + f"\0Linux version {KERNEL} (somebody) \0".encode())
+    kernel = gzip.compress(b"a kernel" * 1000 + f"\0Linux version {KERNEL} (builder) \0".encode())
     (tree / "boot/firmware/kernel_2712.img").write_bytes(kernel)
     run(CARD / "board", tree, encrypt)
     return tree
@@ -49,7 +49,7 @@ def tree_of(folder: Path, encrypt: str = "n") -> Path:
 
 @pytest.fixture(scope="module")
 def card(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The image that is written onto a card."""
+    """The image that is written to a card."""
     here = tmp_path_factory.mktemp("card")
     tree = tree_of(here)
     (here / "input").mkdir()
@@ -63,7 +63,7 @@ def repart_words(definitions: Path, file: Path) -> list[object]:
 
 
 def repart(definitions: Path, file: Path) -> None:
-    """What systemd-repart.service does at every boot."""
+    """Run systemd-repart as systemd-repart.service does at every boot."""
     run(*repart_words(definitions, file))
 
 
@@ -78,7 +78,7 @@ def mounted(file: Path, where: dict[str, int], at: Path) -> Iterator[Path]:
 
 
 def same(one: Path, other: Path, where: dict[str, int]) -> bool:
-    """Whether a partition's first megabytes, where its files are, have the same bytes on both cards."""
+    """Return whether the first 8 MiB of a partition are equal on both cards."""
     with one.open("rb") as first, other.open("rb") as second:
         first.seek(where["at"])
         second.seek(where["at"])
@@ -87,32 +87,32 @@ def same(one: Path, other: Path, where: dict[str, int]) -> bool:
 
 
 def partitions(card: Path) -> dict[str, dict[str, int]]:
-    said = run("partx", "--bytes", "--output", "NR,NAME,START,SIZE", "--pairs", card)
-    rows = [dict(re.findall(r'(\w+)="([^"]*)"', line)) for line in said.splitlines()]
+    output = run("partx", "--bytes", "--output", "NR,NAME,START,SIZE", "--pairs", card)
+    rows = [dict(re.findall(r'(\w+)="([^"]*)"', line)) for line in output.splitlines()]
     return {
         row["NAME"]: {"nr": int(row["NR"]), "at": int(row["START"]) * 512, "bytes": int(row["SIZE"])} for row in rows
     }
 
 
 def read(card: Path, partition: str, name: str) -> str:
-    """A file on one of the FAT partitions."""
+    """Return a file of one of the FAT partitions."""
     at = partitions(card)[partition]["at"]
     return run("mtype", "-i", f"{card}@@{at}", f"::{name}")
 
 
 def of_slot(config: str, number: int) -> dict[str, str]:
-    """What config.txt says to the firmware on this partition: its sections hold until the next."""
-    said: dict[str, str] = {}
-    heard = True
+    """Return the settings of config.txt that apply to a boot partition."""
+    settings: dict[str, str] = {}
+    applies = True
     for line in config.splitlines():
         if section := re.fullmatch(r"\[(.+)\]", line):
-            heard = section[1] in ("all", f"boot_partition={number}")
-        elif heard and (setting := re.fullmatch(r"([a-z0-9_]+)=(.+)", line)):
-            said[setting[1]] = setting[2]
-    return said
+            applies = section[1] in ("all", f"boot_partition={number}")
+        elif applies and (setting := re.fullmatch(r"([a-z0-9_]+)=(.+)", line)):
+            settings[setting[1]] = setting[2]
+    return settings
 
 
-def test_the_partitions_are_those_that_firmware_rauc_and_updates_expect(card: Path, tmp_path: Path) -> None:
+def test_partitions_match_firmware_rauc_and_boot_chooser(card: Path, tmp_path: Path) -> None:
     found = partitions(card)
     assert list(found) == NAMES
     assert [found[f"boot-{slot.lower()}"]["nr"] for slot in PARTITIONS] == list(PARTITIONS.values())
@@ -127,24 +127,24 @@ def test_the_partitions_are_those_that_firmware_rauc_and_updates_expect(card: Pa
 
 
 @pytest.mark.parametrize("slot", PARTITIONS)
-def test_each_slot_tells_the_kernel_which_root_is_its_own(card: Path, tmp_path: Path, slot: str) -> None:
+def test_each_boot_partition_names_its_own_root(card: Path, tmp_path: Path, slot: str) -> None:
     settings = of_slot(read(card, f"boot-{slot.lower()}", "config.txt"), PARTITIONS[slot])
     (tmp_path / "cmdline").write_text(words := read(card, f"boot-{slot.lower()}", settings["cmdline"]))
-    assert words.count("\n") <= 1, "the kernel's words are one line"
+    assert words.count("\n") <= 1, "the kernel command line is one line"
     assert f"root=PARTLABEL=root-{slot.lower()}" in words.split()
     assert {"rootfstype=squashfs", "ro", "rootwait", "systemd.volatile=overlay", "panic=10"} <= set(words.split())
     assert BootChooser(command_line=tmp_path / "cmdline").booted() == slot
 
 
 def bundle(card: Path, root: Path, *more: object) -> subprocess.CompletedProcess[str]:
-    """What a technician calls to make an update of a card."""
+    """Build an update from a card's root, as a technician does."""
     out = root.with_suffix(".raucb")
     words = [IMAGE / "bundle", "--keys", card.parents[1] / "keys", "--format", "plain", "-o", out, "--image", root]
     return subprocess.run([str(word) for word in (*words, *more)], capture_output=True, text=True, check=False)
 
 
-def test_an_update_of_a_card_has_the_kernel_of_its_root_or_is_not_made(card: Path, tmp_path: Path) -> None:
-    """The two are one slot: RAUC finds both in the bundle, and a kernel without its modules is refused at once."""
+def test_bundle_of_a_card_needs_the_kernel_of_its_root(card: Path, tmp_path: Path) -> None:
+    """RAUC finds root and kernel in the bundle; a kernel without its modules is refused."""
     run(IMAGE / "keys", card.parents[1] / "keys")
     boot = card.parent / "boot.vfat"
     for kernel in (KERNEL, "6.1.0"):
@@ -160,29 +160,29 @@ def test_an_update_of_a_card_has_the_kernel_of_its_root_or_is_not_made(card: Pat
     made = bundle(card, ours, "--boot", boot)
     assert made.returncode == 0, made.stderr
     keyring = f"--keyring={card.parents[1] / 'keys/ca.crt'}"
-    said = json.loads(run("rauc", keyring, "info", "--output-format=json", ours.with_suffix(".raucb")))
-    assert {name: image["filename"] for one in said["images"] for name, image in one.items()} == {
+    info = json.loads(run("rauc", keyring, "info", "--output-format=json", ours.with_suffix(".raucb")))
+    assert {name: image["filename"] for one in info["images"] for name, image in one.items()} == {
         "rootfs": "rootfs.img", "boot": "boot.img",
     }  # fmt: skip
 
 
-def test_a_root_has_no_kernel_and_no_choice_in_it(card: Path, tmp_path: Path) -> None:
-    """What an update replaces must not carry what decides about updates."""
+def test_root_holds_no_kernel_and_no_autoboot_txt(card: Path, tmp_path: Path) -> None:
+    """The replaceable root must not contain the boot selection."""
     at = partitions(card)["root-a"]
-    said = run("unsquashfs", "-l", "-o", at["at"], card)
-    assert "squashfs-root/etc/fstab" in said
-    assert "kernel_2712.img" not in said
-    assert "autoboot.txt" not in said
+    listing = run("unsquashfs", "-l", "-o", at["at"], card)
+    assert "squashfs-root/etc/fstab" in listing
+    assert "kernel_2712.img" not in listing
+    assert "autoboot.txt" not in listing
 
 
-def test_the_first_boot_makes_a_data_partition_and_the_second_changes_nothing(card: Path, tmp_path: Path) -> None:
+def test_first_boot_creates_the_data_partition_and_the_second_keeps_it(card: Path, tmp_path: Path) -> None:
     file = tmp_path / "card.img"
     run("cp", "--sparse=always", card, file)
     run("truncate", "-s", f"{GROWN_MB}M", file)
     definitions = tree_of(tmp_path) / "etc/repart.d"
     begin_s = time.monotonic()
     repart(definitions, file)
-    print(f"data partition made in {time.monotonic() - begin_s:.1f} s")  # noqa: T201  # a figure for who reads the log (-rP)
+    print(f"data partition made in {time.monotonic() - begin_s:.1f} s")  # noqa: T201  # figure for the log (-rP)
     found = partitions(file)
     assert list(found) == [*NAMES, "data"]
     assert found["data"]["bytes"] > 1_500_000_000, "all that is left on the card"
@@ -196,8 +196,8 @@ def test_the_first_boot_makes_a_data_partition_and_the_second_changes_nothing(ca
         assert (data / "captures/kept").read_text() == "a picture"
 
 
-def test_a_first_boot_that_is_cut_is_finished_by_the_next(card: Path, tmp_path: Path) -> None:
-    """Killed at six moments: no data partition, or a whole one; what was on the card before is untouched."""
+def test_interrupted_first_boot_is_completed_by_the_next(card: Path, tmp_path: Path) -> None:
+    """Kill at six moments: no data partition or a complete one; the other partitions are unchanged."""
     definitions = tree_of(tmp_path) / "etc/repart.d"
     found, takes_s = [], 0.0
     for cut in range(-1, 6):
@@ -206,7 +206,7 @@ def test_a_first_boot_that_is_cut_is_finished_by_the_next(card: Path, tmp_path: 
         run("truncate", "-s", f"{GROWN_MB}M", file)
         words, begin_s = [str(word) for word in repart_words(definitions, file)], time.monotonic()
         with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-            if cut < 0:  # the first one is let be, to see how long it takes
+            if cut < 0:  # the first one is not killed, to measure its duration
                 process.wait()
                 takes_s = time.monotonic() - begin_s
             time.sleep(takes_s * cut / 5 if cut > 0 else 0)
@@ -219,11 +219,11 @@ def test_a_first_boot_that_is_cut_is_finished_by_the_next(card: Path, tmp_path: 
         for name in NAMES:
             assert same(card, file, partitions(card)[name]), f"{name} is not what was written"
         file.unlink()
-    print(f"{sum(found)} of {len(found)} had a data partition when they were cut")  # noqa: T201  # a figure for who reads the log (-rP)
+    print(f"{sum(found)} of {len(found)} had a data partition when they were cut")  # noqa: T201  # figure for the log (-rP)
 
 
-def test_the_encrypted_card_has_a_key_before_it_has_a_partition(tmp_path: Path) -> None:
-    """Read by systemd-repart and by eye; to make it, a kernel needs device-mapper."""
+def test_encrypted_card_creates_its_key_before_the_partition(tmp_path: Path) -> None:
+    """A dry run of systemd-repart and a check of the files; a real run needs device-mapper."""
     tree = tree_of(tmp_path, "y")
     assert "/dev/mapper/data  /data" in re.sub(" +", "  ", (tree / "etc/fstab").read_text())
     name, source, key, _ = (tree / "etc/crypttab").read_text().splitlines()[-1].split()

@@ -1,8 +1,8 @@
-"""The power goes after any call of an update, and the disk forgets what was not synced: what boots, and what is said.
+"""Power cut after each system call of an update, with loss of unsynced data: the boot slot and the reported state.
 
-RAUC is real, and so are the slots; what a cut leaves is worked out from the calls that were made (tests/hard/power.py):
-the data partition keeps a journal of its own, the chooser is FAT, a slot is a device without a filesystem, and what is
-in /run is gone. The firmware is tests/firmware.py.
+RAUC and the slots are real; the disk states after a cut are computed from the recorded calls (tests/hard/power.py): the
+data partition is journalled, the chooser is FAT, a slot is a raw device, and /run is lost. The firmware is emulated by
+tests/firmware.py.
 """
 
 import random
@@ -19,18 +19,18 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from device.clock import SystemClock
-from device.errors import UpdateNowhere
-from services.instrument.updating import UpdateDesk
-from services.records.update_notes import TABLET
+from services.errors import UpdateNotFound
+from services.instrument.update_requests import UpdateRequests
 from services.update.bootchooser import BootChooser
+from services.update.ipc import TABLET
 from services.update.settings import UpdateSettings
 from services.update.updater import Updater
 from tests import firmware
 from tests.appliance import bench as benches
 from tests.appliance import releases
 from tests.appliance.bench import NOWHERE, Bench
-from tests.hard.power import Disk, noted, written
-from tests.house import ROOT
+from tests.hard.power import Disk, record_calls, write_tree
+from tests.project_files import ROOT
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
 
@@ -57,7 +57,7 @@ SHOWN = {
 
 @dataclass(frozen=True)
 class Recording:
-    """An update that was done once: the bench, what its disks held before, every call, and the new version's images."""
+    """One recorded update: bench, disk contents before it, all calls, and the images of the new version."""
 
     bench: Bench
     before: Path
@@ -73,7 +73,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
     two = workshop.small("two", "2.0", noise_bytes=NOISE_BYTES, boot=KERNEL)
     with benches.opened(folder / "bench", workshop, SLOT_KB) as bench:
         for slot in "AB":
-            bench.fill(slot, one)  # the slot that is written holds something else, whole
+            bench.fill(slot, one)  # the target slot holds another complete version
         (bench.here / "state" / TABLET).mkdir()
         shutil.copy(two, bench.here / "media")
         before = folder / "before"
@@ -83,17 +83,17 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recording]:
         words = [sys.executable, "-m", "tests.appliance.power", str(bench.here), str(workshop.folder)]
         words += [bench.loops["A"], bench.loops["B"], bench.bus]
         devices = {bench.loops[name]: bench.here / f"{name}.img" for name in ("B", "boot-b")}
-        calls = noted(words, bench.here, ROOT, devices)
+        calls = record_calls(words, bench.here, ROOT, devices)
         image = subprocess.run(["unsquashfs", "-cat", str(two), "rootfs.img"], capture_output=True, check=True).stdout
         yield Recording(bench, before, calls, {"B.img": image, "boot-b.img": KERNEL})
 
 
 def cuts(recording: Recording, draw: random.Random) -> Iterator[tuple[str, dict[str, bytes | None]]]:
-    """What was said to be done, and what may be left, after each call that changed something."""
+    """Yield the marks printed so far and a possible disk state, after each call that changed something."""
     disk = Disk(recording.bench.here, recording.before, fat=("chooser",), parts=PARTS)
     for call in ["", *recording.calls]:
         if not call or disk.follow(call):
-            yield from ((disk.said, left) for left in disk.cuts(draw, DRAWS))
+            yield from ((disk.output, left) for left in disk.cuts(draw, DRAWS))
     for name in PARTS[1:]:
         real = recording.bench.here / name
         for path in [real] if real.is_file() else real.rglob("*"):
@@ -101,13 +101,13 @@ def cuts(recording: Recording, draw: random.Random) -> Iterator[tuple[str, dict[
                 assert disk.as_seen()["/" + str(path.relative_to(recording.bench.here))] == path.read_bytes()
 
 
-def judged(left: Path, said: str, images: dict[str, bytes]) -> str:
-    """What the words tell after a cut; every promise that an update makes is held."""
+def check_disk(left: Path, marks: str, images: dict[str, bytes]) -> str:
+    """Check every guarantee of an update on one disk state; return the kind of the reported state."""
     autoboot = (left / "chooser/autoboot.txt").read_bytes()
     assert {firmware.partition(autoboot), firmware.partition(autoboot, tried=True)} == {2, 3}
     slot = firmware.boots(autoboot)
     whole = all((left / name).read_bytes().startswith(image) for name, image in images.items())
-    assert slot == ("A" if "<installed>" not in said else "B" if "<committed>" in said else slot)
+    assert slot == ("A" if "<installed>" not in marks else "B" if "<committed>" in marks else slot)
     assert whole or slot == "A"
     (left / "cmdline").write_text(f"rauc.slot={slot}\n")
     chooser = BootChooser(left / "chooser/autoboot.txt", left / "state", left / "word", left / "cmdline")
@@ -115,32 +115,32 @@ def judged(left: Path, said: str, images: dict[str, bytes]) -> str:
     settings = UpdateSettings(**known, rauc=("true",), restart=("true",), instrument=NOWHERE)  # type: ignore[arg-type]
     runs = "1.0" if slot == "A" else "2.0"
     updater = Updater(settings, SystemClock(), [].append, chooser, runs)
-    (told,) = [kind for words, kind in WORDS.items() if re.fullmatch(words, updater.status()[1])]
-    assert UpdateDesk(left / "state", left, SystemClock(), runs, boot="another").told()["state"] == SHOWN[told]
+    (outcome,) = [kind for words, kind in WORDS.items() if re.fullmatch(words, updater.status()[1])]
+    assert UpdateRequests(left / "state", left, SystemClock(), runs, boot="another").status().state == SHOWN[outcome]
     try:
         updater.restart()
-        assert whole  # a slot that is half written is never tried
-    except UpdateNowhere:
+        assert whole  # a partly written slot is never tried
+    except UpdateNotFound:
         pass
     updater.tidy()
     assert not list((left / "state").glob(".copy*"))
-    return told
+    return outcome
 
 
-def test_whatever_a_power_cut_leaves_of_an_update_boots_and_says_what_happened(recording: Recording) -> None:
+def test_every_disk_state_after_a_power_cut_boots_and_reports_the_outcome(recording: Recording) -> None:
     seen, outcomes = set[int](), Counter[str]()
-    for said, left in cuts(recording, random.Random(1)):
-        if (one := hash((tuple(left.items()), "<installed>" in said, "<committed>" in said))) in seen:
+    for marks, left in cuts(recording, random.Random(1)):
+        if (one := hash((tuple(left.items()), "<installed>" in marks, "<committed>" in marks))) in seen:
             continue
         seen.add(one)
         with TemporaryDirectory(dir="/dev/shm") as place:
-            outcomes[judged(written(left, Path(place) / "left"), said, recording.images)] += 1
-    print(f"{len(seen)} disks: {dict(outcomes)}")  # noqa: T201  # the figures that README quotes
+            outcomes[check_disk(write_tree(left, Path(place) / "left"), marks, recording.images)] += 1
+    print(f"{len(seen)} disks: {dict(outcomes)}")  # noqa: T201  # figures quoted in the README
     assert set(outcomes) == set(SHOWN)
 
 
-def test_rauc_updates_again_whatever_is_left_of_its_own_notes(recording: Recording) -> None:
-    """It writes them without waiting for the disk: they may be gone, empty or half."""
+def test_rauc_installs_again_with_any_state_of_its_status_file(recording: Recording) -> None:
+    """RAUC does not sync its status file, so after a power cut it may be missing, empty or incomplete."""
     bench, left_of_it = recording.bench, {left.get(STATUS) for _, left in cuts(recording, random.Random(2))}
     half = max(left_of_it - {None}, key=len)[:100]
     three = bench.workshop.small("three", "3.0", noise_bytes=NOISE_BYTES)
@@ -153,4 +153,4 @@ def test_rauc_updates_again_whatever_is_left_of_its_own_notes(recording: Recordi
             bench.updater("2.0").install(three)
         assert (bench.chooser.primary(), bench.version("A")) == ("A", "3.0")
         bench.chooser.set_primary("B")
-    print(f"{len(left_of_it)} notes of RAUC, and half of one")  # noqa: T201  # the figure that README quotes
+    print(f"{len(left_of_it)} notes of RAUC, and half of one")  # noqa: T201  # figure quoted in the README

@@ -1,6 +1,6 @@
-"""A tried version is judged by its page, and an update waits for an examination: RAUC is real, the page is made up.
+"""Settling of a tried version, and preconditions of an update: real RAUC, fake page.
 
-What a real instrument answers is in `test_versions.py`; here it hangs, is ill, examines, or has an empty battery.
+`test_versions.py` runs a real instrument; here the page hangs, fails checks, is busy, or reports an empty battery.
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 from device.clock import SystemClock
-from device.errors import UpdateAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow, UpdateWrongDevice
+from services.errors import (
+    UpdateCapturesAtRisk,
+    UpdateDuringExam,
+    UpdateError,
+    UpdateFailed,
+    UpdatePowerLow,
+    UpdateWrongDevice,
+)
 from services.update.updater import Updater
 from tests.appliance import bench as benches
 from tests.appliance import releases
@@ -40,33 +47,33 @@ def bench(two: tuple[releases.Workshop, Path], tmp_path: Path) -> Iterator[Bench
 
 def updater(bench: Bench, page: Page, runs: str) -> Updater:
     settings = bench.settings(instrument=page.at, answer_s=0.3, patience_s=2.5)
-    return Updater(settings, SystemClock(), bench.said.append, bench.chooser, runs)
+    return Updater(settings, SystemClock(), bench.reports.append, bench.chooser, runs)
 
 
-def tried(bench: Bench, page: Page, bundle: Path) -> Updater:
-    """Version 2.0 is installed and its slot boots for the first time."""
+def install_and_boot(bench: Bench, page: Page, bundle: Path) -> Updater:
+    """Install version 2.0 and boot its slot; return its updater."""
     with bench.service():
         updater(bench, page, "1.0").install(bundle)
     assert bench.boot() == "B"
     return updater(bench, page, "2.0")
 
 
-def test_a_version_that_is_well_is_committed(bench: Bench, page: Page, two: tuple[object, Path]) -> None:
-    second = tried(bench, page, two[1])
+def test_healthy_version_is_committed(bench: Bench, page: Page, two: tuple[object, Path]) -> None:
+    second = install_and_boot(bench, page, two[1])
     with bench.service():
         second.settle()
     assert (bench.chooser.committed(), second.status()[1]) == (
         "B", "Updated to 2.0. It was tried, found well, and stays.",
     )  # fmt: skip
-    second.settle()  # the next boots have nothing to settle
-    assert bench.said[-1] == "Version 2.0 is committed already."
+    second.settle()  # nothing to settle at later boots
+    assert bench.reports[-1] == "Version 2.0 is committed already."
 
 
 @pytest.mark.parametrize("how", ["hangs", "ill", "blind", "for ever starting"])
-def test_a_version_that_is_not_well_goes_back_and_says_why(
+def test_unhealthy_version_is_rolled_back_with_the_reason(
     bench: Bench, page: Page, two: tuple[object, Path], how: str
 ) -> None:
-    second = tried(bench, page, two[1])
+    second = install_and_boot(bench, page, two[1])
     match how:
         case "hangs":
             page.hangs, why = True, "page: does not answer"
@@ -79,33 +86,35 @@ def test_a_version_that_is_not_well_goes_back_and_says_why(
     with bench.service(), pytest.raises(UpdateFailed):
         second.settle()
     assert bench.boot() == "A"
-    said = updater(bench, page, "1.0").status()[1]
-    assert said.startswith("Version 1.0 runs. Version 2.0 was tried and was not well, so 1.0 is back: ")
-    assert why in said
+    sentence = updater(bench, page, "1.0").status()[1]
+    assert sentence.startswith("Version 1.0 runs. Version 2.0 was tried and was not well, so 1.0 is back: ")
+    assert why in sentence
     assert not bench.chooser.is_good("B")
 
 
-def test_a_camera_that_was_broken_before_is_not_blamed_on_the_update(
+def test_camera_fault_before_the_update_does_not_prevent_the_commit(
     bench: Bench, page: Page, two: tuple[object, Path]
 ) -> None:
     page.checks, page.sees = [check("camera", ok=False), check("captures")], False
-    second = tried(bench, page, two[1])
+    second = install_and_boot(bench, page, two[1])
     with bench.service():
         second.settle()
     assert bench.chooser.committed() == "B"
 
 
-def test_a_boot_that_never_came_to_an_end_is_told_as_such(bench: Bench, page: Page, two: tuple[object, Path]) -> None:
-    """Neither committed nor judged: the kernel, a hang, or the power."""
-    tried(bench, page, two[1])
+def test_unfinished_boot_of_a_try_is_reported_and_can_be_repeated(
+    bench: Bench, page: Page, two: tuple[object, Path]
+) -> None:
+    """Neither committed nor rolled back: a kernel failure, a hang or a power cut."""
+    install_and_boot(bench, page, two[1])
     assert bench.boot() == "A"
     assert "Version 2.0 did not finish starting, or lost power: 1.0 is back." in updater(bench, page, "1.0").status()[1]
     with bench.service():
-        updater(bench, page, "1.0").restart()  # and it can be tried once more
+        updater(bench, page, "1.0").restart()  # a second try is possible
     assert bench.boot() == "B"
 
 
-def test_a_computer_without_slots_is_told_so(bench: Bench, page: Page) -> None:
+def test_computer_without_boot_slots_is_an_error(bench: Bench, page: Page) -> None:
     (bench.here / "cmdline").write_text("console=tty1 quiet\n")
     device = updater(bench, page, "1.0")
     for ask in (device.status, device.settle, device.restart):
@@ -113,21 +122,21 @@ def test_a_computer_without_slots_is_told_so(bench: Bench, page: Page) -> None:
             ask()
 
 
-def not_now(exam: str = "aim", battery: float | None = None, well: bool = True) -> Page:
+def blocking_page(exam: str = "aim", battery: float | None = None, well: bool = True) -> Page:
     return Page(state=exam, battery=battery, checks=[check("captures", ok=well)])
 
 
 @pytest.mark.parametrize(
     ("now", "kind"),
     [
-        (not_now(exam="busy"), UpdateDuringExam),
-        (not_now(exam="making"), UpdateDuringExam),
+        (blocking_page(exam="busy"), UpdateDuringExam),
+        (blocking_page(exam="making"), UpdateDuringExam),
         (Page(visit_begun=timedelta(minutes=3)), UpdateDuringExam),
-        (not_now(battery=0.49), UpdatePowerLow),
-        (not_now(well=False), UpdateAtRisk),
+        (blocking_page(battery=0.49), UpdatePowerLow),
+        (blocking_page(well=False), UpdateCapturesAtRisk),
     ],
 )
-def test_an_update_waits_for_examination_charger_and_captures(
+def test_update_is_refused_during_exam_low_battery_or_damaged_captures(
     bench: Bench, page: Page, two: tuple[object, Path], now: Page, kind: type[UpdateError]
 ) -> None:
     page.state, page.battery, page.checks, page.visit_begun = now.state, now.battery, now.checks, now.visit_begun
@@ -135,7 +144,7 @@ def test_an_update_waits_for_examination_charger_and_captures(
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "A"
     page.state, page.battery, page.checks = "aim", 0.51, [check("captures")]
-    page.visit_begun = timedelta(hours=1)  # somebody left it so, and will finish it another time
+    page.visit_begun = timedelta(hours=1)  # an old unfinished visit is no examination
     with bench.service():
         updater(bench, page, "1.0").install(two[1])
     assert bench.chooser.primary() == "B"

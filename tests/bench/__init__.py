@@ -1,6 +1,6 @@
-"""Figures, not tests: `make bench`."""
+"""Benchmarks (`make bench`): figures with limits, not tests."""
 
 import os
 
-# OpenBLAS's second thread spins for some 30 ms after every product, into whatever is timed next: before numpy is met.
+# OpenBLAS's second thread spins for some 30 ms after every product, into the next timed run: set before numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

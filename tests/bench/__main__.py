@@ -1,8 +1,8 @@
-"""`make bench`: figures of speed and truth on this machine, with the limits that a change must keep.
+"""`make bench`: speed and accuracy on this machine, with limits that a change must keep.
 
-Absolute times belong to one machine on one day; a ratio within one run tells whether the code is tight. One part alone:
-`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`,
-`scaling` or `viewer`.
+Absolute times hold for one machine on one day; a ratio within one run shows the overhead of the code. One part alone:
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`, `scaling` or
+`viewer`.
 """
 
 import os
@@ -11,9 +11,9 @@ import resource
 import sys
 from pathlib import Path
 
-from device.recon.plan import Planner, processor
-from device.sim.staged import staged
-from device.spec import load_head
+from device.config.head_file import load_head
+from device.recon.model.fft_plans import Planner, processor_name
+from device.sim.scene_files import simulate_exposure
 from tests.bench import calibration, camera, deadline, fitness, peers, scaling, simulator, speed, viewer
 
 PLANS = Path.home() / ".cache" / "diffuscope"
@@ -22,11 +22,11 @@ PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fi
 
 
 def main(parts: list[str]) -> None:
-    """Run the parts that were named, or all."""
-    if strange := set(parts) - set(PARTS):
-        sys.exit(f"there is no part called {sorted(strange)[0]}; choose from {', '.join(PARTS)}")
+    """Run the named parts, by default all."""
+    if unknown := set(parts) - set(PARTS):
+        sys.exit(f"there is no part called {sorted(unknown)[0]}; choose from {', '.join(PARTS)}")
     wanted = parts or list(PARTS)
-    print(f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {platform.platform()}")
+    print(f"{processor_name()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, {platform.platform()}")
     planner = Planner(PLANS)
     if {"speed", "deadline", "peers"} & set(wanted):
         _on_one_scene(wanted, planner)
@@ -45,7 +45,7 @@ def main(parts: list[str]) -> None:
 
 
 def _on_one_scene(wanted: list[str], planner: Planner) -> None:
-    scene = staged(load_head(SCENE))
+    scene = simulate_exposure(load_head(SCENE))
     if "speed" in wanted:
         speed.closed_forms(scene, planner)
         speed.rounds(scene, planner)

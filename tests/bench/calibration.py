@@ -1,4 +1,4 @@
-"""A whole calibration at the sensor's full size, judged by what the simulator knows; the limits are the issue's."""
+"""A whole calibration at full sensor size, compared with the simulator's true values."""
 
 import tempfile
 from pathlib import Path
@@ -6,33 +6,34 @@ from pathlib import Path
 import numpy as np
 
 from device.clock import SystemClock, VirtualClock
-from device.recon.metrics import Judge
-from device.recon.model import field_radius_px
-from device.recon.plan import Planner
+from device.config.head_file import load_head
+from device.recon.assessment.metrics import PictureScorer
+from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import field_radius_px
 from device.recon.reconstructor import Recipe, Reconstructor
-from device.sim.calibrate import flat_frame
 from device.sim.camera import SimCamera
-from device.sim.effects.hot import hot_pixels
+from device.sim.effects.sensor import hot_pixels
 from device.sim.light import SimLight
-from device.sim.render import fitted
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import flat_frame
 from device.sim.world import World
-from device.spec import load_head
-from device.values import Calibration, Glow, Psf, Sensor, Shot
-from services.instrument.calibrating import Wish, calibrate
+from device.values import Calibration, ExposureSettings, Illumination, Psf, Sensor
+from services.instrument.calibration_request import CalibrationRequest
+from services.lab.calibrate_head import calibrate
 from tests.bench.dioptres import MOST_RMS_DPT, factors, refracted
-from tests.simulated import having
+from tests.simulated import with_keys
 
 HEAD = Path("hardware/heads/sim.toml")
 FLAWS = {"prnu": 0.01, "dsnu_e": 2.0, "dark_e_per_s": 50.0, "hot_pixels": 1e-4, "nonlinearity": -0.01}
 
 
 def calibration(planner: Planner) -> None:
-    """Print each figure beside its limit; AssertionError if one does not hold."""
-    spec, clock = having(load_head(HEAD), sensor=FLAWS), SystemClock()
+    """Print each figure with its limit; AssertionError for a figure beyond its limit."""
+    spec, clock = with_keys(load_head(HEAD), sensor=FLAWS), SystemClock()
     begin_s = clock.now_s()
     with tempfile.TemporaryDirectory() as folder:
-        wish = Wish(Path(folder), "D-1", "bench", None, dioptres=True)
-        found = calibrate(spec, wish, VirtualClock(), print, lambda line: None).calibration
+        request = CalibrationRequest(Path(folder), "D-1", "bench", None, dioptres=True)
+        found = calibrate(spec, request, VirtualClock(), print, lambda line: None).calibration
     print(f"\ncalibration of {found.psfs[0].shape}: {clock.now_s() - begin_s:.1f} s of work beside the exposures")
     world, camera = World(spec, VirtualClock()), spec.camera
     truth = true_calibration(world)
@@ -67,26 +68,26 @@ def calibration(planner: Planner) -> None:
 
 
 def true_calibration(world: World) -> Calibration:
-    """What a perfect calibration of this head would be."""
+    """Return the perfect calibration of this head."""
     camera = world.spec.camera
     range_dn = camera.white_dn - camera.black_dn
     bend_per_dn = FLAWS["nonlinearity"] / range_dn
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, camera.white_dn, bend_per_dn)
-    psf = Psf(fitted(world.psf(world.spec.light.colour), world.shape))
+    psf = Psf(crop_or_pad(world.psf(world.spec.light.colour), world.shape))
     dark_dn = camera.black_dn + FLAWS["dark_e_per_s"] * camera.exposure_s / camera.gain_e_per_dn
     dark = np.full(world.shape, dark_dn, np.float32)
-    field_deg, hot = world.optics.field_deg, hot_pixels(world.scene)
+    field_deg, hot = world.scene.optics.field_deg, hot_pixels(world.scene)
     return Calibration((psf,), sensor, world.geometry, field_deg, dark, flat_frame(world), hot)
 
 
 def pictures(world: World, found: Calibration, truth: Calibration, planner: Planner) -> tuple[float, float]:
-    """The PSNR of one frame's picture, in dB, by the measured and by the perfect calibration."""
+    """Return the PSNR in dB of one frame's picture with the measured and with the perfect calibration."""
     colour = world.spec.light.colour
-    with SimLight(world).on(Glow(colour)):
-        counts = SimCamera(world).expose(Shot(world.spec.camera.exposure_s)).counts
+    with SimLight(world).on(Illumination(colour)):
+        counts = SimCamera(world).expose(ExposureSettings(world.spec.camera.exposure_s)).counts
     rows, cols = (np.arange(size) - size // 2 for size in world.shape)
     inside = np.hypot(rows[:, None], cols) < 0.95 * field_radius_px(found)
-    judge, recipes = Judge(world.truth(colour), inside, 8.0), (Recipe("gradient", 1),)
+    judge, recipes = PictureScorer(world.truth(colour), inside, 8.0), (Recipe("gradient", 1),)
     made = (Reconstructor(one, world.shape, planner, VirtualClock(), recipes)(counts) for one in (found, truth))
     by_found, by_truth = (judge(one.picture).psnr_db for one in made)
     return by_found, by_truth

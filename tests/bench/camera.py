@@ -1,27 +1,27 @@
-"""From the raw buffer of a camera to a linear frame: against one copy of its bytes, and without growth."""
+"""Time from the raw camera buffer to a linear frame, relative to one copy of its bytes, and its memory growth."""
 
 import tracemalloc
 
 import numpy as np
 
 from device.drivers.raw_counts import pi_layout
-from device.recon.geometry import Grid
-from device.recon.prepare import Preparer
+from device.recon.model.grid import Grid
+from device.recon.model.preprocessing import Preprocessor
 from device.values import Calibration, Psf, Sensor
 from tests.bench import timing
 from tests.scenes import speckle
 
-SHAPE, BITS, STRIDE = (1088, 1456), 10, 2944  # an IMX296's rows, padded as a Pi pads them
+SHAPE, BITS, STRIDE = (1088, 1456), 10, 2944  # rows of an IMX296 with the padding of a Raspberry Pi
 LIMIT_MS, FRAMES = 6.0, 1000
 
 
 def camera() -> None:
-    """Unpacking, black level, dark frame, flat field, bad pixels: all that happens before the numerics."""
+    """Time unpacking, black level, dark frame, flat field and bad pixels: all preprocessing before reconstruction."""
     rng = np.random.default_rng(0)
     sensor = Sensor(black_dn=60, white_dn=1023)
     flat = rng.uniform(0.9, 1.1, SHAPE).astype(np.float32)
     calibration = Calibration((Psf(speckle((64, 64))),), sensor, flat=flat)
-    prepare = Preparer(calibration, Grid.periodic(SHAPE, 1, float("inf")))
+    prepare = Preprocessor(calibration, Grid.periodic(SHAPE, 1, float("inf")))
     counts, dark = np.empty(SHAPE, np.uint16), rng.integers(58, 63, SHAPE, dtype=np.uint16)
     timing.head("a raw buffer to linear float32, 1456 x 1088", "ms", "copies", "limit")
     for name in ("R10", "R16"):
@@ -38,7 +38,7 @@ def camera() -> None:
 
 
 def growth_kb(act) -> float:
-    """What Python's allocators hold more after many frames than after a few."""
+    """Return the growth of the memory held by Python's allocators between a few frames and many."""
     tracemalloc.start()
     for _ in range(10):
         act()

@@ -1,6 +1,6 @@
-"""Solvers that were tried and do not ship: each from the same start as ours, on the same grid, by the same judge.
+"""Rejected solvers, each with the same start, grid and judge as ours.
 
-gradients   crop-aware preconditioned conjugate gradients with the evidence prior (optics.md 5.2)
+gradients   crop-aware preconditioned conjugate gradients with the evidence prior (NUMERICS.md 4.4)
 wavelets    empirical Wiener shrinkage of an undecimated wavelet transform, after the Wiener filter (ForWaRD-like)
 """
 
@@ -12,23 +12,23 @@ import numpy as np
 from scipy import fft, ndimage
 
 from device.recon.methods import METHODS
-from device.recon.plan import Planner
-from device.recon.prepare import Linear, Preparer
-from device.recon.upsample import to_sensor
-from device.recon.variation import EvidenceWiener
-from device.sim.staged import Staged
+from device.recon.model.fft_plans import Planner
+from device.recon.model.preprocessing import Linear, Preprocessor
+from device.recon.model.resampling import to_sensor
+from device.recon.solvers.tv import EvidenceWiener
+from device.sim.scene_files import SimulatedExposure
 from device.values import Image
 from tests.bench import timing
 from tests.bench.scoring import judge_of, scored
 
-SEEN = 0.7  # of the torus, by which the preconditioner believes that the data term is weighted
-SPLINE = np.array([1, 4, 6, 4, 1], np.float32) / 16  # B3: the à trous transform
+SEEN = 0.7  # share of the torus: weight of the data term in the preconditioner
+SPLINE = np.array([1, 4, 6, 4, 1], np.float32) / 16  # B3 spline of the à trous transform
 SCALES, STRENGTH = 4, 1.0
 
 
 @dataclass
 class Start:
-    """One frame where both begin: the shading, what it leaves, and the filter that the evidence chose."""
+    """Common start on one frame: shading, residual, and the filter selected by the evidence."""
 
     solver: EvidenceWiener
     frame: Linear
@@ -36,28 +36,28 @@ class Start:
     left: Image
 
     @classmethod
-    def of(cls, scene: Staged, n: int, planner: Planner) -> "Start":
+    def of(cls, scene: SimulatedExposure, n: int, planner: Planner) -> "Start":
         shape = scene.counts.shape[0], scene.counts.shape[1]
         method = METHODS["evidence"]
         model = method.model(scene.calibration, shape, n, planner, 0)
         solver = method.build(model, scene.calibration, planner)
         assert isinstance(solver, EvidenceWiener)
-        return cls(solver, Preparer(scene.calibration, model.grid)(scene.counts), *np.zeros((2, 1, 1), np.float32))
+        return cls(solver, Preprocessor(scene.calibration, model.grid)(scene.counts), *np.zeros((2, 1, 1), np.float32))
 
     def begin(self) -> None:
         solver, model = self.solver, self.solver.model
         solver.start(self.frame)
         self.smooth = np.zeros(model.grid.shape, np.float32)
         _, stray = solver.shading.fit(self.frame, self.smooth)
-        self.left = (self.frame.y - self.through(self.smooth) - np.float32(stray)) * self.frame.good
+        self.left = (self.frame.y - self.forward(self.smooth) - np.float32(stray)) * self.frame.good
 
-    def through(self, x: Image) -> Image:
-        """crop(h * x)."""
+    def forward(self, x: Image) -> Image:
+        """Return crop(h * x)."""
         model = self.solver.model
         return fft.irfft2(fft.rfft2(x) * model.otf, model.grid.shape)[model.grid.slices]
 
-    def back(self, y: Image) -> Image:
-        """The adjoint, inside the field."""
+    def adjoint(self, y: Image) -> Image:
+        """Return the adjoint, inside the field."""
         model = self.solver.model
         whole = np.zeros(model.grid.shape, np.float32)
         whole[model.grid.slices] = y
@@ -68,18 +68,18 @@ class Start:
 
 
 def gradients(start: Start, rounds: int) -> Image:
-    """(M H'C'CHM + R) z = M H'C' r, warm from the Wiener solution; three FFT pairs a round."""
+    """Solve (M H'C'CHM + R) z = M H'C' r, started from the Wiener solution; three FFT pairs per round."""
     start.begin()
-    model, reg = start.solver.model, start.solver.reg
+    model, reg = start.solver.model, start.solver.detail.reg
     shape, mask = model.grid.shape, model.mask
     condition = 1 / (SEEN * np.abs(model.otf) ** 2 + reg + np.float32(1e-7))
 
     def apply(z: Image) -> Image:
         prior = fft.irfft2(fft.rfft2(z) * reg, shape)
-        return start.back(start.through(z * mask) * start.frame.good) + mask * prior
+        return start.adjoint(start.forward(z * mask) * start.frame.good) + mask * prior
 
     z = (start.solver.x - start.smooth) * mask
-    r = start.back(start.left) - apply(z)
+    r = start.adjoint(start.left) - apply(z)
     s = mask * fft.irfft2(fft.rfft2(r) * condition, shape)
     p, rs = s, float(np.vdot(r, s))
     for _ in range(rounds):
@@ -93,13 +93,13 @@ def gradients(start: Start, rounds: int) -> Image:
 
 
 def wavelets(start: Start, _: int) -> Image:
-    """Shrink each scale by what the filter makes of the frame's noise there, which one draw of it tells."""
+    """Shrink each scale by the filtered noise there, estimated from one noise realisation."""
     start.begin()
     model, solver = start.solver.model, start.solver
     noise = np.zeros(model.grid.shape, np.float32)
     draw = np.random.default_rng(0).standard_normal(model.grid.window, np.float32)
-    noise[model.grid.slices] = draw * np.float32(solver.noise.variance_dn2(solver.level) ** 0.5)
-    gain = model.otf.conj() / (np.abs(model.otf) ** 2 + solver.reg)
+    noise[model.grid.slices] = draw * np.float32(solver.detail.noise.variance_dn2(solver.level) ** 0.5)
+    gain = model.otf.conj() / (np.abs(model.otf) ** 2 + solver.detail.reg)
     noise = fft.irfft2(fft.rfft2(noise) * gain, model.grid.shape)
     coarse, hiss = (solver.x - start.smooth) * model.mask, noise
     detail = np.zeros_like(coarse)
@@ -113,7 +113,7 @@ def wavelets(start: Start, _: int) -> Image:
 
 
 def spread(image: Image, scale: int) -> Image:
-    """One step of the à trous transform: the spline with holes of 2^scale."""
+    """Return one step of the à trous transform: the spline with holes of 2^scale."""
     taps = np.zeros(4 * 2**scale + 1, np.float32)
     taps[:: 2**scale] = SPLINE
     return ndimage.convolve1d(ndimage.convolve1d(image, taps, 0), taps, 1)
@@ -125,8 +125,8 @@ CANDIDATES: tuple[tuple[str, Callable[[Start, int], Image], tuple[int, ...]], ..
 )
 
 
-def candidates(scene: Staged, n: int, planner: Planner) -> None:
-    """Their rows in the table of peers, counts prepared, the start included."""
+def candidates(scene: SimulatedExposure, n: int, planner: Planner) -> None:
+    """Print their rows of the table of peers; counts prepared, the start included."""
     start, judge = Start.of(scene, n, planner), judge_of(scene)
     for name, solve, some in CANDIDATES:
         for rounds in some:

@@ -1,4 +1,4 @@
-"""The factor of heads with other optics, a wide source, or a diffuser off its place; and refractions read with it."""
+"""The scale factor per dioptre of heads with other optics, a wide source or a shifted diffuser, and its refractions."""
 
 import tempfile
 from dataclasses import replace
@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from device.calibration.archive import Archive
-from device.calibration.procedure import Job, Operator, Procedure
+from device.calibration.procedure.calibration_sequence import CalibrationJob, CalibrationSequence, Operator
 from device.clock import VirtualClock
-from device.recon.plan import Planner
-from device.recon.refraction import Refractor
+from device.config.head_file import InstrumentSpec
+from device.head import target_placer
+from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.model.fft_plans import Planner
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.world import World
-from device.spec import InstrumentSpec
-from device.values import Calibration, Glow, Shot
-from services.instrument.calibrating import staging
-from tests.simulated import having
+from device.values import Calibration, ExposureSettings, Illumination
+from tests.simulated import with_keys
 
 EYES_DPT = (-6.0, -4.0, -2.0, -0.5, 0.5, 2.0, 4.0, 6.0)
 MOST_RMS_DPT = 0.1
@@ -32,12 +32,15 @@ HEADS: dict[str, tuple[dict[str, float], dict[str, float]]] = {
 
 
 def factors(drawn: InstrumentSpec, planner: Planner) -> list[tuple[str, float, float]]:
-    """Name, value and limit of each figure: the factor of each head, and refractions where the drawings are wrong."""
+    """Return name, value and limit of each figure.
+
+    The figures are the factor of each head, and refractions of heads that deviate from `drawn`.
+    """
     figures = []
     for name, (optics, source) in HEADS.items():
         assert drawn.optics is not None
         made = drawn.model_copy(update={"optics": drawn.optics.model_copy(update=optics)})
-        world = World(having(made, calibration=source), VirtualClock())
+        world = World(with_keys(made, calibration=source), VirtualClock())
         found = measured(world, drawn if "off its place" in name else made)
         assert found.geometry is not None
         error = abs(found.geometry.scale_per_dpt / world.geometry.nominal_scale_per_dpt - 1)
@@ -49,24 +52,24 @@ def factors(drawn: InstrumentSpec, planner: Planner) -> list[tuple[str, float, f
 
 
 def measured(world: World, drawn: InstrumentSpec) -> Calibration:
-    """A world's head calibrated by somebody who has these drawings."""
+    """Return the calibration of a world's head by a technician with the drawings `drawn`."""
     assert world.spec.sim is not None
     source_deg = float(np.degrees(world.spec.sim.calibration.source_um / world.spec.sim.eye.focal_length_um))
-    job = Job(drawn, "D-1", "bench", "0", source_deg=source_deg, dioptres=True)
+    job = CalibrationJob(drawn, "D-1", "bench", "0", source_deg=source_deg, dioptres=True)
     with tempfile.TemporaryDirectory() as folder:
-        archive, operator = Archive(Path(folder)), Operator(staging(world), lambda line: None)
-        id = Procedure(job, SimCamera(world), operator, world.clock, Path(folder) / ".steps").run(archive)
+        archive, operator = Archive(Path(folder)), Operator(target_placer(world), lambda line: None)
+        id = CalibrationSequence(job, SimCamera(world), operator, world.clock, Path(folder) / ".steps").run(archive)
         return archive.load(id).calibration
 
 
 def refracted(spec: InstrumentSpec, found: Calibration, planner: Planner) -> float:
-    """The RMS error of the refraction over simulated retinas, dpt."""
+    """Return the RMS error of the refraction over simulated retinas, dpt."""
     errors = []
-    refractor = Refractor(found, found.psfs[0].shape, planner, 0)
+    refractor = RefractionEstimator(found, found.psfs[0].shape, planner, 0)
     for m_dpt in EYES_DPT:
-        world = World(having(spec, eye={"m_dpt": m_dpt}), VirtualClock())
-        camera, shot = SimCamera(world), Shot(spec.camera.exposure_s)
-        with SimLight(world).on(Glow(spec.light.colour)):
+        world = World(with_keys(spec, eye={"m_dpt": m_dpt}), VirtualClock())
+        camera, shot = SimCamera(world), ExposureSettings(spec.camera.exposure_s)
+        with SimLight(world).on(Illumination(spec.light.colour)):
             frame = camera.expose(shot).counts.copy()
         seen = refractor.find(frame, camera.expose(shot).counts)
         errors.append(np.nan if seen is None else seen.sphere_dpt - m_dpt)

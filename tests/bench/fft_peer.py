@@ -1,4 +1,4 @@
-"""Runs in `.bench-venv`: a real FFT pair by three libraries in turns, float32, one thread. argv: rows cols."""
+"""Runs in `.bench-venv`: a real FFT pair by three libraries in turn, float32, one thread. argv: rows cols."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ TURNS = 31
 
 
 def pairs(rows: int, cols: int) -> dict[str, Callable[[], object]]:
-    """A forward and an inverse transform by each, into arrays of their own where the library allows."""
+    """Return a forward and inverse transform by each library, into preallocated arrays where supported."""
     image = np.random.default_rng(0).random((rows, cols), np.float32)
     spectrum, back = np.empty((rows, cols // 2 + 1), np.complex64), np.empty_like(image)
     space, half = pyfftw.zeros_aligned(image.shape, np.float32), pyfftw.zeros_aligned(spectrum.shape, np.complex64)

@@ -1,9 +1,9 @@
-"""The page beside the instrument: from tap to quick look, how alive it is while a picture is refined, its memory.
+"""Latency, responsiveness and memory of the page: from tap to quick look, and during a refinement.
 
-A real Chromium on the real server with the simulated head, both on the cores of this computer. What the page draws is
-timed in the page itself, by hooks on its requests, events and canvases. A tablet has cores of its own: so the server
-gives way to the browser (`nice`). By itself: `make bench-page`; MINUTES=60 aims for an hour. The exposure is that of
-the simulated head, which computes for part of it, and is taken off as reported.
+A real Chromium runs on the real server with the simulated head, both on the cores of this computer. Hooks on the page's
+requests, events and canvases take the times. A tablet has its own cores, so the server runs with lower priority
+(`nice`). Alone: `make bench-page`; MINUTES=60 aims for an hour. The exposure is that of the simulated head, which
+computes for part of it, and is subtracted as reported.
 """
 
 import json
@@ -78,25 +78,25 @@ def opened(browser: Browser, url: str) -> Page:
     return page
 
 
-def anew(page: Page, url: str) -> None:
-    """Aim at the next person, as if just loaded."""
+def reload(page: Page, url: str) -> None:
+    """Load the page again and aim at the next patient."""
     page.goto("about:blank")
     page.goto(aiming_at(url.split("/#")[0]))
     page.wait_for_selector("eye-live[data-frame]")
 
 
 def marks(page: Page) -> list[Mark]:
-    """What was noted since it was asked for last."""
+    """Return the marks recorded since the last call."""
     return [(name, at_ms, more[0] if more else None) for name, at_ms, *more in page.evaluate("marks.splice(0)")]
 
 
 def first(noted: list[Mark], name: str) -> float:
-    """When it was noted, in ms of the page's clock."""
+    """Return the time of the first mark with that name, in ms of the page's clock."""
     return next(at_ms for one, at_ms, _ in noted if one == name)
 
 
 def pressed(page: Page) -> list[Mark] | None:
-    """All that is noted from one press to its kept picture; None where the guard wanted darkness first."""
+    """Return all marks from one press to its saved picture; None if the guard required a pause first."""
     page.wait_for_timeout(600)
     page.locator("#shutter[aria-disabled=false]").wait_for(timeout=60_000)
     marks(page)
@@ -107,7 +107,7 @@ def pressed(page: Page) -> list[Mark] | None:
 
 
 def without_a_step_ms(noted: list[Mark]) -> float:
-    """The longest time, from the quick look to the picture, in which nothing moved on the page."""
+    """Return the longest time without a visible change, from quick look to picture."""
     begin = first(noted, "shown quick")
     seen = [at for name, at, _ in noted if name in ("progress", "shown quick", "shown final") and at >= begin]
     return float(np.diff(sorted(seen)).max())
@@ -121,14 +121,14 @@ NAMES = {
 
 
 def quick_looks(browser: Browser, url: str) -> None:
-    """Print the way from the tap to the quick look on the screen, and how alive the page is after it."""
+    """Print the time from tap to visible quick look, and the responsiveness of the page after it."""
     page, whole, parts, gaps, lasted = opened(browser, url), [], [], [], []
     for _ in range(3 * PRESSES):
         if len(whole) == PRESSES:
             break
         if (noted := pressed(page)) is None:
             page.wait_for_timeout(3000)
-            anew(page, url)
+            reload(page, url)
             continue
         exposed_ms = 1000 * next(more for name, _, more in noted if name == "kept")["expose"]
         times = [first(noted, name) for name in PARTS]
@@ -137,7 +137,7 @@ def quick_looks(browser: Browser, url: str) -> None:
         whole.append(float(taken.sum()))
         gaps.append(without_a_step_ms(noted))
         lasted.append(first(noted, "kept") - times[-1])
-        anew(page, url)
+        reload(page, url)
     head(f"press to quick look, {len(whole)} presses, s", "p50", "p95", "worst", "limit")
     show("tap to quick look on the screen, without exposure", whole, 0.35)
     for name, column in zip(PARTS, np.array(parts).T, strict=False):
@@ -153,7 +153,7 @@ def show(name: str, times_ms: list[float], limit_s: float | None = None) -> None
 
 
 def staying(browser: Browser, url: str, rounds: int = 8) -> None:
-    """Print how alive a page is that waits for the picture of a large sensor."""
+    """Print the responsiveness of a page that waits for the picture of a large sensor."""
     page, gaps, lasted = opened(browser, url), [], []
     for _ in range(rounds):
         if (noted := pressed(page)) is None:
@@ -161,7 +161,7 @@ def staying(browser: Browser, url: str, rounds: int = 8) -> None:
         else:
             gaps.append(without_a_step_ms(noted))
             lasted.append(first(noted, "shown final") - first(noted, "shown quick"))
-        anew(page, url)
+        reload(page, url)
     head(f"waiting for the picture of a large sensor, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
     show("longest time without a step of progress", gaps, 1.0)
     show("  quick look to picture", lasted)
@@ -169,13 +169,13 @@ def staying(browser: Browser, url: str, rounds: int = 8) -> None:
 
 
 def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
-    """Print how a page fares that goes on to the next picture while the last one is still refined."""
+    """Print the responsiveness of a page that continues with the next picture during the refinement of the last one."""
     page, answers, gaps, frames, lasted = opened(browser, url), [], [], [], []
     for _ in range(rounds):
         page.wait_for_timeout(600)
         page.locator("#shutter[aria-disabled=false]").wait_for(timeout=60_000)
         page.locator("#shutter").tap()
-        page.wait_for_selector("[data-phase=told] #next, [data-phase=kept] #next, [data-screen=aim] [data-do]")
+        page.wait_for_selector("[data-phase=assessed] #next, [data-phase=kept] #next, [data-screen=aim] [data-do]")
         if page.locator("#next").count() == 0:
             page.wait_for_timeout(3000)
         else:
@@ -190,7 +190,7 @@ def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
             gaps.append(float(np.diff([tapped, *seen]).max()))
             lasted.append(first(noted, "kept") - tapped)
             frames.append(sum(name == "live" for name, *_ in noted))
-        anew(page, url)
+        reload(page, url)
     head(f"going on while it is refined, {len(gaps)} times, s", "p50", "p95", "worst", "limit")
     show("tap to the next screen", answers, 0.1)
     show("longest time without a live picture", gaps, 1.0)
@@ -200,7 +200,7 @@ def going_on(browser: Browser, url: str, rounds: int = 8) -> None:
 
 
 def a_long_one(folder: Path) -> Path:
-    """A recording that takes seconds to make: its field is not known, its edges are drawn out to a large sensor."""
+    """Return a recording with a reconstruction of seconds: unknown field, edges extended to a large sensor."""
     scene = ROOT / "device" / "sim" / "scenes" / "diabetic.toml"
     sh(str(Path(sys.executable).parent / "diffuscope"), "simulate", str(scene), "-o", str(folder / "scene"))
     wide = folder / "wide"
@@ -212,7 +212,7 @@ def a_long_one(folder: Path) -> Path:
 
 
 def ready(server: Server) -> None:
-    """Wait until it has measured this computer and made its plans."""
+    """Wait until the server has measured this computer and made its FFT plans."""
     server.wait_until_ready()
     while json.load(urllib.request.urlopen(f"{server.url}/api/status", timeout=30))["state"] != "aim":
         time.sleep(0.5)
@@ -220,7 +220,7 @@ def ready(server: Server) -> None:
 
 @contextmanager
 def serving(folder: Path, *source: str) -> Iterator[str]:
-    """The address at which somebody aims, on a server of its own."""
+    """Yield the address of the aiming screen on a new server."""
     folder.mkdir()
     server = Server(folder / "data", *source)
     server.before = ["nice", "-n", "5"]
@@ -233,7 +233,7 @@ def serving(folder: Path, *source: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure all of it."""
+    """Run all measurements."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else MINUTES
     with tempfile.TemporaryDirectory() as place, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])

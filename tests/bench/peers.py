@@ -1,4 +1,4 @@
-"""What others do with the same frame, on the same pixels, judged by the same judge: for the bench only, not shipped."""
+"""Other solvers on the same frame and pixels with the same judge: for the benchmark only, not shipped."""
 
 import time
 from collections.abc import Callable
@@ -9,16 +9,16 @@ from scipy import fft, ndimage
 from skimage.restoration import wiener
 
 from device.clock import SystemClock
-from device.recon.geometry import Grid
-from device.recon.metrics import Judge
-from device.recon.plan import Planner
+from device.recon.assessment.metrics import PictureScorer
+from device.recon.model.fft_plans import Planner
+from device.recon.model.grid import Grid
+from device.recon.model.resampling import to_sensor
 from device.recon.reconstructor import Recipe, Reconstructor
-from device.recon.upsample import to_sensor
-from device.sim.staged import Staged
+from device.sim.scene_files import SimulatedExposure
 from device.values import Image
 from tests.bench import timing
 from tests.bench.candidates import candidates
-from tests.bench.elsewhere import lensless_pictures
+from tests.bench.peer_environment import lensless_pictures
 from tests.bench.scoring import judge_of, scored
 
 N = 2
@@ -31,13 +31,13 @@ def binned(image: Image, n: int = N) -> Image:
 
 
 def centred(psf: Image, n: int = N) -> Image:
-    """The PSF moved by part of a pixel, so that its centre is a block's centre: no peer pays for a half pixel."""
+    """Return the PSF shifted by a fraction of a pixel to the centre of a block, so that no peer loses half a pixel."""
     half = (n - 1) / 2
     return np.asarray(fft.ifft2(ndimage.fourier_shift(fft.fft2(psf), (half, half))).real, np.float32)
 
 
 def blurs(psf: Image) -> tuple[Convolve, Convolve, float]:
-    """Periodic h * x, its adjoint, and the largest |H|^2."""
+    """Return periodic h * x, its adjoint, and the largest |H|^2."""
     otf = fft.rfft2(np.fft.ifftshift(psf / psf.sum()))
     shape = psf.shape
     forward = lambda x: fft.irfft2(fft.rfft2(x) * otf, shape)  # noqa: E731
@@ -46,7 +46,7 @@ def blurs(psf: Image) -> tuple[Convolve, Convolve, float]:
 
 
 def fista(y: Image, psf: Image, rounds: int) -> Image:
-    """Accelerated projected gradient with non-negativity: Beck and Teboulle 2009; two FFT pairs a round."""
+    """Accelerated projected gradient with non-negativity (Beck and Teboulle 2009); two FFT pairs per round."""
     forward, adjoint, lipschitz = blurs(psf)
     x = z = np.full_like(y, max(float(y.mean()), 0))
     t = 1.0
@@ -58,7 +58,7 @@ def fista(y: Image, psf: Image, rounds: int) -> Image:
 
 
 def richardson_lucy(y: Image, psf: Image, rounds: int) -> Image:
-    """Multiplicative rounds for Poisson light: Richardson 1972, Lucy 1974; two FFT pairs a round."""
+    """Multiplicative rounds for Poisson noise (Richardson 1972, Lucy 1974); two FFT pairs per round."""
     forward, adjoint, _ = blurs(np.maximum(psf, 0))
     y = np.maximum(y, 0)
     x = np.full_like(y, max(float(y.mean()), 1e-6))
@@ -68,7 +68,7 @@ def richardson_lucy(y: Image, psf: Image, rounds: int) -> Image:
 
 
 def skimage_wiener(y: Image, psf: Image, _: int) -> Image:
-    """scikit-image's Wiener filter, its default prior, at the balance of its own example, on [0, 1]."""
+    """scikit-image's Wiener filter with its default prior, at the balance of its example, on [0, 1]."""
     return np.asarray(wiener(y / y.max(), psf, balance=1e-3, clip=False), np.float32)
 
 
@@ -80,8 +80,11 @@ PEERS: tuple[tuple[str, Callable[[Image, Image, int], Image], tuple[int, ...]], 
 LENSLESS_ROUNDS = (10, 40, 100)
 
 
-def peers(scene: Staged, planner: Planner) -> None:
-    """Ours and theirs in one table; theirs at bin 2, on black-subtracted counts, no shading model, no crop model."""
+def peers(scene: SimulatedExposure, planner: Planner) -> None:
+    """Print our solvers and others in one table.
+
+    The others run at bin 2 on black-subtracted counts, without shading model and crop model.
+    """
     shape = (scene.truth.shape[0], scene.truth.shape[1])
     judge = judge_of(scene)
     timing.head("peers, 1080 x 1920 binned by 2 (medians of 3)", "ms", "peak MB", "PSNR dB", "PCC", "SSIM", "detail")
@@ -107,7 +110,7 @@ def peers(scene: Staged, planner: Planner) -> None:
     lensless(y, psf, grid, judge)
 
 
-def lensless(y: Image, psf: Image, grid: Grid, judge: Judge) -> None:
-    """LenslessPiCam's ADMM in its own environment."""
+def lensless(y: Image, psf: Image, grid: Grid, judge: PictureScorer) -> None:
+    """Print the rows of LenslessPiCam's ADMM, run in its own environment."""
     for name, ms, mb, picture in lensless_pictures(y, psf, LENSLESS_ROUNDS):
         scored(name, ms, mb, judge, to_sensor(picture, grid))

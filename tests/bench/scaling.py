@@ -1,6 +1,6 @@
-"""How time and memory of the closed form grow with the sensor: 0.25 to 8 megapixels, each in a process of its own.
+"""Growth of time and memory of the closed form with the sensor: 0.25 to 8 megapixels, one process each.
 
-`python -m tests.bench.scaling MPX` measures one size and prints it as JSON; the table and the plot are `scaling()`.
+`python -m tests.bench.scaling MPX` measures one size and prints it as JSON; `scaling()` makes the table and the plot.
 """
 
 import json
@@ -12,27 +12,27 @@ from pathlib import Path
 import numpy as np
 
 from device.clock import SystemClock
-from device.recon.plan import Planner
+from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Calibration, Geometry, Psf, Sensor
-from services.instrument.plot import Mark, Plot, Series, log_axis, svg, time_axis
+from services.lab.plot import Mark, Plot, Series, log_axis, svg, time_axis
 from tests.bench import timing
 from tests.scenes import speckle
 
 SIZES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 CASES = (Recipe("gradient", 1), Recipe("gradient", 2))
-STEEPEST = 1.25  # N log N over this range is N^1.05; the rest is what leaves the caches
+STEEPEST = 1.25  # N log N over this range is N^1.05; cache misses add the rest
 OUT = Path("out")
 
 
 def shape_of(megapixels: float) -> tuple[int, int]:
-    """A 9:16 sensor of about so many pixels, its sides divisible by 24."""
+    """Return the shape of a 9:16 sensor of about that many pixels, its sides divisible by 24."""
     rows = round((megapixels * 1e6 * 9 / 16) ** 0.5 / 24) * 24
     return rows, round(rows * 16 / 9 / 24) * 24
 
 
 def measure(megapixels: float, plans: Path) -> dict[str, float]:
-    """One size: milliseconds of each case, and how much the process grew from its imports to its last picture."""
+    """Measure one size: milliseconds of each case, and growth of the process from its imports to its last picture."""
     shape = shape_of(megapixels)
     pitch_um = 5.04 * 1080 / shape[0]  # the same optics on finer or coarser pixels
     psf = Psf(speckle(shape, grain_px=2 * shape[0] / 1080))
@@ -52,7 +52,7 @@ def peak_mb() -> float:
 
 
 def scaling(plans: Path) -> None:
-    """The table, the fitted power law, and out/scaling.svg."""
+    """Print the table and the fitted power law, and write out/scaling.svg."""
     timing.head("closed form from 0.25 to 8 megapixels", "bin 1 ms", "bin 2 ms", "peak MB", "grown MB")
     found = []
     for size in SIZES:
@@ -71,7 +71,7 @@ def scaling(plans: Path) -> None:
 
 
 def drawn(found: list[dict[str, float]]) -> str:
-    """Sensor size to the right, time upward, both logarithmic."""
+    """Return the plot of time over sensor size, both logarithmic."""
     trails = {
         case: tuple(
             Mark(at["pixels"] / 1e6, at[case] / 1e3, f"{at['peak_mb']:.0f} MB" if case == "bin 1" else "",

@@ -1,7 +1,7 @@
-"""`make bench-sides DATA=folder`: how often the side of an eye is told, and how often wrongly, on photographs.
+"""`make bench-sides DATA=folder`: rate of laterality estimates, and of wrong ones, on real photographs.
 
-Each photograph is turned, mirrored, blurred and put behind the simulated head in more and less light, and its picture
-is made as the instrument makes it. The two whose limits were chosen by them stand apart from those never seen before.
+Each photograph is rotated, mirrored, blurred and imaged by the simulated head in more and less light; its picture is
+made as by the instrument. The two photographs that set the limits are listed apart from the unseen ones.
 """
 
 import argparse
@@ -17,15 +17,15 @@ from PIL import Image as Pictures
 from PIL import ImageFilter, ImageOps
 
 from device.clock import Deadline, SystemClock
-from device.recon.laterality import laterality
-from device.recon.model import field_box
-from device.recon.plan import Planner
+from device.config.head_file import InstrumentSpec, load_head
+from device.config.scene import ObjectSpec
+from device.recon.assessment.laterality import laterality
+from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import field_box
 from device.recon.reconstructor import Reconstructor
-from device.scene import ObjectSpec
-from device.sim.staged import staged
-from device.spec import InstrumentSpec, load_head
+from device.sim.scene_files import simulate_exposure
 from device.values import Eye
-from tests.simulated import coarse, having
+from tests.simulated import coarse, with_keys
 
 HEAD = coarse(load_head(Path("hardware/heads/sim.toml")), 2)
 CLOCK, PLANNER = SystemClock(), Planner(Path.home() / ".cache" / "diffuscope")
@@ -35,7 +35,7 @@ BUDGET_S = 1.0
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph: its eye, degrees across its width, and where disc and fovea are, in shares of its width."""
+    """A photograph: its eye, its width in degrees, and the positions of disc and fovea as shares of its width."""
 
     file: str
     eye: Eye
@@ -61,7 +61,7 @@ CONDITIONS: dict[str, tuple[float, float, float]] = {  # blur in degrees, light,
 
 
 def prepared(photo: Photo, data: Path, mirrored: bool, turned_deg: float, blur_deg: float, aim: str, to: Path) -> Eye:
-    """Write what the head will look at, as wide as the photograph; answer with its eye."""
+    """Write the object for the head, at the width of the photograph; return its eye."""
     with Pictures.open(data / photo.file) as picture:
         rgb = picture.convert("RGB")
     rgb.thumbnail((1200, 1200))
@@ -81,34 +81,34 @@ def prepared(photo: Photo, data: Path, mirrored: bool, turned_deg: float, blur_d
 
 
 class Maker:
-    """Makes pictures of images as the instrument does; planned once for each field."""
+    """Reconstruction of images as by the instrument, planned once per field."""
 
     def __init__(self) -> None:
         self._made: dict[float, Reconstructor] = {}
 
-    def told(self, image: Path, wide_deg: float, light: float, field_deg: float) -> tuple[Eye | None, float]:
-        """Which eye the picture of this image is said to be of, and how surely."""
+    def estimate_eye(self, image: Path, wide_deg: float, light: float, field_deg: float) -> tuple[Eye | None, float]:
+        """Return the estimated eye of an image's picture, and the confidence."""
         assert HEAD.sim is not None
         assert HEAD.optics is not None
-        looked = having(HEAD, peak_e=HEAD.sim.peak_e * light)
+        looked = with_keys(HEAD, peak_e=HEAD.sim.peak_e * light)
         assert looked.sim is not None
         thing = ObjectSpec(kind="image", image=image, size_deg=wide_deg)
         spec: InstrumentSpec = looked.model_copy(update={
             "sim": looked.sim.model_copy(update={"object": thing}),
             "optics": HEAD.optics.model_copy(update={"field_deg": field_deg}),
         })  # fmt: skip
-        shot = staged(spec)
+        shot = simulate_exposure(spec)
         if field_deg not in self._made:
             self._made[field_deg] = Reconstructor(shot.calibration, shot.counts.shape, PLANNER, CLOCK)
         made = self._made[field_deg](shot.counts, simulated=True, deadline=Deadline.after(CLOCK, BUDGET_S))
         seen = made.picture[field_box(shot.calibration, shot.counts.shape)]
         assert shot.calibration.geometry is not None
-        said = laterality(seen, shot.calibration.geometry.px_per_deg, field_deg)
-        return said.eye, said.confidence
+        estimate = laterality(seen, shot.calibration.geometry.px_per_deg, field_deg)
+        return estimate.eye, estimate.confidence
 
 
 def tries(data: Path, maker: Maker, aim: str) -> Iterator[tuple[Photo, str, str, float]]:
-    """Every photograph in every condition: what was said of it, `right`, `wrong` or `nothing`."""
+    """Yield the result of every photograph in every condition: `right`, `wrong` or `nothing`."""
     with TemporaryDirectory() as folder:
         there = Path(folder) / "eye.png"
         for photo, (name, (blur, light, field)) in product(PHOTOS, CONDITIONS.items()):
@@ -116,20 +116,20 @@ def tries(data: Path, maker: Maker, aim: str) -> Iterator[tuple[Photo, str, str,
                 continue
             for mirrored, turned in product((False, True), (-10.0, 0.0, 10.0)):
                 eye = prepared(photo, data, mirrored, turned, blur, aim, there)
-                said, sure = maker.told(there, photo.wide_deg, light, field)
-                yield photo, name, "nothing" if said is None else "right" if said == eye else "wrong", sure
+                eye_found, sure = maker.estimate_eye(there, photo.wide_deg, light, field)
+                yield photo, name, "nothing" if eye_found is None else "right" if eye_found == eye else "wrong", sure
 
 
 def main() -> None:
-    """Print a table for each aim, and how long one look takes."""
+    """Print a table per aim, and the time of one estimate."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     data, maker = parser.parse_args().data, Maker()
     for aim in ("centre", "nerve"):
         counts: dict[tuple[bool, str], Counter[str]] = defaultdict(Counter)
-        for photo, name, said, sure in tries(data, maker, aim):
-            counts[photo.seen, name][said] += 1
-            if said == "wrong":
+        for photo, name, result, sure in tries(data, maker, aim):
+            counts[photo.seen, name][result] += 1
+            if result == "wrong":
                 print(f"wrong: {photo.file}, {name}, {sure:.3f}")
         print(f"\naim: {aim}\n{'':24}{'limits chosen by them':>28}{'never seen before':>28}")
         for name in CONDITIONS:

@@ -1,4 +1,4 @@
-"""What a simulated frame costs: against its own bare FFTs, and what leaving out effects saves."""
+"""Cost of a simulated frame relative to its bare FFTs, and the saving by skipped effects."""
 
 import time
 from functools import partial
@@ -8,23 +8,23 @@ import numpy as np
 from scipy import fft
 
 from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec, load_head
 from device.sim.plan import decide
-from device.sim.render import electrons_per_s, traced
+from device.sim.render import cached_caustic, electrons_per_s
 from device.sim.world import World
-from device.spec import InstrumentSpec, load_head
 from tests.bench import timing
 
 SCENE = Path("device/sim/scenes/healthy.toml")
-SKIPPED_LIMIT = 0.2  # of everything, for a relaxed eye on the axis before a screen that shines by itself
+SKIPPED_LIMIT = 0.2  # share of the full cost, for a relaxed eye on the axis before a self-luminous screen
 TURNS = 7
 
 
 def simulator() -> None:
-    """One frame at 1080 x 1920: its light, its noise, and the same with every effect forced."""
+    """Time one frame of 1080 x 1920: its light, its noise, and the same with every effect forced."""
     spec = before_a_screen(load_head(SCENE))
     plain, everything = (World(spec, VirtualClock(), choose=partial(decide, everything=forced)) for forced in (0, 1))
     for world in (plain, everything):
-        world.electrons_per_s(spec.light.colour)  # draws the object, which both need
+        world.electrons_per_s(spec.light.colour)  # renders the object, which both runs need
     warm_ms = median_ms(plain, fresh=False)
     cold_ms, all_ms = median_ms(plain, fresh=True), median_ms(everything, fresh=True)
     (bare_ms,) = timing.side_by_side_ms(bare_ffts(plain))
@@ -40,18 +40,18 @@ def simulator() -> None:
 
 
 def before_a_screen(spec: InstrumentSpec) -> InstrumentSpec:
-    """The same object on a screen that shines by itself."""
+    """Return the same object on a self-luminous screen."""
     assert spec.sim is not None
     eye = spec.sim.eye.model_copy(update={"shown_by": "screen"})
     return spec.model_copy(update={"sim": spec.sim.model_copy(update={"eye": eye})})
 
 
 def median_ms(world: World, *, fresh: bool) -> float:
-    """Rendering once more what the sensor receives; `fresh` traces the caustics anew as well."""
+    """Return the median time to render the sensor's light again; `fresh` also retraces the caustics."""
     times = []
     for _ in range(TURNS):
         if fresh:
-            traced.cache_clear()
+            cached_caustic.cache_clear()
         begin = time.perf_counter()
         electrons_per_s(world.setup(world.spec.light.colour))
         times.append(time.perf_counter() - begin)
@@ -59,7 +59,7 @@ def median_ms(world: World, *, fresh: bool) -> float:
 
 
 def bare_ffts(world: World) -> partial[None]:
-    """Object and caustic there, their product back, with nothing between."""
+    """Return the transforms of object and caustic and the inverse of their product, without any other work."""
     setup = world.setup(world.spec.light.colour)
     wide = [fft.next_fast_len(n + world.psf("green").shape[0] - 1, real=True) for n in setup.object.shape]
     image = np.ones(wide, np.float32)

@@ -1,8 +1,8 @@
-"""How much an hour of aiming fills the page's memory, in a Chromium that nobody is attached to.
+"""Memory growth of the page per hour of aiming, in a Chromium without an attached debugger.
 
-Playwright listens to the network of every page it opens, and the page's own process keeps what it may be asked for: by
-that alone it grew by 30 MB an hour. Here commands go through a pipe, and a page is attached to only while it is asked.
-What a renderer has for itself is what the kernel counts as its private, written memory, after its rubbish is collected.
+Playwright listens to the network of every page it opens, and the page's process keeps records for it: these alone grew
+by 30 MB an hour. Here commands go through a pipe, and a debugger is attached only during each command. The memory of a
+renderer is its private dirty memory as counted by the kernel, after garbage collection.
 """
 
 import json
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from tests.bench.timing import head, row
 from tests.browser.conftest import CHROMIUM
 
-EVERY_S, LOOKS = 10.0, 30  # how often it is looked at, and how many times at the least
-WARM_H = 1 / 60  # until then fonts, code and caches arrive that no later minute brings again
+EVERY_S, LOOKS = 10.0, 30  # sampling interval, and minimum number of samples
+WARM_H = 1 / 60  # warm-up: fonts, code and caches are loaded once
 WORDS = ("--headless", "--no-sandbox", "--window-size=1280,800", "--remote-debugging-pipe")
-PIPED = 'exec "$0" "$@" 3<&{} 4>&{}'  # where Chromium reads its commands, and where it answers
+PIPED = 'exec "$0" "$@" 3<&{} 4>&{}'  # file descriptors of Chromium's commands and answers
 
 
-class Alone:
-    """A Chromium with one page, spoken to through a pipe; between two questions nothing listens to the page."""
+class PipedBrowser:
+    """A Chromium with one page, controlled through a pipe; no debugger is attached between two commands."""
 
     def __init__(self, folder: Path, url: str) -> None:
         reads, self._commands = os.pipe()
@@ -42,7 +42,7 @@ class Alone:
         self.ask("Page.navigate", url=url)
 
     def ask(self, method: str, **words: Any) -> dict[str, Any]:
-        """What the page answers; it is attached to for that long."""
+        """Attach to the page, send one command, detach, and return its answer."""
         page = next(one for one in self._pages() if one["type"] == "page")
         session = self._say("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         answer = self._say(method, session, **words)
@@ -50,28 +50,28 @@ class Alone:
         return answer
 
     def value(self, expression: str) -> Any:
-        """What an expression is worth in the page."""
+        """Return the value of an expression in the page."""
         return self.ask("Runtime.evaluate", expression=expression)["result"].get("value")
 
     def own_mb(self) -> float:
-        """The private, written memory of the processes that draw pages."""
-        told = self._say("SystemInfo.getProcessInfo")["processInfo"]
-        sizes = [Path(f"/proc/{one['id']}/smaps_rollup").read_text() for one in told if one["type"] == "renderer"]
+        """Return the private dirty memory of the renderer processes."""
+        processes = self._say("SystemInfo.getProcessInfo")["processInfo"]
+        sizes = [Path(f"/proc/{one['id']}/smaps_rollup").read_text() for one in processes if one["type"] == "renderer"]
         return (
             sum(int(line.split()[1]) for text in sizes for line in text.splitlines() if "Private_Dirty" in line) / 1024
         )
 
     def close(self) -> None:
-        """End it."""
+        """End the browser."""
         self._process.terminate()
         self._process.wait(10)
         os.close(self._commands)
         os.close(self._answers)
 
     def _pages(self) -> list[dict[str, Any]]:
-        while not (told := self._say("Target.getTargets")["targetInfos"]):
-            time.sleep(0.1)  # it begins without
-        targets: list[dict[str, Any]] = told
+        while not (found := self._say("Target.getTargets")["targetInfos"]):
+            time.sleep(0.1)  # no target exists right after the start
+        targets: list[dict[str, Any]] = found
         return targets
 
     def _say(self, method: str, session: str | None = None, **words: Any) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class Alone:
         command = {"id": self._number, "method": method, "params": words} | ({"sessionId": session} if session else {})
         os.write(self._commands, json.dumps(command).encode() + b"\0")
         while (answer := self._next()).get("id") != self._number:
-            pass  # an event: nobody listens
+            pass  # an event, which is ignored
         assert "result" in answer, answer
         result: dict[str, Any] = answer["result"]
         return result
@@ -95,7 +95,7 @@ class Alone:
 
 
 class Seen(NamedTuple):
-    """One look: when, the heap of the page's code, and all that its process has for itself."""
+    """One sample: time, heap of the page's code, and private memory of its process."""
 
     at_h: float
     heap_mb: float
@@ -103,10 +103,10 @@ class Seen(NamedTuple):
 
 
 def memory(url: str, minutes: float) -> None:
-    """Print the curve of the memory, whether it still rises in the second half, and what an hour would add by that."""
+    """Print the memory curve, its slope in the second half, and the extrapolation to one hour."""
     with (
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
-        closing(Alone(Path(folder), url)) as browser,
+        closing(PipedBrowser(Path(folder), url)) as browser,
     ):
         while not browser.value("document.querySelector('eye-live[data-frame]') !== null"):
             time.sleep(0.5)
@@ -117,14 +117,14 @@ def memory(url: str, minutes: float) -> None:
     columns = ("1st min", "then", "mid", "end", "rise/h", "sd", "in 1 h", "limit")
     head(f"memory, {minutes:.0f} min of aiming, MB ({number} live pictures)", *columns)
     for name, mb in zip(("heap of the page's code", "its process, all that is its own"), kinds, strict=True):
-        told(f"{name}, extrapolated", at_h[warm], mb[warm], float(mb[0]))
+        print_row(f"{name}, extrapolated", at_h[warm], mb[warm], float(mb[0]))
     print("rise/h: by a straight line through the second half; in 1 h: what was seen, and that rise for the rest")
     parts = np.array_split(np.array(kinds[1]), min(len(at_h), 10))
     print("its process, means of ten equal parts of the time: " + " ".join(f"{part.mean():.1f}" for part in parts))
 
 
-def watched(browser: Alone, minutes: float) -> Iterator[Seen]:
-    """A look every ten seconds, or oftener in a short run, after the rubbish was collected."""
+def watched(browser: PipedBrowser, minutes: float) -> Iterator[Seen]:
+    """Yield a sample every ten seconds, or oftener in a short run, after garbage collection."""
     begin_s = time.monotonic()
     for at_s in np.arange(0.0, 60 * minutes + 1, min(EVERY_S, 60 * minutes / LOOKS)):
         time.sleep(max(0.0, begin_s + at_s - time.monotonic()))
@@ -133,8 +133,8 @@ def watched(browser: Alone, minutes: float) -> Iterator[Seen]:
         yield Seen((time.monotonic() - begin_s) / 3600, heap_mb, browser.own_mb())
 
 
-def told(name: str, at_h: NDArray[np.float64], mb: NDArray[np.float64], first_mb: float) -> None:
-    """One row: the curve, its rise in the second half, and what an hour adds to the first warm look."""
+def print_row(name: str, at_h: NDArray[np.float64], mb: NDArray[np.float64], first_mb: float) -> None:
+    """Print one row: the curve, its slope in the second half, and the extrapolated increase after an hour."""
     late = at_h >= (at_h[0] + at_h[-1]) / 2
     (rise, _), spread = np.polyfit(at_h[late], mb[late], 1, cov=True)
     few = max(1, len(mb) // 10)

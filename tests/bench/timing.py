@@ -1,4 +1,4 @@
-"""Acts that take turns, and a table of figures with their limits and a verdict."""
+"""Interleaved timing of functions, and a table of figures with limits and verdicts."""
 
 import time
 import tracemalloc
@@ -11,10 +11,10 @@ ROUNDS = 15
 
 
 def turns_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> NDArray[np.float64]:
-    """Times of several acts that take turns, (rounds, acts), after two turns that warm up.
+    """Return the times of interleaved calls, (rounds, acts), after two warm-up rounds.
 
-    Each is run twice and its second run counts: the first one's caches are full of what ran before it, which would
-    charge the shortest act most.
+    Each function is called twice and the second call counts: the caches of the first call are filled by other code,
+    which would charge the shortest function most.
     """
     times = np.empty((rounds + 2, len(acts)))
     for turn in times:
@@ -27,21 +27,21 @@ def turns_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> NDArray[np.fl
 
 
 def side_by_side_ms(*acts: Callable[[], object], rounds: int = ROUNDS) -> list[float]:
-    """The median time of each of several acts that take turns."""
+    """Return the median time of each of several interleaved functions."""
     return [float(ms) for ms in np.median(turns_ms(*acts, rounds=rounds), axis=0)]
 
 
 def against_the_first(*acts: Callable[[], object], rounds: int = 31) -> tuple[list[float], list[float]]:
-    """Median times, and the median over the turns of each act's ratio to the first one.
+    """Return median times, and the median over rounds of each function's ratio to the first.
 
-    A neighbour's burst lasts longer than a turn: it slows both sides of a turn's ratio, and leaves the ratio alone.
+    A burst of other load lasts longer than a round: it slows both sides of a ratio and leaves the ratio unchanged.
     """
     times = turns_ms(*acts, rounds=rounds)
     return [float(v) for v in np.median(times, axis=0)], [float(v) for v in np.median(times / times[:, :1], axis=0)]
 
 
 def peak_mb(act: Callable[[], object]) -> float:
-    """The most memory that Python's allocators, numpy's arrays among them, held while an act ran, over that before."""
+    """Return the peak memory of Python's allocators (numpy arrays included) during a call, above that before it."""
     tracemalloc.start()
     act()
     peak = tracemalloc.get_traced_memory()[1]
@@ -50,12 +50,12 @@ def peak_mb(act: Callable[[], object]) -> float:
 
 
 def head(title: str, *columns: str) -> None:
-    """The first line of a table."""
+    """Print the first line of a table."""
     print(f"\n{title:<52}" + "".join(f"{column:>9}" for column in columns), flush=True)
 
 
 def row(name: str, *cells: float | str | None, limit: float | None = None, value: float | None = None) -> None:
-    """One line: figures, then, where `value` has a limit, the limit and whether it is kept."""
+    """Print one line: figures, then, for a `value` with a limit, the limit and whether it is kept."""
     words = "".join(f"{_cell(cell):>9}" for cell in cells)
     verdict = "" if limit is None or value is None else f"{limit:9.2f}   {'ok' if value <= limit else 'OVER'}"
     print(f"{name:<52}{words}{verdict}", flush=True)

@@ -1,27 +1,29 @@
-"""How long a tool of the picture viewer takes until it is seen, on the graphics chip and without it.
+"""Latency of a tool of the picture viewer, with the graphics chip and without.
 
-A real Chromium shows one picture of 1024 x 1024 in the page's own element on 1280 x 800; a tool is changed, and the
-clock stops when a pixel of the glass has been read back. So a wait of up to one frame (17 ms) is in every figure; and
-where the chip is a program (SwiftShader, wherever the bench's computer has none) all that it computes, too: such a chip
-is refused by an ordinary browser, so its figures are the worst case. `CPU/4` slows the page's own thread four times: a
-guess at a cheap tablet. Limits: 50 ms with the chip, 100 ms without.
+A real Chromium shows one picture of 1024 x 1024 in the page's element on 1280 x 800. A tool is changed, and the timer
+stops when a pixel of the canvas has been read back, so each figure includes a wait of up to one frame (17 ms). A
+software chip (SwiftShader, where the benchmark's computer has no chip) adds its computation: an ordinary browser
+refuses such a chip, so its figures are the worst case. `CPU/4` slows the page's thread four times, as an estimate of a
+cheap tablet. Limits: 50 ms with the chip, 100 ms without.
 """
 
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from pathlib import Path
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.bench.timing import head, row
-from tests.browser.conftest import CHROMIUM, free_port
-from tests.browser.stub import Stub, Stubbed
+from tests.browser.conftest import CHROMIUM
+from tests.browser.real import Real
 
 LIMITS_MS = {"gl": 50.0, "2d": 100.0}
 FLAGS = {"gl": [], "2d": ["--use-gl=disabled"]}
 SIDE, ROUNDS = 1024, 40
 
 SHOWN = """async (side) => {
-  await import(new URL("viewer.js", document.querySelector("script[type=module]").src).href);
+  await import(new URL("components/viewer/viewer.js", document.querySelector("script[type=module]").src).href);
   const drawing = Object.assign(document.createElement("canvas"), { width: side, height: side });
   const context = drawing.getContext("2d");
   const pixels = context.createImageData(side, side);
@@ -60,7 +62,7 @@ CHANGED = """async (rounds) => {
 
 @contextmanager
 def showing(browser: Browser, url: str, slower: int) -> Iterator[tuple[Page, str]]:
-    """A page that shows one picture, on a processor that many times slower, and the painter that it chose."""
+    """Yield a page with one picture, on a processor slowed by `slower`, and the renderer in use."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True)
     page = context.new_page()
     page.goto(url)
@@ -72,15 +74,20 @@ def showing(browser: Browser, url: str, slower: int) -> Iterator[tuple[Page, str
 
 
 def viewer() -> None:
-    """Print the time of a tool change for both painters, and how the chip compares."""
+    """Print the time of a tool change for both renderers, and their ratio."""
     title = f"a tool change on {SIDE} x {SIDE}, until it is seen, ms"
     head(title, "first", "median", "p95", "drawing", "of limit", "limit")
-    with Stubbed(Stub(), free_port()) as stubbed, sync_playwright() as playwright:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        closing(Real(Path(folder), Path(folder) / "plans")) as real,
+        sync_playwright() as playwright,
+    ):
+        real.wait_until_ready()
         for slower in (1, 4):
             medians = {}
             for wanted, flags in FLAGS.items():
                 browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *flags])
-                with showing(browser, stubbed.url, slower) as (page, painter):
+                with showing(browser, real.url, slower) as (page, painter):
                     assert painter == wanted, f"this Chromium draws by {painter}"
                     times, drawing = page.evaluate(CHANGED, ROUNDS)
                 first, later = times[0], sorted(times[1:])

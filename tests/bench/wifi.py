@@ -1,8 +1,8 @@
-"""A tablet at the end of a bad link: how old the live picture is, when a lost link is told, how soon the page is there.
+"""A tablet on a bad link: age of the live picture, detection of a lost link, and time to first use.
 
-The tablet is a real Chromium in a network namespace of its own, behind a queue that lets only so many bits through; the
-server is `diffuscope run`. Needs root. A relay between the two notes when each live picture leaves, and the browser
-when it is drawn: both read one clock. By itself: `make bench-wifi`.
+The tablet is a real Chromium in a network namespace, behind a queue of limited rate; the server is `diffuscope run`.
+Needs root. A relay between the two records the departure of each live picture, and the browser its drawing, on one
+clock. Alone: `make bench-wifi`.
 """
 
 import asyncio
@@ -54,7 +54,7 @@ def sh(*words: str) -> None:
 
 @contextmanager
 def namespace() -> Iterator[None]:
-    """A second host on this machine, with one wire to it."""
+    """Create a second host on this machine, with one link to it."""
     subprocess.run(["ip", "netns", "del", SPACE], check=False, capture_output=True)
     sh("ip", "netns", "add", SPACE)
     try:
@@ -73,14 +73,14 @@ def namespace() -> Iterator[None]:
 
 
 def throttle(mbit_per_s: int) -> None:
-    """Both ways through a queue of 400 ms."""
+    """Limit both directions by a queue of 400 ms."""
     queue = ["root", "tbf", "rate", f"{mbit_per_s}mbit", "burst", "16kb", "latency", "400ms"]
     sh("tc", "qdisc", "replace", "dev", OURS, *queue)
     sh("ip", "netns", "exec", SPACE, "tc", "qdisc", "replace", "dev", THEIRS, *queue)
 
 
 class Relay:
-    """Hands bytes between the tablet and the server, and notes when the light of each live picture was collected."""
+    """TCP relay between tablet and server; records when the light of each live picture was collected."""
 
     def __init__(self, server_port: int) -> None:
         self.port, self._server_port = free_port(), server_port
@@ -108,7 +108,7 @@ class Relay:
 
 @contextmanager
 def tablet(folder: Path) -> Iterator[Browser]:
-    """Chromium at the other end of the wire."""
+    """Yield a Chromium at the other end of the link."""
     wrapper = folder / "chromium"
     wrapper.write_text(f'#!/bin/sh\nexec ip netns exec {SPACE} {CHROMIUM} "$@"\n')
     wrapper.chmod(0o755)
@@ -119,22 +119,22 @@ def tablet(folder: Path) -> Iterator[Browser]:
 
 
 def aiming_at(url: str) -> str:
-    """The address at which a tablet aims at a person who agreed."""
+    """Return the address of the aiming screen for a patient with consent."""
 
-    def said(method: str, path: str, **body: str) -> dict[str, str]:
+    def send(method: str, path: str, **body: str) -> dict[str, str]:
         content = json.dumps({"key": secrets.token_hex(8), **body}).encode()
         headers = {"Content-Type": "application/json"}
         asked = urllib.request.Request(f"{url}{path}", content, headers, method=method)
         answer: dict[str, str] = json.load(urllib.request.urlopen(asked, timeout=30))
         return answer
 
-    visit = said("POST", "/api/visits")["id"]
-    said("PATCH", f"/api/visits/{visit}", field="consent", value="agreed")
+    visit = send("POST", "/api/visits")["id"]
+    send("PATCH", f"/api/visits/{visit}", field="consent", value="agreed")
     return f"{url}/#/visit/{visit}/aim/R-centre"
 
 
 def opened(browser: Browser, url: str, slower: int = 1) -> tuple[Page, float]:
-    """The page at its live picture, on a processor that many times slower; and how long that took."""
+    """Return the page at its live picture, on a processor slowed by `slower`, and the time it took."""
     page = browser.new_context(viewport={"width": 1280, "height": 800}, has_touch=True).new_page()
     page.add_init_script(DRAWN)
     page.context.new_cdp_session(page).send("Emulation.setCPUThrottlingRate", {"rate": slower})
@@ -145,7 +145,7 @@ def opened(browser: Browser, url: str, slower: int = 1) -> tuple[Page, float]:
 
 
 def ages(browser: Browser, relay: Relay, url: str, mbit_per_s: int, limit_ms: float | None) -> None:
-    """Print how old the live picture is when it is drawn, and how many come."""
+    """Print the age of each live picture at its drawing, and the rate of pictures."""
     throttle(mbit_per_s)
     page, _ = opened(browser, url)
     page.wait_for_timeout(2000)
@@ -168,30 +168,30 @@ def ages(browser: Browser, relay: Relay, url: str, mbit_per_s: int, limit_ms: fl
 
 
 def losses(browser: Browser, url: str) -> None:
-    """Print when a cut wire is told, and when its return is noticed."""
+    """Print the time to detect a lost link, and to detect its return."""
     throttle(8)
     page, _ = opened(browser, url)
-    told = page.get_by_text("not answering").first
-    told_s, back_s = [], []
+    message = page.get_by_text("not answering").first
+    detected_s, back_s = [], []
     for _ in range(3):
         page.wait_for_timeout(1500)
         sh("ip", "link", "set", OURS, "down")
         begin_s = time.monotonic()
-        told.wait_for(state="visible", timeout=20_000)
-        told_s.append(time.monotonic() - begin_s)
+        message.wait_for(state="visible", timeout=20_000)
+        detected_s.append(time.monotonic() - begin_s)
         sh("ip", "link", "set", OURS, "up")
         begin_s = time.monotonic()
-        told.wait_for(state="hidden", timeout=20_000)
+        message.wait_for(state="hidden", timeout=20_000)
         back_s.append(time.monotonic() - begin_s)
-    for name, times, limit in (("lost link told, s", told_s, 5.0), ("its return noticed, s", back_s, 2.0)):
+    for name, times, limit in (("lost link told, s", detected_s, 5.0), ("its return noticed, s", back_s, 2.0)):
         row(name, float(np.median(times)), max(times), 0.0, limit=limit, value=max(times))
     page.context.close()
 
 
 def first_use(browser: Browser, url: str) -> None:
-    """Print how soon a slow tablet on 8 Mbit/s shows the live picture, and what it asked for until then."""
+    """Print the time to the live picture on a slow tablet at 8 Mbit/s, and the requests until then."""
     throttle(8)
-    opened(browser, url)[0].context.close()  # the preview runs
+    opened(browser, url)[0].context.close()  # leaves the preview running
     times, drawn, answers, sizes = [], [], [], []
     for _ in range(FIRST_USES):
         page, took_s = opened(browser, url, slower=6)
@@ -210,7 +210,7 @@ def first_use(browser: Browser, url: str) -> None:
 
 
 def main() -> None:
-    """Measure all of it."""
+    """Run all measurements."""
     with tempfile.TemporaryDirectory() as place, namespace():
         server = Server(Path(place) / "data")
         server.start()

@@ -1,4 +1,4 @@
-"""The real server, the stand-in, and a touch page that fails its test for anything unexpected in the console."""
+"""Fixtures: the real application in this process or in its own, and a touch page that fails on console messages."""
 
 import os
 import re
@@ -10,18 +10,28 @@ import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Request, sync_playwright
 
-from tests.browser.stub import Stub, Stubbed
+from tests.browser.alert_causes import StandingAlerts
+from tests.browser.real import Instruments, Real
 
 ROOT = Path(__file__).parents[2]
-PLANS = ROOT / "out" / "browser-plans"  # what the first start measured about this computer; `make clean` forgets it
+PLANS = ROOT / "out" / "browser-plans"  # cached FFT plans and timings of this computer; deleted by `make clean`
+SMALL_PLANS = PLANS.with_name("browser-plans-small")  # the same for heads with a small sensor
 CHROMIUM = "/usr/bin/chromium-headless-shell"
 TABLET = (1280, 800)
+
+
+def copy_small_plans(data: Path) -> None:
+    """Copy the cached plans of heads with a small sensor into the data folder of a server, if there are any."""
+    if SMALL_PLANS.is_dir():
+        shutil.copytree(SMALL_PLANS, data / "plans")
 
 
 def free_port() -> int:
@@ -32,20 +42,20 @@ def free_port() -> int:
 
 
 class Server:
-    """`diffuscope run` as a process of its own, on one port and one shelf, that can be stopped and started again."""
+    """`diffuscope run` as a process with its own port and data folder; it can be stopped and restarted."""
 
     def __init__(self, data: Path, source: str = "hardware/heads/sim.toml", kind: str = "--head") -> None:
         self.data, self._source = data, (kind, source)
-        self.before: list[str] = []  # words before the command, such as `nice`
-        self.more: list[str] = []  # words for `run`
-        self.first_on_path: Path | None = None  # where Python looks first: what a version is called
+        self.before: list[str] = []  # prefix of the command, such as `nice`
+        self.more: list[str] = []  # additional arguments of `run`
+        self.first_on_path: Path | None = None  # first entry of PYTHONPATH; its metadata sets the version
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._log = (data.parent / "server.log").open("ab")
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        """Launch the process without waiting for it; the first start measures the computer for half a minute."""
+        """Launch the process without waiting; on a new computer the first start measures FFT plans for 30 s."""
         command = [*self.before, str(Path(sys.executable).parent / "diffuscope"), "run", *self._source]
         command += ["--port", str(self.port), "--data", str(self.data), *self.more]
         place = {"PYTHONPATH": str(self.first_on_path)} if self.first_on_path else {}
@@ -84,41 +94,34 @@ class Server:
         self._log.close()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The journeys come last: the real server measures the computer in the meantime."""
-    here = Path(__file__).parent
-    items.sort(key=lambda item: item.path.parent == here and "server" in getattr(item, "fixturenames", ()))
-
-
-# The tests read pixels back more often than a page would, and their graphics chip is a program, which must hand every
-# picture back to the processor: the browser's advice about both is not for us.
+# Ignored console messages: the tests read pixels back more often than a page would, with a software renderer.
 ADVICE = ("willReadFrequently", "GPU stall due to ReadPixels")
 
 
 @dataclass
 class Complaints:
-    """What the browser complained about; `expect` names, as regular expressions, what a test causes on purpose."""
+    """Console messages and failed requests of the pages; `expect` adds regular expressions of expected ones."""
 
-    heard: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
     expected: list[str] = field(default_factory=list)
 
     def expect(self, *patterns: str) -> None:
         self.expected.extend(patterns)
 
     def unexpected(self) -> list[str]:
-        return [line for line in self.heard if not any(re.search(pattern, line) for pattern in self.expected)]
+        return [line for line in self.messages if not any(re.search(pattern, line) for pattern in self.expected)]
 
     def watch(self, page: Page) -> None:
         def console(message: ConsoleMessage) -> None:
             if message.type in ("error", "warning") and not any(advice in message.text for advice in ADVICE):
-                self.heard.append(f"console {message.type}: {message.text} ({message.location.get('url')})")
+                self.messages.append(f"console {message.type}: {message.text} ({message.location.get('url')})")
 
         def failed(request: Request) -> None:
-            if request.failure != "net::ERR_ABORTED":  # the page itself gives up a preview that it no longer needs
-                self.heard.append(f"request failed: {request.url} {request.failure}")
+            if request.failure != "net::ERR_ABORTED":  # aborted by the page itself
+                self.messages.append(f"request failed: {request.url} {request.failure}")
 
         page.on("console", console)
-        page.on("pageerror", lambda error: self.heard.append(f"page error: {error}"))
+        page.on("pageerror", lambda error: self.messages.append(f"page error: {error}"))
         page.on("requestfailed", failed)
 
 
@@ -130,10 +133,10 @@ def browser() -> Iterator[Browser]:
         browser.close()
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="session")
 def launched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """One real server for all tests, which gets ready while those tests run that do not need it."""
-    server = Server(tmp_path_factory.mktemp("shelf") / "data")
+    """The real server in its own process, shared by all tests."""
+    server = Server(tmp_path_factory.mktemp("server") / "data")
     if PLANS.is_dir():
         shutil.copytree(PLANS, server.data / "plans")
     server.start()
@@ -150,16 +153,46 @@ def server(launched: Server) -> Server:
 
 
 @pytest.fixture(scope="session")
-def standing_stub() -> Iterator[Stubbed]:
-    with Stubbed(Stub(), free_port()) as stubbed:
-        yield stubbed
+def instruments(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Instruments]:
+    made = Instruments(lambda: tmp_path_factory.mktemp("real"))
+    yield made
+    made.close()
 
 
 @pytest.fixture
-def stub(standing_stub: Stubbed) -> Stubbed:
-    """The stand-in for the API, as new."""
-    standing_stub.stub.reset()
-    return standing_stub
+def undo() -> Iterator[ExitStack]:
+    """What ends after the pages are closed: a page reports a server that goes away."""
+    with ExitStack() as undo:
+        yield undo
+
+
+@pytest.fixture
+def real(instruments: Instruments, undo: ExitStack) -> Real:
+    """A real instrument of this test alone, in this process."""
+    real = instruments.take()
+    undo.callback(real.close)
+    return real
+
+
+MakeReal = Callable[..., Real]
+
+
+@pytest.fixture
+def make_real(instruments: Instruments, undo: ExitStack) -> MakeReal:
+    """A factory of instruments with other parts than `real`: see `Real`."""
+
+    def make(*args: Any, **options: Any) -> Real:
+        real = instruments.build(*args, **options)
+        undo.callback(real.close)
+        return real
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def standing_alerts(instruments: Instruments) -> Iterator[StandingAlerts]:
+    with ExitStack() as undo:
+        yield StandingAlerts(instruments, undo)
 
 
 @pytest.fixture
@@ -171,8 +204,10 @@ Open = Callable[..., Page]
 
 
 @pytest.fixture
-def open_page(browser: Browser, complaints: Complaints) -> Iterator[Open]:
-    """Open touch pages, `open_page(url, size=(width, height), **context options)`; every one is listened to."""
+def open_page(browser: Browser, complaints: Complaints, undo: ExitStack) -> Iterator[Open]:
+    """A factory of touch pages, `open_page(url, size=(width, height), **context options)`; console messages are
+    recorded.
+    """
     contexts: list[BrowserContext] = []
 
     def opened(url: str, size: tuple[int, int] = TABLET, **options: object) -> Page:
@@ -186,13 +221,13 @@ def open_page(browser: Browser, complaints: Complaints) -> Iterator[Open]:
         return page
 
     yield opened
-    heard = complaints.unexpected()
+    unexpected = complaints.unexpected()
     for context in contexts:
         context.close()
-    assert heard == []
+    assert unexpected == []
 
 
 @pytest.fixture
 def page(open_page: Open, server: Server) -> Page:
-    """A tablet on the real server."""
+    """A tablet page on the real server."""
     return open_page(server.url)

@@ -1,11 +1,11 @@
-// Run inside the page by looks.py: everything is measured on what is really drawn (computed colours, boxes after
-// layout, names as they are spoken). Returns the faults as sentences.
+// Layout and accessibility checks that looks.py evaluates in the page, on computed colours, boxes after layout and
+// accessible names. Returns each violation as a sentence.
 (inView) => {
   const faults = [];
   const scope = document.querySelector("dialog[open]") ?? document.body;
   const shown = (el) => el.checkVisibility({ visibilityProperty: true, opacityProperty: true });
-  const said = (el) => (el.ariaLabel ?? el.textContent ?? "").trim().replace(/\s+/g, " ").slice(0, 40);
-  const name = (el) => `${el.tagName.toLowerCase()}#${el.id} "${said(el)}"`;
+  const labelOf = (el) => (el.ariaLabel ?? el.textContent ?? "").trim().replace(/\s+/g, " ").slice(0, 40);
+  const name = (el) => `${el.tagName.toLowerCase()}#${el.id} "${labelOf(el)}"`;
   const rgb = (text) => text.match(/[\d.]+/g).map(Number);
   const light = ([r, g, b]) => [r, g, b]
     .map((v) => v / 255)
@@ -29,7 +29,7 @@
     const least = el.id === "shutter" ? 84 : 48;
     const narrow = el.matches("button, .button") && box.width < 48;
     if (box.height < least - 0.01 || narrow) faults.push(`too small: ${name(el)} ${box.width}x${box.height}`);
-    if (!said(el)) faults.push(`no name: ${name(el)}`);
+    if (!labelOf(el)) faults.push(`no name: ${name(el)}`);
     if (el.scrollWidth > el.clientWidth + 1) faults.push(`words cut off: ${name(el)}`);
   }
 
@@ -44,7 +44,7 @@
     const [ink, frame] = [glyphs.getBoundingClientRect(), (control ?? document.documentElement).getBoundingClientRect()];
     const scrolls = control?.matches(".card");
     if (ink.left < frame.left - 1 || ink.right > frame.right + 1) faults.push(`words stick out sideways: ${name(el)}`);
-    const room = 1 + parseFloat(getComputedStyle(el).fontSize) / 6; // a line's box is lower than its font's
+    const room = 1 + parseFloat(getComputedStyle(el).fontSize) / 6; // a line box can be lower than its glyphs
     if (control && !scrolls && (ink.top < frame.top - room || ink.bottom > frame.bottom + room)) faults.push(`words stick out: ${name(el)}`);
     const style = getComputedStyle(el);
     if (parseFloat(style.fontSize) < 18) faults.push(`small text: ${name(el)} ${style.fontSize}`);

@@ -1,4 +1,4 @@
-"""What a person with big fingers, tired eyes or a small screen would trip over, measured in the page."""
+"""Layout and accessibility checks in the page: control size, contrast, accessible names, clipping and overlap."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ _MEASURE = Path(__file__).with_name("looks.js").read_text()
 
 
 def look_for_faults(page: Page, *in_view: str) -> list[str]:
-    """Every fault in what is shown now, in both themes; `in_view` must be wholly inside the viewport and uncovered."""
+    """Return all violations in both themes; each selector of `in_view` must be inside the viewport and uncovered."""
     both = f"""(inView) => {{
       const measure = {_MEASURE.strip().removesuffix(";")};
       const root = document.documentElement;

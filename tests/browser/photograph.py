@@ -1,34 +1,35 @@
-"""Photographs of every screen and state, for people to look at: `python -m tests.browser.photograph FOLDER`.
+"""Screenshots of every screen and state for visual review: `python -m tests.browser.photograph FOLDER`.
 
-Each language, each size, one PNG per screen and per state; `--language` and `--size` choose.
+One PNG per language, size, screen and state; `--language` and `--size` select.
 """
 
 import argparse
 from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import count
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
 
 from playwright.sync_api import Page, sync_playwright
 
-from tests.browser.conftest import CHROMIUM, free_port
+from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
+from tests.browser.conftest import CHROMIUM
 from tests.browser.looks import SIZES
-from tests.browser.stub import Stub, Stubbed
-from tests.browser.stub_visits import unsent
-from tests.browser.test_states import CAUSES, STOPS, TELLS, over, tell
+from tests.browser.real import POOR, Instruments, Real
 from tests.browser.walk import tap
 
 LANGUAGES = ["en", "en-XA", "ta", "hi", "te"]
 
 
 class Camera:
-    """Takes numbered photographs of one page into a folder."""
+    """Numbered screenshots of one page in a folder."""
 
     def __init__(self, page: Page, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.page, self.folder, self._count = page, folder, 0
 
     def take(self, name: str, ready: str | None = None) -> None:
-        """As it is now, or as soon as there is what `ready` selects; a breath later, for pictures that fade in."""
+        """Save a screenshot, after waiting for the selector `ready` and 0.5 s for fades."""
         if ready:
             self.page.wait_for_selector(ready)
             self.page.wait_for_timeout(500)
@@ -41,71 +42,92 @@ class Camera:
         tap(self.page, selector)
 
 
-def photograph(page: Page, stubbed: Stubbed, folder: Path) -> None:
-    """Walk through all screens, and hold every state still on the way."""
-    stub, camera = stubbed.stub, Camera(page, folder)
+def photograph(page: Page, real: Real, standing: StandingAlerts, folder: Path) -> None:
+    """Save screenshots of all screens and of each state in between."""
+    camera = Camera(page, folder)
 
-    def at(place: str, mark: str, name: str) -> None:
-        page.goto(f"{stubbed.url}/#/{place}")
+    def at(place: str, mark: str, name: str, of: Real = real) -> None:
+        page.goto(f"{of.url}/#/{place}")
         camera.take(name, mark)
 
     at("", "#new", "home-empty")
-    visit = stub.visits.begin(consent="agreed", sex="woman", age=54, complaints=["flashes"], diabetes="yes")
+    visit = real.begin_visit(consent="agreed", sex="woman", age=54, complaints=["flashes"], diabetes="yes")["id"]
     at("find", ".people", "find")
-    for digit in "142":
+    for digit in "0013":
         page.locator(f"[data-key='{digit}']").tap()
     camera.take("find-match", "#start:not([hidden])")
     page.locator("[data-key='9']").tap()
     page.locator(".people").wait_for(state="detached")
-    camera.take("find-nobody", "#start:not([hidden])")
-    at(f"visit/{visit['id']}/person", ".person", "person")
+    camera.take("find-no-match", "#start:not([hidden])")
+    at(f"visit/{visit}/person", ".person", "person")
     page.locator("[data-field=complaints] [data-value=pain]").tap()
     page.locator(".urgent").scroll_into_view_if_needed()
     camera.take("person-urgent")
     page.locator("[data-field=complaints] [data-value=pain]").tap()
-    at(f"visit/{visit['id']}/aim/R-centre", "eye-live[data-frame]", "aim")
-    states(camera, stubbed)
+    for code in standing.CODES:
+        standing.open(page, code)
+        camera.take(code)
+    at(f"visit/{visit}/aim/R-centre", "eye-live[data-frame]", "aim")
+    states(camera, real)
     camera.tap("#could-not")
     camera.take("why", ".reasons")
     camera.tap("#not-asked")
-    shots(camera, stub, visit)
-    after(camera, stubbed, visit, at)
+    shots(camera, real)
+    after(camera, real, visit, at)
+    sending = standing.instrument("send.stuck")
+    at("", "#send", "home-sending", sending)
+    at("send", ".send .people li", "send", sending)
+    at(f"visit/{sending.visits()[-1]['id']}/outcome", "#by-itself", "outcome-sending", sending)
 
 
-def states(camera: Camera, stubbed: Stubbed) -> None:
-    """Every stop, every chip, every hint of aiming, the menu and what can be said aloud."""
-    page, stub = camera.page, stubbed.stub
-    for code in [*STOPS, *TELLS]:
-        tell(stubbed, page, code)
-        camera.take(code)
-        over(stubbed, page, code)
-    for hint in ("noeye", "closer", "left", "still"):
-        stub.aim = {"code": hint, "fill": 0.5}
-        page.locator(".prompt [data-icon], .prompt svg").first.wait_for()
-        page.wait_for_timeout(1200)
-        camera.take(f"aim-{hint}")
-    stub.aim = {"code": "ready", "fill": 0.9}
+def states(camera: Camera, real: Real) -> None:
+    """Save screenshots of all alerts, aiming hints and the menu."""
+    page, faults = camera.page, real.rig.world.faults
+    for code in CAUSES:
+        with alert(real, page, code):
+            camera.take(code)
+    faults.add("eye.closed")
+    page.wait_for_timeout(1500)
+    camera.take("aim-noeye")
+    faults.clear()
+    for cause in ("pupil", "saturated", "dark"):
+        with real.poor_light(cause):
+            page.wait_for_timeout(1500)
+            camera.take(f"aim-{cause}")
+    page.wait_for_selector(".prompt[data-tone=ready]")
     camera.tap("#open-menu")
     camera.take("menu", "dialog[open]")
     page.keyboard.press("Escape")
 
 
-def shots(camera: Camera, stub: Stub, visit: dict[str, Any]) -> None:
-    """Making, told, every cause, not clear after many tries, and good."""
-    page, slot = camera.page, visit["slots"]["R-centre"]
-    stub.hold = "verdict"
-    for cause in [*CAUSES, "poor"]:
-        slot["tries"] = 2 if cause == "poor" else 0
-        stub.verdicts = ["shot.moved" if cause == "poor" else f"shot.{cause}"]
+def shots(camera: Camera, real: Real) -> None:
+    """Save screenshots of a capture: in progress, assessed, each poor verdict, retakes exhausted, good."""
+    page = camera.page
+    address = page.url
+    real.hold = "expose"
+    for cause in POOR:
+        visit = real.begin_visit(consent="agreed", sex="woman", age=54)["id"]
+        page.goto(f"{real.url}/#/visit/{visit}/aim/R-centre")
+        page.wait_for_selector("eye-live[data-frame]")
+        real.show(cause)
         camera.tap("#shutter")
-        if stub.hold:
-            camera.take("making", ".stage[data-mark=quick]")
-            stub.hold = "keep"
-            camera.take("told", "[data-phase=told]")
-            stub.hold = None
+        if real.hold:
+            camera.take("making", "[data-phase=making]")
+            real.hold = "quick"
+            camera.take("assessed", "[data-phase=assessed]")
+            real.hold = None
         camera.take(f"shot-{cause}", "[data-phase=kept] .stage[data-mark=final]")
+        real.show(None)
+        for _ in range(3):  # good pictures keep the calibration in force
+            real.request("POST", "/api/captures", eye="OD")
+    real.show("saturated")
+    page.goto(address)
+    for _ in range(3):
+        camera.tap("#shutter")
+        page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+        camera.take("shot-poor") if page.locator("#could-not").count() else None
         camera.tap("#again")
-    slot["tries"] = 0
+    real.show(None)
     camera.tap("#shutter")
     camera.take("good", "[data-phase=kept] [data-verdict=good] #result-title")
     camera.tap("#open-details")
@@ -113,37 +135,32 @@ def shots(camera: Camera, stub: Stub, visit: dict[str, Any]) -> None:
     page.keyboard.press("Escape")
 
 
-def after(camera: Camera, stubbed: Stubbed, visit: dict[str, Any], at: Callable[[str, str, str], None]) -> None:
-    """The rest of the visit, its end, and how it is looked at later."""
-    page, stub = camera.page, stubbed.stub
-    for hold in (None, "keep"):
+def after(camera: Camera, real: Real, visit: str, at: Callable[[str, str, str], None]) -> None:
+    """Save screenshots of the rest of the visit, its outcome, and history."""
+    page = camera.page
+    for hold in (None, "stored"):
         camera.tap("#next")
-        stub.hold = hold
+        real.hold = hold
         camera.tap("#shutter")
-        page.wait_for_selector("[data-phase=told]" if hold else "[data-phase=kept] .stage[data-mark=final]")
+        page.wait_for_selector("[data-phase=assessed]" if hold else "[data-phase=kept] .stage[data-mark=final]")
     camera.tap("#finish")
     camera.take("finishing", "#finishing progress")
-    stub.hold = None
+    real.hold = None
     camera.take("outcome", "#done")
     camera.tap("#code")
     camera.take("outcome-code", ".outcome > figure.code")
     page.emulate_media(media="print")
     camera.take("slip")
     page.emulate_media(media="screen")
-    stub.sending = True
-    stub.unsent = [unsent(visit, code, 3) for code in ("send.refused", "send.link")] + [unsent(visit)]
-    at("", "#send", "home-sending")
-    at("send", ".send .people li", "send")
-    at(f"visit/{visit['id']}/outcome", "#by-itself", "outcome-sending")
-    stub.sending = False
-    declined = stub.visits.begin(consent="declined")
-    at(f"visit/{declined['id']}/person", ".person", "declined")
+    declined = real.begin_visit(consent="declined")["id"]
+    at(f"visit/{declined}/person", ".person", "declined")
     camera.tap("#finish")
     camera.take("outcome-refer", ".outcome")
-    stub.visits.begin(consent="agreed", sex="man", age=61)
+    real.begin_visit(consent="agreed", sex="man", age=61)
     at("", "#continue", "home")
     at("history", ".history [data-visit]", "history")
-    at(f"visit/{visit['id']}/film", ".film li", "film")
+    real.mount()
+    at(f"visit/{visit}/film", ".film li", "film")
     for pick in page.locator(".pick").all()[:2]:
         pick.tap()
     camera.tap("#copy")
@@ -155,23 +172,28 @@ def after(camera: Camera, stubbed: Stubbed, visit: dict[str, Any], at: Callable[
 
 
 def main() -> None:
-    """Photograph what was asked for."""
-    words = argparse.ArgumentParser(description=__doc__)
-    words.add_argument("folder", type=Path)
-    words.add_argument("--language", choices=LANGUAGES, action="append")
-    words.add_argument("--size", choices=sorted(SIZES), action="append")
-    asked = words.parse_args()
-    with Stubbed(Stub(), free_port()) as stubbed, sync_playwright() as playwright:
+    """Save the selected screenshots."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--language", choices=LANGUAGES, action="append")
+    parser.add_argument("--size", choices=sorted(SIZES), action="append")
+    arguments = parser.parse_args()
+    with TemporaryDirectory() as scratch, ExitStack() as undo, sync_playwright() as playwright:
+        numbers = count()
+        instruments = Instruments(lambda: Path(scratch) / str(next(numbers)))
+        undo.callback(instruments.close)
+        standing = StandingAlerts(instruments, undo)
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        for language in asked.language or LANGUAGES:
-            for size in asked.size or SIZES:
-                stubbed.stub.reset()
+        for language in arguments.language or LANGUAGES:
+            for size in arguments.size or SIZES:
+                real = instruments.build(binning=4)
                 width, height = SIZES[size]
                 viewport = {"width": width, "height": height}
                 context = browser.new_context(viewport=viewport, has_touch=True, is_mobile=True)  # type: ignore[arg-type]
                 context.add_init_script(f"localStorage.setItem('diffuscope.language', '{language}')")
-                photograph(context.new_page(), stubbed, asked.folder / language / size)
+                photograph(context.new_page(), real, standing, arguments.folder / language / size)
                 context.close()
+                real.close()
 
 
 if __name__ == "__main__":

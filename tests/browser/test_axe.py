@@ -1,103 +1,118 @@
-"""axe-core finds nothing on any screen or in any state of the screener's page; the technician's tests ask it too."""
+"""axe-core checks of every screen and alert of the exam page; the tests of the technician page run axe too."""
 
 import pytest
 from playwright.sync_api import Page, expect
 
+from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
 from tests.browser.axe import axe_faults
-from tests.browser.stub import Stubbed
-from tests.browser.test_states import STOPS, TELLS, over, tell
-from tests.browser.walk import SHUTTER, Open, aiming, taken, tap
+from tests.browser.conftest import Complaints
+from tests.browser.real import Real
+from tests.browser.walk import SHUTTER, Open, aiming, take_picture, tap
 
 pytestmark = pytest.mark.browser
 
 
-class Looked:
-    """What axe said of each place; a place that was not looked at is no proof."""
+HINTS = {
+    "noeye": ("No eye seen", lambda real: real.rig.world.faults.add("eye.closed")),
+    "back": ("Move back a little", lambda real: (real.rig.world.faults.clear(), real.show("pupil"))),
+    "ready": ("Ready.", lambda real: real.show(None)),
+}
+
+
+class AxeRun:
+    """Violations by screen name; `assert_clean` also requires a minimum number of checks."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
         self.faults: dict[str, list[str]] = {}
 
-    def at(self, name: str, mark: str) -> None:
+    def check(self, name: str, mark: str) -> None:
         self.page.wait_for_selector(mark)
         self.faults[name] = axe_faults(self.page)
-        self.page.locator("[data-link=live]").wait_for()  # axe held the page so long that it may have missed beats
+        self.page.locator("[data-link=live]").wait_for()  # axe blocks the page long enough to miss heartbeats
 
-    def go(self, place: str, mark: str) -> None:
+    def open(self, place: str, mark: str) -> None:
         self.page.goto(f"{self.page.url.split('#')[0]}#/{place}")
-        self.at(place, mark)
+        self.check(place, mark)
 
-    def clean(self, least: int) -> None:
+    def assert_clean(self, least: int) -> None:
         assert {name: found for name, found in self.faults.items() if found} == {}
         assert len(self.faults) >= least
 
 
-def test_axe_finds_nothing_on_any_screen(open_page: Open, stub: Stubbed) -> None:
-    page = aiming(open_page, stub)
-    looked = Looked(page)
+def test_no_axe_violation_on_any_screen(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    axe = AxeRun(page)
     for _ in range(2):
-        taken(page)
+        take_picture(page)
         tap(page, "#again")
-    first, second = next(iter(stub.stub.visits.kept.values()))["slots"]["R-centre"]["captures"]
-    looked.go("", "#new")
+    visit = real.visit()
+    first, second = visit["slots"]["R-centre"]["captures"]
+    axe.open("", "#new")
     page.get_by_role("button", name="Menu").tap()
-    looked.at("menu", "dialog[open]")
+    axe.check("menu", "dialog[open]")
     page.keyboard.press("Escape")
-    looked.go("find", ".people")
-    looked.go("visit/v142/person", ".person")
-    looked.go("history", ".history .people")
-    looked.go("visit/v142/film", ".film .pick")
-    looked.go(f"visit/v142/compare/{first}/{second}", ".two figure:last-child eye-pic[data-mark=final]")
-    looked.go("visit/v142/outcome", ".outcome")
-    looked.go("visit/v142/aim/R-nerve", "eye-live[data-frame]")
+    axe.open("find", ".people")
+    axe.open(f"visit/{visit['id']}/person", ".person")
+    axe.open("history", ".history .people")
+    axe.open(f"visit/{visit['id']}/film", ".film .pick")
+    axe.open(f"visit/{visit['id']}/compare/{first}/{second}", ".two figure:last-child eye-pic[data-mark=final]")
+    axe.open(f"visit/{visit['id']}/outcome", ".outcome")
+    axe.open(f"visit/{visit['id']}/aim/R-nerve", "eye-live[data-frame]")
     tap(page, "#finish")
     tap(page, "#code")
-    looked.at("finished", "figure.code svg path")
-    looked.clean(10)
+    axe.check("finished", "figure.code svg path")
+    axe.assert_clean(10)
 
 
-def test_axe_finds_nothing_while_a_picture_is_made_and_told(open_page: Open, stub: Stubbed) -> None:
-    stub.stub.hold, stub.stub.verdicts = "verdict", ["shot.pupil"]
-    page = aiming(open_page, stub)
-    looked = Looked(page)
+def test_no_axe_violation_during_capture_and_verdict(open_page: Open, real: Real) -> None:
+    real.hold = "expose"
+    page = aiming(open_page, real)
+    axe = AxeRun(page)
     tap(page, SHUTTER)
-    looked.at("making", ".stage[data-mark=quick]")
-    stub.stub.hold = "keep"
-    looked.at("told", "[data-phase=told]")
-    stub.stub.hold = None
-    looked.at("shot.pupil", "[data-phase=kept] .stage[data-mark=final]")
+    axe.check("making", "[data-phase=making]")
+    real.show("pupil")
+    real.hold = "quick"
+    axe.check("assessed", "[data-phase=assessed] .stage[data-mark=quick]")
+    real.hold = None
+    axe.check("shot.pupil", "[data-phase=kept] .stage[data-mark=final]")
+    real.show(None)
     tap(page, "#again")
-    taken(page)
-    looked.at("good", "[data-verdict=good]")
+    take_picture(page)
+    axe.check("good", "[data-verdict=good]")
     tap(page, "#open-details")
-    looked.at("details", "#details[open]")
+    axe.check("details", "#details[open]")
     page.keyboard.press("Escape")
-    stub.stub.verdicts = ["shot.dark"]
-    stub.stub.visits.kept["v142"]["slots"]["R-centre"]["tries"] = 3
+    real.show("saturated")
     tap(page, "#again")
-    taken(page)
-    looked.at("shot.poor", "#could-not")
+    take_picture(page)
+    axe.check("shot.poor", "#could-not")
     tap(page, "#could-not")
-    looked.at("why", ".reasons")
-    looked.clean(7)
+    axe.check("why", ".reasons")
+    axe.assert_clean(7)
 
 
-def test_axe_finds_nothing_in_any_state(open_page: Open, stub: Stubbed) -> None:
-    page = aiming(open_page, stub)
-    looked = Looked(page)
-    for code in [*STOPS, *TELLS]:
-        tell(stub, page, code)
-        looked.at(code, f"[data-code='{code}']")
-        over(stub, page, code)
-    for hint, words in {"noeye": "No eye seen", "closer": "a little closer", "ready": "Ready."}.items():
-        stub.stub.aim = {"code": hint, "fill": 0.5}
+def test_no_axe_violation_in_any_alert(
+    open_page: Open, real: Real, standing_alerts: StandingAlerts, complaints: Complaints
+) -> None:
+    complaints.expect("409")
+    page = aiming(open_page, real)
+    axe = AxeRun(page)
+    for code in CAUSES:
+        with alert(real, page, code):
+            axe.check(code, f"[data-code='{code}']")
+    for hint, (words, show) in HINTS.items():
+        show(real)
         expect(page.locator(".prompt")).to_contain_text(words)
-        looked.at(f"aim.{hint}", "eye-live[data-frame]")
-    looked.clean(24)
+        axe.check(f"aim.{hint}", "eye-live[data-frame]")
+    for code in StandingAlerts.CODES:
+        standing_alerts.open(page, code)
+        axe.check(code, f"[data-code='{code}']")
+    axe.assert_clean(24)
 
 
-def test_axe_would_find_what_is_wrong_in_either_theme(open_page: Open, stub: Stubbed) -> None:
-    page = open_page(stub.url)
+def test_axe_detects_violations_in_both_themes(open_page: Open, real: Real) -> None:
+    page = open_page(real.url)
     page.wait_for_selector("#new")
     page.evaluate("document.querySelector('#new').setAttribute('aria-labelledby', 'nowhere')")
     page.evaluate("document.querySelector('.home').append(document.createElement('img'))")

@@ -1,19 +1,14 @@
-"""Consent and copying in a real browser against the real server: no light without consent, and a visit onto a stick."""
+"""Consent and USB export in a real browser on the real server: no light without consent, and a copied visit."""
 
-import json
 import re
-import secrets
-import urllib.request
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
-from tests.browser.conftest import Complaints, free_port
+from tests.browser.conftest import Complaints
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, live, new_person, settled, taken, tap
-from tests.journey.faults import rest
+from tests.browser.walk import SHUTTER, Open, after_debounce, new_person, take_picture, tap, visit_of, wait_for_preview
+from tests.journey.faults import wait_until_idle
 
 pytestmark = pytest.mark.browser
 
@@ -24,39 +19,12 @@ WORDS = {
 }
 
 
-@pytest.fixture(scope="module")
-def instrument(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Real]:
-    with Real(tmp_path_factory.mktemp("consent"), free_port()) as real:
-        yield real
-
-
-@pytest.fixture
-def real(instrument: Real) -> Iterator[Real]:
-    instrument.rig.app.state.notices.lease._until_s = 0.0  # the tablet of the test before is gone, without a word
-    yield instrument
-    instrument.pull_out()
-
-
-def asked(real: Real, method: str, path: str, **body: Any) -> Any:
-    """The answer to a request that comes from no page."""
-    content = json.dumps({"key": secrets.token_hex(8), **body}).encode() if method != "GET" else None
-    request = urllib.request.Request(f"{real.url}{path}", content, {"Content-Type": "application/json"}, method=method)
-    with urllib.request.urlopen(request, timeout=30) as answer:
-        return json.loads(answer.read())
-
-
-def visit_of(page: Page) -> str:
-    found = re.search(r"visit/([^/]+)/", page.url)
-    assert found is not None
-    return found[1]
-
-
-def answered(real: Real, visit: str, value: str | None) -> None:
-    asked(real, "PATCH", f"/api/visits/{visit}", field="consent", value=value)
+def set_consent(real: Real, visit: str, value: str | None) -> None:
+    real.record(visit, "consent", value)
 
 
 @pytest.mark.parametrize("value", WORDS)
-def test_consent_withdrawn_elsewhere_darkens_the_lamp_and_the_page_says_why(
+def test_consent_withdrawn_by_another_client_stops_light(
     open_page: Open, real: Real, complaints: Complaints, value: str | None
 ) -> None:
     complaints.expect("409")
@@ -64,15 +32,15 @@ def test_consent_withdrawn_elsewhere_darkens_the_lamp_and_the_page_says_why(
     new_person(page)
     expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "false", timeout=15_000)
     visit, kept = visit_of(page), len(real.rig.store.captures(500))
-    answered(real, visit, value)
+    set_consent(real, visit, value)
     words, on_the_button = WORDS[value]
     expect(page.locator(".prompt .state-bar")).to_contain_text(words, timeout=10_000)
     expect(page.locator(SHUTTER)).to_contain_text(on_the_button)
     expect(page.locator(SHUTTER)).to_have_attribute("aria-disabled", "true")
     expect(page.locator("eye-live[data-frame]")).to_have_count(0)
-    rest(real.rig)
+    wait_until_idle(real.rig)
     frames = real.rig.world.frames
-    settled(page).locator(SHUTTER).tap(force=True)
+    after_debounce(page).locator(SHUTTER).tap(force=True)
     page.wait_for_timeout(3000)
     assert real.rig.world.frames == frames
     assert len(real.rig.store.captures(500)) == kept
@@ -80,17 +48,15 @@ def test_consent_withdrawn_elsewhere_darkens_the_lamp_and_the_page_says_why(
         tap(page, "[data-do=ask]")
         tap(page, "[data-value=agreed]")
         tap(page, "#shoot")
-        live(page)
-        taken(page)
+        wait_for_preview(page)
+        take_picture(page)
     else:
         tap(page, ".state-bar [data-do=finish]")
         page.wait_for_selector("[data-screen=outcome]")
 
 
-def test_a_press_that_is_refused_for_want_of_consent_is_told_and_keeps_nothing(
-    open_page: Open, real: Real, complaints: Complaints
-) -> None:
-    """The page still believes that the person agreed: its preview hangs, and the press comes first."""
+def test_capture_refused_without_consent_shows_alert(open_page: Open, real: Real, complaints: Complaints) -> None:
+    """The page still shows consent, because its preview request hangs; the capture request is refused."""
     complaints.expect("409")
     page = open_page(real.url)
     new_person(page)
@@ -98,7 +64,7 @@ def test_a_press_that_is_refused_for_want_of_consent_is_told_and_keeps_nothing(
     page.route("**/api/preview**", lambda route: None)
     page.wait_for_timeout(3000)
     visit, kept = visit_of(page), len(real.rig.store.captures(500))
-    answered(real, visit, "declined")
+    set_consent(real, visit, "declined")
     tap(page, SHUTTER)
     expect(page.locator(".prompt .state-bar")).to_contain_text(WORDS["declined"][0])
     expect(page.locator(SHUTTER)).to_contain_text("Did not agree")
@@ -107,26 +73,26 @@ def test_a_press_that_is_refused_for_want_of_consent_is_told_and_keeps_nothing(
     page.unroute("**/api/preview**")
 
 
-def test_a_test_picture_is_not_shown_as_one_of_a_visit(open_page: Open, real: Real) -> None:
-    made = asked(real, "POST", "/api/captures", eye="OD")
-    visit = asked(real, "POST", "/api/visits")["id"]
-    answered(real, visit, "agreed")
+def test_test_picture_is_not_shown_in_visit(open_page: Open, real: Real) -> None:
+    made = real.request("POST", "/api/captures", eye="OD")
+    visit = real.begin_visit()["id"]
+    set_consent(real, visit, "agreed")
     page = open_page(f"{real.url}/#/visit/{visit}/picture/R-centre/{made['id']}")
     expect(page.locator(".state-bar")).to_contain_text("This is a test picture. It belongs to no person.")
     assert page.locator(".stage[data-mark=final]").count() == 0
 
 
-def test_a_visit_is_copied_to_a_usb_stick_from_its_history(open_page: Open, real: Real) -> None:
+def test_visit_is_copied_to_usb_drive(open_page: Open, real: Real) -> None:
     page = open_page(real.url)
     new_person(page)
-    taken(page)
-    visit = asked(real, "GET", f"/api/visits/{visit_of(page)}")
+    take_picture(page)
+    visit = real.visit(visit_of(page))
     page.goto(f"{real.url}/#/history")
     tap(page, f".people [data-visit='{visit['id']}'], .people li:has-text('{visit['number'][:-1]}') button")
     page.wait_for_selector(".film")
     tap(page, "#copy")
     expect(page.locator(".film [role=note]")).to_have_text("No USB stick found. Put one in.")
-    real.put_in()
+    real.mount()
     tap(page, "#copy")
     expect(page.locator(".film [data-folder]")).to_have_text(re.compile("USB STICK"))
     tap(page, ".film [data-folder]")

@@ -1,4 +1,4 @@
-"""A health worker with a tablet, on the real server with the simulated head: the whole way, and the link cut."""
+"""The exam page on the real server with the simulated head: whole exam, restart, lost connection."""
 
 import gzip
 import re
@@ -12,7 +12,7 @@ from playwright.sync_api import Page, Response, expect
 
 from tests.browser.conftest import Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
-from tests.browser.walk import SHUTTER, Open, double_tap, live, new_person, settled, tap
+from tests.browser.walk import SHUTTER, Open, after_debounce, double_tap, new_person, tap, wait_for_preview
 
 pytestmark = pytest.mark.browser
 
@@ -20,18 +20,18 @@ WEB = Path(__file__).parents[2] / "web"
 
 
 def live_after(page: Page, number: int, limit_s: float = 5) -> None:
-    """Wait until another live picture than `number` is drawn; a string polled in the page would need unsafe-eval."""
+    """Wait until another frame than `number` is drawn; a polled script would need unsafe-eval."""
     expect(page.locator("eye-live")).not_to_have_attribute("data-frame", str(number), timeout=1000 * limit_s)
 
 
 def a_new_person(page: Page, complaints: Complaints) -> Page:
-    """Aim at the first picture of a new person, on a server that may have just come up, and that another page held."""
+    """Aim at the first slot of a new patient, on a server that may be starting or controlled by another page."""
     complaints.expect("404")
     page.wait_for_selector("#new")
     if page.evaluate("fetch('/api/protocol').then((answer) => answer.status)") != 200:
         pytest.skip("this server keeps no visits")
     page.locator(".state[data-state=aim]").wait_for(state="attached", timeout=300_000)
-    if settled(page).locator("[data-do=useHere]").count():
+    if after_debounce(page).locator("[data-do=useHere]").count():
         page.locator("[data-do=useHere]").tap()
         expect(page.locator(".state-bar")).to_have_count(0)
     new_person(page)
@@ -39,10 +39,10 @@ def a_new_person(page: Page, complaints: Complaints) -> Page:
 
 
 def press(page: Page, complaints: Complaints, how: Callable[[], None]) -> None:
-    """Press, and if the guard wants darkness first, do as its words say: wait, and press again."""
+    """Press the shutter; if the light guard requires a pause, wait and press again."""
     complaints.expect("423")
     for _ in range(5):
-        settled(page)
+        after_debounce(page)
         how()
         page.wait_for_selector("[data-screen=picture]")
         page.wait_for_selector("[data-phase=kept], [data-screen=aim]", timeout=30_000)
@@ -57,19 +57,19 @@ def press(page: Page, complaints: Complaints, how: Callable[[], None]) -> None:
 
 @pytest.fixture
 def page(page: Page, complaints: Complaints) -> Page:
-    """A tablet on the real server, aiming at the first picture of a new person."""
+    """A tablet page on the real server, aiming at the first slot of a new patient."""
     return a_new_person(page, complaints)
 
 
-def test_from_aiming_to_the_next_picture_by_touch(page: Page, complaints: Complaints) -> None:
-    first = live(page)
+def test_capture_and_viewer_by_touch(page: Page, complaints: Complaints) -> None:
+    first = wait_for_preview(page)
     live_after(page, first)
-    live_after(page, live(page))
-    assert live(page) > first + 1
+    live_after(page, wait_for_preview(page))
+    assert wait_for_preview(page) > first + 1
     expect(page.locator("header .chip")).to_have_text("SIMULATED")
     page.locator("[data-slot=L-centre]").tap()
     expect(page.locator(SHUTTER)).to_contain_text("Left eye")
-    # The order of the marks is written down by the page itself: a quick look may be there for less than a poll.
+    # The page records the marks itself: a quick look may last less than one poll.
     page.evaluate("""() => {
         window.marks = [];
         new MutationObserver(() => window.marks.push(document.querySelector(".stage").dataset.mark))
@@ -109,10 +109,10 @@ BRIGHT_SHARE = """el => {
 }"""
 
 
-def test_what_was_taken_is_still_there_after_a_restart(page: Page, server: Server, complaints: Complaints) -> None:
+def test_captures_survive_server_restart(page: Page, server: Server, complaints: Complaints) -> None:
     complaints.expect("ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_INCOMPLETE_CHUNKED", "ERR_EMPTY_RESPONSE")
     complaints.expect("ERR_CONTENT_LENGTH_MISMATCH")
-    live(page)
+    wait_for_preview(page)
     press(page, complaints, lambda: page.locator(SHUTTER).tap())
     page.wait_for_selector(".stage[data-mark=final]")
     tap(page, "#again")
@@ -121,19 +121,19 @@ def test_what_was_taken_is_still_there_after_a_restart(page: Page, server: Serve
     expect(page.get_by_role("alert")).to_be_visible(timeout=6000)
     server.start()
     server.wait_until_ready()
-    expect(page.get_by_role("alert")).to_have_count(0, timeout=8000)  # by itself; nothing to tap
-    frame = live(page)
-    live_after(page, frame, limit_s=60)  # it makes its plans anew first
+    expect(page.get_by_role("alert")).to_have_count(0, timeout=8000)  # without a tap
+    frame = wait_for_preview(page)
+    live_after(page, frame, limit_s=60)  # the server makes new FFT plans first
     page.reload()
     expect(page.locator("[data-slot=R-centre] img")).to_have_attribute("src", taken or "")
     tap(page, "[data-slot=R-centre]")
     page.wait_for_selector(".stage[data-mark=final]")
 
 
-def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(page: Page, complaints: Complaints) -> None:
+def test_press_during_other_captures_shows_busy_alert(page: Page, complaints: Complaints) -> None:
     complaints.expect("409", "423")
-    live(page)
-    # Somebody impatient: whenever a seat is free, it is taken, so both are taken for seconds.
+    wait_for_preview(page)
+    # A client that requests a capture every 50 ms keeps both places in the queue taken for seconds.
     page.evaluate("""() => {
         const headers = { "Content-Type": "application/json" };
         let left = 40;
@@ -150,10 +150,10 @@ def test_a_press_while_somebody_else_takes_a_picture_is_refused_in_words(page: P
     expect(page.locator(".state")).to_have_text("Ready", timeout=60_000)
 
 
-def test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three(
+def test_frozen_server_alert_begins_within_5_s_and_ends_within_3_s(
     page: Page, server: Server, complaints: Complaints
 ) -> None:
-    live(page)
+    wait_for_preview(page)
     expect(page.locator(".state")).not_to_have_text("Connecting")
     server.signal(signal.SIGSTOP)
     try:
@@ -168,13 +168,13 @@ def test_a_frozen_server_is_told_within_five_seconds_and_forgotten_within_three(
     began = time.monotonic()
     expect(page.get_by_role("alert")).to_have_count(0, timeout=6000)
     assert time.monotonic() - began < 3
-    frame = live(page)
-    # If the lamp was lit when time stood still, the guard wants as much darkness first.
+    frame = wait_for_preview(page)
+    # If the lamp was lit during SIGSTOP, the light guard requires an equal pause.
     live_after(page, frame, limit_s=20)
 
 
-def test_every_control_of_the_result_is_reached_by_keyboard(page: Page, complaints: Complaints) -> None:
-    live(page)
+def test_every_result_control_is_reachable_by_keyboard(page: Page, complaints: Complaints) -> None:
+    wait_for_preview(page)
     page.wait_for_selector(".state[data-state=aim]")
     press(page, complaints, lambda: page.locator(SHUTTER).press("Enter"))
     page.wait_for_selector(".stage[data-mark=final]")
@@ -196,7 +196,7 @@ def test_every_control_of_the_result_is_reached_by_keyboard(page: Page, complain
         assert name in names
 
 
-def test_the_first_load_is_small_and_strict(open_page: Open, server: Server) -> None:
+def test_first_load_size_and_content_security_policy(open_page: Open, server: Server) -> None:
     page = open_page("about:blank")
     answers: list[Response] = []
     page.on("response", lambda answer: answers.append(answer))
@@ -217,7 +217,9 @@ def test_the_first_load_is_small_and_strict(open_page: Open, server: Server) -> 
 
 
 @pytest.mark.parametrize("size", [SIZES["phone"], SIZES["small"]], ids=["phone", "small"])
-def test_a_real_result_fits(open_page: Open, server: Server, complaints: Complaints, size: tuple[int, int]) -> None:
+def test_result_fits_small_screens(
+    open_page: Open, server: Server, complaints: Complaints, size: tuple[int, int]
+) -> None:
     page = a_new_person(open_page(server.url, size), complaints)
     assert look_for_faults(page, SHUTTER) == []
     press(page, complaints, lambda: page.locator(SHUTTER).tap())
@@ -225,7 +227,7 @@ def test_a_real_result_fits(open_page: Open, server: Server, complaints: Complai
     assert look_for_faults(page, "#again") == []
 
 
-def test_a_second_look_asks_for_the_shell_alone(open_page: Open, server: Server) -> None:
+def test_reload_uses_cached_static_files(open_page: Open, server: Server) -> None:
     page = open_page(server.url)
     page.wait_for_selector("#new")
     page.reload()

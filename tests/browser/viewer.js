@@ -1,8 +1,8 @@
-// Run inside the page by test_viewer.py and the bench: pictures through the page's own painters, read back from a canvas.
+// Functions that test_viewer.py evaluates in the page: draw pictures with the page's renderers and read the canvas back.
 (async () => {
-  const { Studio } = await import(new URL("painter.js", document.querySelector("script[type=module]").src).href);
-  const { openGl } = await import(new URL("painter_gl.js", document.querySelector("script[type=module]").src).href);
-  const { lens, place } = await import(new URL("glass.js", document.querySelector("script[type=module]").src).href);
+  const { PictureRenderer } = await import(new URL("components/viewer/renderer.js", document.querySelector("script[type=module]").src).href);
+  const { openWebgl } = await import(new URL("components/viewer/renderer_webgl.js", document.querySelector("script[type=module]").src).href);
+  const { drawLoupe, drawPicture } = await import(new URL("components/viewer/canvas.js", document.querySelector("script[type=module]").src).href);
   const answer = await fetch("/api/captures/any/picture.png");
   const picture = await createImageBitmap(await answer.blob());
   const pixels = (source) => {
@@ -13,43 +13,43 @@
   };
   const neutral = { redfree: false, brightness: 0, contrast: 0 };
 
-  // A chip that does as it is told, except for what `lies` puts in the place of some of its functions.
-  const liar = (lies) => {
-    const gl = openGl();
+  // A WebGL context in which `overrides` replaces some functions.
+  const brokenContext = (overrides) => {
+    const gl = openWebgl();
     return new Proxy(gl, {
       get(_, name) {
-        const made = lies[name]?.(gl);
-        if (made) return made;
+        const replaced = overrides[name]?.(gl);
+        if (replaced) return replaced;
         return typeof gl[name] === "function" ? gl[name].bind(gl) : gl[name];
       },
     });
   };
 
   window.bench = {
-    Studio,
-    openGl,
+    PictureRenderer,
+    openWebgl,
     picture,
     pixels,
-    liar,
+    brokenContext,
     neutral,
 
-    /** The glass with the picture on it: `scale` screen pixels per picture pixel, perhaps with a loupe. */
-    glass(studio, tools, scale, loupe = null) {
+    /** Return the pixels of the drawn picture: `scale` screen pixels per picture pixel, optionally with a loupe. */
+    drawn(renderer, tools, scale, loupe = null) {
       const canvas = Object.assign(document.createElement("canvas"), { width: 700, height: 600 });
       canvas.className = "measured";
       document.body.append(canvas);
       const context = canvas.getContext("2d", { willReadFrequently: true });
-      const shown = studio.develop(picture, { ...neutral, ...tools });
+      const shown = renderer.render(picture, { ...neutral, ...tools });
       const view = { u: 0.05, v: -0.02, width: picture.width * scale, height: picture.height * scale };
-      place(context, shown, view);
-      if (loupe) lens(context, shown, { ...view, loupe });
+      drawPicture(context, shown, view);
+      if (loupe) drawLoupe(context, shown, { ...view, loupe });
       const { data } = context.getImageData(0, 0, 700, 600);
       canvas.remove();
       return data;
     },
 
-    /** The largest difference between two lists of values, of 255. */
-    apart(a, b) {
+    /** Return the largest difference between two lists of values, of 255. */
+    maxDifference(a, b) {
       let worst = 0;
       for (let i = 0; i < a.length; i += 1) worst = Math.max(worst, Math.abs(a[i] - b[i]));
       return worst;

@@ -1,6 +1,6 @@
-// Stands in for the tablet's voices, which a headless browser has not: what was said is kept in `spoken`, and every
-// sentence lasts until the next. `voices` are its languages; one with "!" needs an internet that is not there, and one with
-// "?" waits for it for ever.
+// Stub of speech synthesis, because a headless browser has no voices: `spoken` records the sentences, and each lasts
+// until the next. `voices` are the available languages; a voice with "!" fails without the internet, one with "?" never
+// starts.
 window.spoken = [];
 window.voices = ["en-GB", "hi_IN", "ta-IN", "te-IN"];
 window.SpeechSynthesisUtterance = class {

@@ -1,4 +1,4 @@
-"""How the tests walk through the page: to a live picture, through a press, to a verdict."""
+"""Functions that operate the exam page: aim, press, wait for verdict and picture."""
 
 import re
 import time
@@ -6,59 +6,66 @@ from collections.abc import Callable
 
 from playwright.sync_api import Locator, Page, expect
 
-from tests.browser.stub import Stubbed
+from tests.browser.real import Real
 
 SHUTTER = "#shutter"
-LOCK_MS = 450  # the page ignores presses for 400 ms after every change of screen
+DEBOUNCE_MS = 450  # debounce time of the page (400 ms) and a margin
 Open = Callable[..., Page]
 
 
-def live(page: Page) -> int:
-    """Wait for a live picture; its number."""
+def wait_for_preview(page: Page) -> int:
+    """Wait for a live frame; return its number."""
     page.wait_for_selector("eye-live[data-frame]")
     return int(page.locator("eye-live").get_attribute("data-frame") or 0)
 
 
-def settled(page: Page) -> Page:
-    page.wait_for_timeout(LOCK_MS)
+def after_debounce(page: Page) -> Page:
+    page.wait_for_timeout(DEBOUNCE_MS)
     return page
 
 
 def tap(page: Page, selector: str) -> None:
-    """Tap as a person would: not within the blink of an eye after the last change."""
+    """Tap an element after the debounce time."""
     page.locator(selector).first.wait_for()
-    settled(page).locator(selector).first.tap()
+    after_debounce(page).locator(selector).first.tap()
 
 
-def aiming(open_page: Open, stub: Stubbed, size: tuple[int, int] = (1280, 800), **options: object) -> Page:
-    """A page that aims at the first slot of a person who agreed."""
-    visit = stub.stub.visits.begin(consent="agreed", sex="woman", age=54)
-    page = open_page(f"{stub.url}/#/visit/{visit['id']}/aim/R-centre", size, **options)
-    live(page)
+def aiming(
+    open_page: Open, real: Real, size: tuple[int, int] = (1280, 800), slot: str = "R-centre", **options: object
+) -> Page:
+    """Open a page that aims at a slot of a new patient with consent."""
+    visit = real.begin_visit(consent="agreed", sex="woman", age=54)
+    page = open_page(f"{real.url}/#/visit/{visit['id']}/aim/{slot}", size, **options)
+    wait_for_preview(page)
     expect(page.locator(".state")).not_to_have_attribute("data-state", "opening")
-    if (
-        settled(page).locator("[data-do=useHere]").count()
-    ):  # the page of the test before asked once more while it closed
-        page.locator("[data-do=useHere]").tap()
-    return page
+    return after_debounce(page)
+
+
+def visit_of(page: Page) -> str:
+    """Return the id of the visit in the address of the page."""
+    found = re.search(r"visit/([^/]+)/", page.url)
+    assert found is not None
+    return found[1]
 
 
 def new_person(page: Page) -> None:
-    """From Home to a live picture in three taps."""
+    """Go from Home to a live picture in three taps."""
     tap(page, "#new")
     tap(page, "[data-value=agreed]")
     tap(page, "#shoot")
-    live(page)
+    wait_for_preview(page)
 
 
-def taken(page: Page) -> None:
-    """Press, and wait until the final picture is drawn."""
+def take_picture(page: Page) -> None:
+    """Press the shutter and wait for the final picture."""
+    page.wait_for_selector("[data-screen=aim]")
     tap(page, SHUTTER)
+    page.wait_for_selector("[data-screen=picture]")
     page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
 
 
 def double_tap(page: Page, x: float, y: float) -> None:
-    """Two taps 0.15 s apart by their own time, however busy this computer is."""
+    """Send two taps 0.15 s apart by their event time stamps, independent of the computer's load."""
     touch = page.context.new_cdp_session(page)
     begin_s = time.time() - 0.3
     for after_s in (0.0, 0.15):
@@ -68,18 +75,18 @@ def double_tap(page: Page, x: float, y: float) -> None:
     touch.detach()
 
 
-def drawn(page: Page, tools: str, which: str = "#picture") -> None:
-    """Wait until the final picture is on the glass under these tools ("red-free 0 1": brightness, contrast)."""
+def wait_until_drawn(page: Page, tools: str, which: str = "#picture") -> None:
+    """Wait until the final picture is drawn with these tools ("red-free 0 1": brightness, contrast)."""
     expect(page.locator(which)).to_have_attribute("data-drawn", f"final {tools}", timeout=20_000)
 
 
-def place_of(pic: Locator) -> tuple[float, float]:
-    """Where the loupe is, in widths of the picture from its middle."""
+def loupe_position(pic: Locator) -> tuple[float, float]:
+    """Return the loupe's position in picture widths from the centre."""
     expect(pic).to_have_attribute("data-loupe", re.compile("."))
     u, v = (pic.get_attribute("data-loupe") or "").split(",")
     return float(u), float(v)
 
 
-def spoken(page: Page, language: str) -> None:
-    """Let every page of this context speak a language from its start."""
+def set_language(page: Page, language: str) -> None:
+    """Set the language of all pages of this context."""
     page.context.add_init_script(f"localStorage.setItem('diffuscope.language', '{language}')")

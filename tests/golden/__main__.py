@@ -1,6 +1,6 @@
-"""Program of the golden records.
+"""Command line of the golden records.
 
-python -m tests.golden write [NAME ...]       write these records anew (all, without a name)
+python -m tests.golden write [NAME ...]       rewrite these records (all, without a name)
 python -m tests.golden mutants [--only N]     apply each seeded mutant to a copy of the tree and run its tests
 """
 

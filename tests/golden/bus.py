@@ -1,7 +1,7 @@
-"""Record of the buses: bytes on the emulated SPI and I2C when a head is opened, aimed, pressed, closed and killed.
+"""Record of the buses: bytes on the emulated SPI and I2C while a head is opened, aimed, pressed, closed and killed.
 
-The buses need umockdev, so that the record is made in a process of its own: `umockdev-wrapper python -m
-tests.golden.bus`, which prints it as JSON.
+The buses need umockdev, so a separate process makes the record and prints it as JSON: `umockdev-wrapper python -m
+tests.golden.bus`.
 """
 
 import itertools
@@ -26,7 +26,7 @@ def present() -> dict[str, Any]:
     """Return the record of the present code.
 
     Camera, ring and guardian run in real time: on a busy machine the guardian may answer too late, and the light is
-    refused. Such a run ends with an error and is repeated; bytes that differ are never repeated.
+    refused. Such a run ends with an error and is repeated; a difference in bytes is never repeated.
     """
     command = ["umockdev-wrapper", sys.executable, "-m", "tests.golden.bus", "record"]
     for _ in range(TRIES):
@@ -53,13 +53,13 @@ class Listener:
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Record what is sent inside the context under that name."""
+        """Record the bytes sent inside the context under that name."""
         self._since()
         yield
         found = self._since()
         self.phases[name] = {
             "spi": [f"{one['hz']} Hz, mode {one['mode']}: {shortened(one['hex'])}" for one in found["spi"]],
-            "i2c": [told(one) for one in found["i2c"]],
+            "i2c": [as_line(one) for one in found["i2c"]],
         }
 
     def _since(self) -> dict[str, list[dict[str, Any]]]:
@@ -72,13 +72,13 @@ class Listener:
 
 
 def shortened(text: str) -> str:
-    """Return hexadecimal bytes in words of four; a word that repeats stands once, with its number."""
+    """Return hexadecimal bytes in words of four; a repeated word is written once, with its count."""
     words = [text[at : at + 2 * WORD_BYTES] for at in range(0, len(text), 2 * WORD_BYTES)]
     groups = [(word, len(list(same))) for word, same in itertools.groupby(words)]
     return " ".join(word if number == 1 else f"{word}*{number}" for word, number in groups)
 
 
-def told(message: dict[str, Any]) -> str:
+def as_line(message: dict[str, Any]) -> str:
     """Return one message on I2C as a line."""
     way = "read" if "read" in message else "write"
     return f"{message['chip']:#04x} {way} {message[way]}"
@@ -86,39 +86,42 @@ def told(message: dict[str, Any]) -> str:
 
 def record() -> dict[str, Any]:
     """Run a head through its phases on the emulated buses; needs umockdev."""
-    from tests.ports import conftest  # first: it puts the emulated libcamera on the path
+    from tests.ports import conftest  # first: adds the emulated libcamera to the path
 
     assert conftest.HEAD.is_file()
     from device.clock import SystemClock
     from device.head import head_memory
-    from device.values import EYES, Identity
-    from services.instrument.exposing import expose, expose_live
-    from tests.ports.emulators.wires import wires
-    from tests.ports.test_press import opened_again, plug_in, real_parts
+    from device.values import EYES, HeadIdentity
+    from services.instrument.capture_pipeline import expose, expose_live
+    from tests.ports.emulators.wires import emulated_buses
+    from tests.ports.test_press import attach_sensor, head_with_real_drivers, reopened_head
 
-    buses, clock = wires(), SystemClock()
+    buses, clock = emulated_buses(), SystemClock()
     listener = Listener(buses.folder)
-    buses.break_("memory.blank")
-    plug_in()
+    buses.set_faults("memory.blank")
+    attach_sensor()
     with listener.phase("open"):
-        head = opened_again()
-    buses.break_()
+        head = reopened_head()
+    buses.set_faults()
     with listener.phase("aim"):
         expose_live(head, EYES, clock)
     with listener.phase("press"):
         expose(head, ("OD",))
     with listener.phase("close"):
         head.close()
-    with listener.phase("write the head's memory"), head_memory(real_parts(), clock) as memory:
-        memory.write(Identity("DS-0001", "0123456789abcdef"))
-    with listener.phase("read the head's memory"), head_memory(real_parts(), clock) as memory:
+    with listener.phase("write the head's memory"), head_memory(head_with_real_drivers(), clock) as memory:
+        memory.write(HeadIdentity("DS-0001", "0123456789abcdef"))
+    with listener.phase("read the head's memory"), head_memory(head_with_real_drivers(), clock) as memory:
         memory.read()
     kills(listener, lambda: bool(buses.lit))
     return listener.phases
 
 
 def kills(listener: Listener, is_lit: Callable[[], bool]) -> None:
-    """Record what the guardian sends when its owner is killed: lit, dark again, and never lit."""
+    """Record the bytes sent by the guardian after its parent process is killed.
+
+    The lamp is lit, dark again, or was never lit.
+    """
     for name in ("lit", "dark"):
         victim = subprocess.Popen(
             [sys.executable, "-m", "tests.golden.bus", name], stdout=subprocess.PIPE, start_new_session=True
@@ -129,7 +132,7 @@ def kills(listener: Listener, is_lit: Callable[[], bool]) -> None:
         with listener.phase(f"kill while {name}"):
             victim.send_signal(signal.SIGKILL)
             victim.wait()
-            victim.stdout.read()  # its guardian has ended too
+            victim.stdout.read()  # returns after the end of its guardian
             wait_for(lambda: not is_lit())
             time.sleep(0.3)
         victim.stdout.close()
@@ -139,7 +142,7 @@ def kills(listener: Listener, is_lit: Callable[[], bool]) -> None:
 
 
 def wait_for(holds: Callable[[], bool]) -> None:
-    """Wait in real time: guardian and buses are other processes."""
+    """Wait in real time for another process, guardian or bus."""
     end_s = time.monotonic() + PATIENCE_S
     while not holds():
         assert time.monotonic() < end_s
@@ -147,16 +150,16 @@ def wait_for(holds: Callable[[], bool]) -> None:
 
 
 def hold(state: str) -> None:
-    """Open the ring, light it if `state` says so, and wait to be killed."""
+    """Open the ring, light it if `state` requires light, and wait for the kill."""
+    from device.config.head_file import ChainSpec
     from device.drivers.guardian import Guardian
     from device.drivers.ring import Apa102Ring
-    from device.spec import ChainSpec
-    from device.values import Glow
+    from device.values import Illumination
 
     chain = ChainSpec()
     ring = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), LEASE_S)
     if state == "lit":
-        ring.on(Glow("green", 0.5)).__enter__()
+        ring.on(Illumination("green", 0.5)).__enter__()
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     time.sleep(LEASE_S)

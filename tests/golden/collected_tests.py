@@ -1,4 +1,4 @@
-"""The list of collected tests, and the mapping from tests that were renamed or removed to those that replace them."""
+"""The list of collected tests, and the mapping of renamed or removed tests to their replacements."""
 
 import os
 import subprocess
@@ -7,16 +7,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from tests.golden import compare
-from tests.house import ROOT
+from tests.project_files import ROOT
 
-OWN = "tests/golden/"  # the records are not recorded
+OWN = "tests/golden/"  # excluded from the record
 MOVED = Path(__file__).parent / "moved_tests.txt"
 
 
 def collected() -> list[str]:
-    """Return the node ids of all tests, whatever can run here; those of the golden records aside.
+    """Return the node ids of all tests, including those that cannot run here, except those of the golden records.
 
-    Each file is imported under a name of its own (`importlib`), because some folders have files of the same name.
+    Each file is imported under a unique name (`importlib`), because some folders have files of the same name.
     """
     command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "--import-mode=importlib", "--ignore", OWN]
     plain = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
@@ -40,10 +40,12 @@ def flat(record: Mapping[str, Iterable[str]]) -> list[str]:
 
 
 def moves(lines: Iterable[str]) -> dict[str, str]:
-    """Return old name -> new name of lines `OLD -> NEW`; comments and empty lines aside. ValueError for others.
+    """Return old name -> new name of lines `OLD -> NEW`; comments and empty lines are skipped.
+
+    ValueError for other lines.
 
     A name is a folder (ends in `/`), a file, a test (all its parameters), or a test with one parameter. `OLD => NEW`
-    says that OLD was removed because NEW tests the same.
+    means that OLD was removed because NEW tests the same.
     """
     found = {}
     for line in lines:
@@ -56,7 +58,7 @@ def moves(lines: Iterable[str]) -> dict[str, str]:
 
 
 def mapped(id: str, moved: Mapping[str, str]) -> str:
-    """Return the new id of a test: the longest old name that is the id or a leading part of it is replaced."""
+    """Return the new id of a test: the longest old name that equals the id or a leading part is replaced."""
     for old in sorted(moved, key=len, reverse=True):
         if id == old or (id.startswith(old) and (old.endswith("/") or id[len(old) :].startswith(("::", "[")))):
             return moved[old] + id[len(old) :]
@@ -64,7 +66,7 @@ def mapped(id: str, moved: Mapping[str, str]) -> str:
 
 
 def lost(recorded: Iterable[str], present: Iterable[str], moved: Mapping[str, str]) -> list[str]:
-    """Return `OLD -> NEW` of every recorded test whose new id is not collected; NEW may be a test without parameter."""
+    """Return `OLD -> NEW` of every recorded test whose new id is not collected; NEW may lack a parameter."""
     there = set(present)
     there |= {id.partition("[")[0] for id in there}
     pairs = [(id, mapped(id, moved)) for id in recorded]
@@ -72,7 +74,7 @@ def lost(recorded: Iterable[str], present: Iterable[str], moved: Mapping[str, st
 
 
 def unneeded(recorded: Iterable[str], moved: Mapping[str, str]) -> list[str]:
-    """Return every old name of the mapping that no recorded test has."""
+    """Return every old name of the mapping without a recorded test."""
     known = list(recorded)
     return [old for old in moved if not any(mapped(id, {old: moved[old]}) != id for id in known)]
 

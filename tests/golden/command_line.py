@@ -1,4 +1,4 @@
-"""`--help` of every command, and the exit code and output of good and bad calls, in one process of fixed width."""
+"""`--help` of every command, and exit code and output of good and bad calls, in one process of fixed width."""
 
 import io
 import json
@@ -19,7 +19,7 @@ from services.cli import app, main
 from tests.golden import compare
 from tests.golden.instrument import HEAD
 from tests.golden.normalise import Normaliser
-from tests.house import ROOT
+from tests.project_files import ROOT
 
 WIDTH = "100"
 START = "from tests.golden.command_line import print_made; print_made()"
@@ -32,7 +32,7 @@ UNSET = (
     "NOTIFY_SOCKET",
     "LISTEN_PID",
 )
-CALLS = (  # in this order: later ones use the files of earlier ones
+CALLS = (  # ordered: later calls use the files of earlier ones
     "", "fly", "--version",
     "methods", "methods --rows 136 --cols 240", "methods --rows 0",
     "optics", "optics --sensor imx296", "optics --sensor none", "optics --head {0}/head.toml --sensor imx296",
@@ -51,6 +51,9 @@ CALLS = (  # in this order: later ones use the files of earlier ones
     "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
     "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
     "frontier --json {0}/f.json --plot {0}/f.svg", "frontier --json {0}/f.json --plot {0}/f.svg --repeats 0",
+    "frontier --data {0}/scene --scene {0}/head.toml --json {0}/f.json --plot {0}/f.svg",
+    "data {0}/scene", "data {0}/scene --check --psf {0}/none.tiff", "data {0}", "data {0}/none", "data",
+    "bench {0}/scene --method guess --no-peers", "bench {0}/none",
     "paper -o {0}/paper --only nothing", "hard -o {0}/hard --case nothing", "hard -o {0}/hard --method guess",
     "calibrations", "calibrations list --archive {0}/a", "calibrations new-key {0}/key --name Ada",
     "calibrations new-key {0}/key --name Ada",
@@ -67,14 +70,14 @@ CALLS = (  # in this order: later ones use the files of earlier ones
     *(f"update {word} --settings {{0}}/none.toml" for word in ("restart", "settle", "answer", "tidy")),
     "update install {0}/none.raucb --settings {0}/none.toml",
 )  # fmt: skip
-PROGRAMS = (  # of units and of RAUC, each in a process of its own
+PROGRAMS = (  # of units and of RAUC, each in a separate process
     "-m services.update --help", "-m services.update fly", "device/drivers/blank.py --help", "device/drivers/blank.py",
     "device/drivers/blank.py --device {0}/none", "services/update/bootchooser.py fly",
 )  # fmt: skip
 
 
 def record() -> dict[str, Any]:
-    """Return help texts by command and the calls, made by a process whose terminal is 100 columns wide."""
+    """Return help texts by command and the calls, made by a process with a terminal of 100 columns."""
     with TemporaryDirectory() as temporary:
         folder = Path(temporary).resolve()
         command = [sys.executable, "-c", START, str(folder)]
@@ -86,7 +89,7 @@ def record() -> dict[str, Any]:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return an environment without what changes colours and widths, with folders of its own."""
+    """Return an environment with new folders, and without variables that change colours or widths."""
     kept = {name: value for name, value in os.environ.items() if name not in UNSET}
     own = {"HOME": folder, "XDG_CACHE_HOME": folder / "cache", "XDG_DATA_HOME": folder / "data"}
     fixed = {"COLUMNS": WIDTH, "TERMINAL_WIDTH": WIDTH, "TERM": "dumb", "NO_COLOR": "1", "LC_ALL": "C.UTF-8"}
@@ -100,7 +103,10 @@ def _program(words: str, folder: Path) -> dict[str, Any]:
 
 
 def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
-    """Return a value with texts as lists of lines, blanks in rows as two, measured numbers in `out` as placeholders."""
+    """Return a value with texts as lists of lines and runs of blanks as two.
+
+    Measured numbers in `out` become placeholders.
+    """
     if isinstance(value, dict):
         return {name: _plain(one, normaliser, name) for name, one in value.items()}
     if isinstance(value, list):
@@ -117,7 +123,7 @@ def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
 
 
 def commands() -> Iterator[list[str]]:
-    """Yield the words of every command and subcommand; the first has none."""
+    """Yield the words of every command and subcommand; the first entry is empty."""
 
     def below(command: Any, words: list[str]) -> Iterator[list[str]]:
         yield words
@@ -128,7 +134,7 @@ def commands() -> Iterator[list[str]]:
 
 
 def called(words: list[str]) -> dict[str, Any]:
-    """Call the command line in this process; exit code and what it printed."""
+    """Call the command line in this process; return exit code and output."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         try:
@@ -140,7 +146,7 @@ def called(words: list[str]) -> dict[str, Any]:
 
 
 def _made(folder: Path) -> dict[str, Any]:
-    """Return everything that is done in one process."""
+    """Return the part of the record that one process makes."""
     (folder / "head.toml").write_text(HEAD)
     helps = {" ".join(["diffuscope", *words]): called([*words, "--help"]) for words in commands()}
     calls = []
@@ -152,7 +158,7 @@ def _made(folder: Path) -> dict[str, Any]:
 
 
 def print_made() -> None:
-    """Print what is done in one process as JSON; the first word is an empty folder for the files of the calls."""
+    """Print the record of one process as JSON; the first argument is an empty folder for the files of the calls."""
     folder = Path(sys.argv[1])
     sys.argv[:] = ["diffuscope"]  # the name in the usage lines
     json.dump(_made(folder), sys.stdout)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 RECORDS = Path(__file__).parent / "records"
-MOST_LINES = 60  # of a difference that is printed
+MOST_LINES = 60  # maximum length of a printed difference
 
 
 def as_text(record: Any) -> str:
@@ -26,7 +26,7 @@ def read(name: str) -> Any:
 
 
 def difference(recorded: Any, present: Any) -> str:
-    """Return a unified diff of two records, at most MOST_LINES long; empty where they are equal."""
+    """Return a unified diff of two records, at most MOST_LINES long; empty for equal records."""
     texts = [as_text(one).splitlines() for one in (recorded, json.loads(json.dumps(present)))]
     lines = list(difflib.unified_diff(*texts, "recorded", "present", lineterm="", n=2))
     more = [f"... and {len(lines) - MOST_LINES} lines more"] if len(lines) > MOST_LINES else []
@@ -34,7 +34,7 @@ def difference(recorded: Any, present: Any) -> str:
 
 
 def _lines(value: Any, depth: int) -> list[str]:
-    """Return the pieces of a value's text; a value that fits into one line is not broken."""
+    """Return the pieces of a value's text; a value that fits on one line is not broken."""
     flat = json.dumps(value, ensure_ascii=False, sort_keys=True)
     if not isinstance(value, dict | list | tuple) or not value or len(flat) + depth <= 116:
         return [flat]

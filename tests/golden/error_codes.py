@@ -1,4 +1,4 @@
-"""Every error code with its remedy, HTTP status and message templates, and every sentence beside other codes."""
+"""Every error code with its remedy, HTTP status and message templates, and every sentence for users in the sources."""
 
 import ast
 import re
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from device.errors import DiffuscopeError
-from services.instrument.api import refusal
+from services.http.problem_responses import problem_response
 from tests.golden import compare
-from tests.house import nodes, parsed, python, text
+from tests.project_files import nodes, parsed, python_files, text
 
 CODE = re.compile(r"[a-z]+(?:\.[a-z-]+)+")
 FILE = re.compile(
@@ -30,7 +30,7 @@ def errors() -> dict[str, Any]:
             "parent": next((base.code for base in kind.__bases__ if issubclass(base, DiffuscopeError)), None),
             "also": sorted(base.__name__ for base in kind.__bases__ if not issubclass(base, DiffuscopeError)),
             "remedy": kind.default_remedy,
-            "status": refusal(kind("message")).status_code,
+            "status": problem_response(kind("message")).status_code,
             "templates": [list(one) for one in sorted(templates[kind.code])],
         }
         for kind in kinds.values()
@@ -38,20 +38,22 @@ def errors() -> dict[str, Any]:
 
 
 def codes() -> list[str]:
-    """Return every text of the form `word.word` that is no file name: codes of errors, verdicts, notices, faults."""
+    """Return every text of the form `word.word` that is no file name: codes of errors, verdicts, alerts and faults."""
     return sorted(one for one in _all_texts() if CODE.fullmatch(one) and not FILE.fullmatch(one))
 
 
 def sentences() -> list[str]:
-    """Return every sentence for people in the sources: remedies of checks and findings, messages, help texts."""
+    """Return every sentence for users in the sources: remedies of checks and findings, messages, help texts."""
     return sorted(one for one in _all_texts() if SENTENCE.fullmatch(one))
 
 
 @cache
 def _all_texts() -> frozenset[str]:
-    """Return the template of every text in the sources, docstrings aside."""
+    """Return the template of every text in the sources, except docstrings and the scripts of the documentation."""
     found = set[str]()
-    for name in python(*SOURCES):
+    for name in python_files(*SOURCES):
+        if name.startswith("services/lab/site/"):
+            continue
         inside = {id(part) for node in nodes(text(name)) if isinstance(node, ast.JoinedStr) for part in node.values}
         docs = {id(node.value) for node in nodes(text(name)) if isinstance(node, ast.Expr)}
         for node in nodes(text(name)):
@@ -68,11 +70,11 @@ def _kinds(kind: type[DiffuscopeError]) -> Iterator[type[DiffuscopeError]]:
 
 
 def _templates(kinds: dict[str, type[DiffuscopeError]]) -> defaultdict[str, set[tuple[str, str]]]:
-    """Return (message, remedy) of every place where an error is made; what is filled in is `{}`."""
+    """Return (message, remedy) of every place that makes an error; inserted values are `{}`."""
     found, everywhere = defaultdict[str, set[tuple[str, str]]](set), {}
-    for name in python(*SOURCES):
+    for name in python_files(*SOURCES):
         everywhere |= _constants(name)
-    for name in python(*SOURCES):
+    for name in python_files(*SOURCES):
         known = everywhere | _constants(name)
         for node in nodes(text(name)):
             if isinstance(node, ast.Call) and (called := ast.unparse(node.func).split(".")[-1]) in kinds and node.args:
@@ -83,7 +85,7 @@ def _templates(kinds: dict[str, type[DiffuscopeError]]) -> defaultdict[str, set[
 
 
 def _constants(name: str) -> dict[str, str]:
-    """Return the texts that a module gives a name to."""
+    """Return the named string constants of a module."""
     return {
         ast.unparse(node.targets[0]): _texts(node.value, {})[0]
         for node in parsed(text(name)).body
@@ -92,7 +94,10 @@ def _constants(name: str) -> dict[str, str]:
 
 
 def _texts(node: ast.expr, known: Mapping[str, str]) -> list[str]:
-    """Return the template of an expression, names looked up in `known`; of a conditional one both branches."""
+    """Return the template of an expression, with names looked up in `known`.
+
+    A conditional expression has a template per branch.
+    """
     match node:
         case ast.Constant(value=str(words)):
             return [words]

@@ -12,26 +12,27 @@ from time import sleep
 from typing import Any
 
 from device.clock import VirtualClock
-from device.errors import CameraMissing, ConsentDeclined, DiffuscopeError
-from device.sim.calibrate import simulated_calibration
+from device.config.head_file import InstrumentSpec, load_head
+from device.errors import CameraMissing, DiffuscopeError
+from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.spec import InstrumentSpec, load_head
-from device.values import Calibration, Eye, Glow
-from services.instrument.bulletin import Bulletin
-from services.records.errand import Errand
+from device.values import Calibration, Eye, Illumination
+from services.errors import ConsentDeclined
+from services.instrument.events import EventBus
+from services.records.capture_target import CaptureTarget
 from tests.golden import compare
-from tests.journey.asking import equipped
-from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, until
-from tests.journey.test_exam import Astonishing
+from tests.journey.asking import with_all_chips
+from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, rig_builder, until
+from tests.journey.test_exam import FailingCamera
 
 CAPTURE = re.compile(r"\d{8}T\d{6}-(?:OD|OS)-[0-9a-f]{6}")
 KEY = "0123456789abcdef"
-PATIENCE_S = 150.0  # the first picture may have to compile the kernels
+PATIENCE_S = 150.0  # the first picture may include compilation of the kernels
 
 
 @dataclass
 class Trace:
-    """Events and lamp changes in the order in which they happened, with the virtual time of each."""
+    """Events and lamp changes in order of occurrence, with virtual times."""
 
     entries: list[dict[str, Any]] = field(default_factory=list)
     now_s: Callable[[], float] = lambda: 0.0
@@ -42,18 +43,18 @@ class Trace:
 
 
 class WatchedWorld(World):
-    """A World that adds each change of its lamp to `trace`."""
+    """A World that appends each change of its lamp to `trace`."""
 
     trace = Trace()
-    _shown: Glow | None = None
+    _shown: Illumination | None = None
 
-    @property  # type: ignore[override]
-    def glow(self) -> Glow | None:
-        """What the lamp shows now."""
+    @property  # type: ignore[override]  # in place of an attribute of World, to see each change
+    def illumination(self) -> Illumination | None:
+        """Present light of the lamp."""
         return self._shown
 
-    @glow.setter
-    def glow(self, glow: Glow | None) -> None:
+    @illumination.setter
+    def illumination(self, glow: Illumination | None) -> None:
         if glow != self._shown:
             self.trace.add(lamp="dark" if glow is None else f"{glow.colour} {glow.level:g}")
         self._shown = glow
@@ -72,11 +73,11 @@ class ScriptedClock(GateClock):
 
     @property
     def is_done(self) -> bool:
-        """Whether the whole script has been played."""
+        """Return whether the whole script has run."""
         return not self._script
 
     def sleep(self, duration_s: float) -> None:
-        """Move the clock on, with a stop at each moment of the script."""
+        """Advance the clock, with a stop at each moment of the script."""
         end_s = self.elapsed_s + max(0.0, duration_s)
         while self._script and self._script[0][0] <= end_s:
             entry = self._script[0]
@@ -87,7 +88,7 @@ class ScriptedClock(GateClock):
 
 
 def without_figures(kind: str, data: dict[str, Any]) -> dict[str, Any]:
-    """Return an event's data without what the estimators measured: FFT plans may differ in the last digit."""
+    """Return an event's data without estimated values: FFT plans may change their last digit."""
     match kind:
         case "calibration":
             return {"findings": [{"name": one["name"], "ok": one["ok"]} for one in data["findings"]]}
@@ -98,19 +99,19 @@ def without_figures(kind: str, data: dict[str, Any]) -> dict[str, Any]:
     return data
 
 
-class TracedBulletin(Bulletin):
-    """A Bulletin that adds each event to a trace; `at_quick` is called once, after the first quick look."""
+class TracedEventBus(EventBus):
+    """An EventBus that appends each event to a trace; `at_quick` is called once, after the first quick look."""
 
     def __init__(self, trace: Trace) -> None:
         super().__init__()
         self._trace = trace
         self.at_quick: Callable[[], Any] | None = None
 
-    def tell(self, kind: str, **data: Any) -> None:
+    def publish(self, kind: str, **data: Any) -> None:
         """Record the event, then publish it."""
-        shown = without_figures(kind, data)
-        self._trace.add(event=kind, data=shown)
-        super().tell(kind, **data)
+        recorded = without_figures(kind, data)
+        self._trace.add(event=kind, data=recorded)
+        super().publish(kind, **data)
         if data.get("stage") == "quick" and self.at_quick is not None:
             act, self.at_quick = self.at_quick, None
             act()
@@ -128,10 +129,10 @@ class Stage:
     closing: Thread | None = None
     aims_until_s: float = 0.0
 
-    def press(self, eye: Eye, key: str | None = None, errand: Errand | None = None) -> Any:
-        """Press, and remember the future or the refusal."""
+    def press(self, eye: Eye, key: str | None = None, target: CaptureTarget | None = None) -> Any:
+        """Press, and record the future or the refusal."""
         try:
-            pressed = self.rig.exam.press(eye, key, *([errand] if errand else []))
+            pressed = self.rig.exam.press(eye, key, *([target] if target else []))
         except DiffuscopeError as error:
             self.answers.append(refusal(error))
             return None
@@ -139,7 +140,7 @@ class Stage:
         return pressed
 
     def soon(self, act: Callable[[], Any], after_s: float = 0.05) -> None:
-        """Call `act` so long after now: by default in the midst of a lit exposure."""
+        """Call `act` after a delay, by default during a lit exposure."""
         self.clock.at(self.clock.now_s() + after_s, act)
 
     def break_(self, *faults: str) -> None:
@@ -147,18 +148,18 @@ class Stage:
         self.rig.world.faults.update(faults)
 
     def add_journal(self) -> None:
-        """Add what the journal of interrupted captures holds now to the trace."""
+        """Append the content of the journal of interrupted captures to the trace."""
         notes = sorted((self.rig.store.folder / "underway").iterdir())
         self.trace.add(journal=[json.loads(path.read_bytes()) for path in notes])
 
     def close(self) -> None:
-        """Close as the server does after SIGTERM, from another thread, and go on once the exam knows of it."""
-        self.closing = Thread(target=self.rig.owner.close, name="closing", daemon=True)
+        """Close from another thread, as the server does after SIGTERM; return after the exam has begun to close."""
+        self.closing = Thread(target=self.rig.arbiter.close, name="closing", daemon=True)
         self.closing.start()
-        assert self.rig.exam.preview(10**9, wait_s=PATIENCE_S) is None  # answered at once when it is closing
+        assert self.rig.exam.preview(10**9, wait_s=PATIENCE_S) is None  # returns at once during closing
 
     def settle(self) -> None:
-        """Wait until the presses are answered and the exam rests, or has ended."""
+        """Wait until all presses are answered and the exam is idle or has ended."""
         until(lambda: self.clock.is_done, PATIENCE_S)
         for answer in [one for one in self.answers if hasattr(one, "exception")]:
             answer.exception(PATIENCE_S)
@@ -169,12 +170,17 @@ class Stage:
 
 
 def rests(stage: Stage) -> bool:
-    """Return whether nothing is pressed, aimed at or looked at any more."""
+    """Return whether no press, aim or look is pending."""
     exam, before = stage.rig.exam, stage.clock.now_s()
-    if exam.state != "aim" or exam.fitness.due or stage.rig.world.glow is not None or before < stage.aims_until_s:
+    if (
+        exam.state != "aim"
+        or exam.calibration_monitor.has_pending
+        or stage.rig.world.illumination is not None
+        or before < stage.aims_until_s
+    ):
         return False
     sleep(0.1)
-    return exam.state == "aim" and not exam.fitness.due and stage.clock.now_s() == before
+    return exam.state == "aim" and not exam.calibration_monitor.has_pending and stage.clock.now_s() == before
 
 
 def refusal(error: BaseException) -> dict[str, Any]:
@@ -211,8 +217,8 @@ def press_during_refinement(stage: Stage) -> None:
         stage.press("OS")
         stage.press("OD")
 
-    bulletin = stage.rig.bulletin
-    assert isinstance(bulletin, TracedBulletin)
+    bulletin = stage.rig.event_bus
+    assert isinstance(bulletin, TracedEventBus)
     bulletin.at_quick = more
     stage.press("OD")
 
@@ -241,7 +247,7 @@ def withdrawn(stage: Stage) -> None:
     def permit() -> None:
         raise ConsentDeclined("PR 1 did not agree to pictures")
 
-    stage.press("OD", None, Errand(visit="v", slot="R-centre", permit=permit))
+    stage.press("OD", None, CaptureTarget(visit="v", slot="R-centre", permit=permit))
 
 
 def camera_lost(stage: Stage) -> None:
@@ -272,7 +278,7 @@ def light_fault(stage: Stage) -> None:
 
 def light_cut(stage: Stage) -> None:
     """The exposure hangs; the guard's timer ends the light."""
-    stage.soon(lambda: until(lambda: stage.rig.world.glow is None))
+    stage.soon(lambda: until(lambda: stage.rig.world.illumination is None))
     stage.press("OD")
 
 
@@ -315,7 +321,7 @@ LIMITS = {"light_cut": {"max_on_s": 0.15}}  # other arguments of the instrument
 
 @contextmanager
 def instruments() -> Iterator[Callable[[str], Stage]]:
-    """Give a function that builds the instrument of a scenario; all share the traced light and the FFT plans."""
+    """Yield a function that builds the instrument of a scenario; all share the traced light and the FFT plans."""
     with TemporaryDirectory() as place, ExitStack() as undo:
         folder = Path(place)
         (folder / "small.toml").write_text(SMALL_HEAD)
@@ -324,25 +330,25 @@ def instruments() -> Iterator[Callable[[str], Stage]]:
         def built(name: str) -> Stage:
             trace, clock = Trace(), ScriptedClock()
             trace.now_s = clock.now_s
-            options: dict[str, Any] = {"head": equipped, "bulletin": TracedBulletin(trace), "clock": clock}
+            options: dict[str, Any] = {"head": with_all_chips, "event_bus": TracedEventBus(trace), "clock": clock}
             pulled = Event()
             if name == "camera_pulled":
                 pulled.set()
-                del options["head"]  # whose chips are those of a simulated camera's world
-                options["camera"] = lambda camera: Astonishing(camera, pulled, CameraMissing("the cable is out"))
-            build = builder((world, calibration), folder / "plans")
+                del options["head"]  # its chips belong to the world of a simulated camera
+                options["camera"] = lambda camera: FailingCamera(camera, pulled, CameraMissing("the cable is out"))
+            build = rig_builder((world, calibration), folder / "plans")
             own = undo.enter_context(ExitStack())
             rig = build(folder / name, own, **options, **LIMITS.get(name, {}))
             own.callback(rig.world.faults.clear)
             assert isinstance(rig.world, WatchedWorld)
-            rig.world.trace = trace  # nothing was lit before
+            rig.world.trace = trace  # the lamp was dark until now
             return Stage(rig, clock, trace, own.close)
 
         yield built
 
 
 def watched(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """Return a coarse world of the head whose light is traced already, and its calibration."""
+    """Return a coarse world of the head with its light already traced, and its calibration."""
     coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
     world = WatchedWorld(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}), VirtualClock())
     for colour in (spec.light.colour, spec.light.preview_colour):
@@ -351,8 +357,8 @@ def watched(spec: InstrumentSpec) -> tuple[World, Calibration]:
 
 
 def play(stage: Stage, name: str) -> dict[str, Any]:
-    """Run one scenario and return its trace and the state after it; captures are named by their order."""
-    until(lambda: bool(stage.trace.entries), PATIENCE_S)  # its first state: the exam is ready a little before
+    """Run one scenario and return its trace and final state; captures are named by their order."""
+    until(lambda: bool(stage.trace.entries), PATIENCE_S)  # first state event, shortly after the exam is ready
     SCENARIOS[name](stage)
     stage.settle()
     rig = stage.rig
@@ -364,7 +370,7 @@ def play(stage: Stage, name: str) -> dict[str, Any]:
             "state": rig.exam.state,
             "problem": None if rig.exam.problem is None else refusal(rig.exam.problem),
             "died": rig.died.is_set(),
-            "lamp": "dark" if rig.world.glow is None else "lit",
+            "lamp": "dark" if rig.world.illumination is None else "lit",
             "captures": [[one.id, one.eye, one.simulated, sorted(one.files)] for one in rig.store.captures()],
             "underway": sorted(path.name for path in (rig.store.folder / "underway").iterdir()),
             "spent_j_per_cm2": {
@@ -378,7 +384,7 @@ def play(stage: Stage, name: str) -> dict[str, Any]:
 
 
 def answered(answer: Any) -> Any:
-    """Return what a press was answered: the capture's name, or the refusal."""
+    """Return the answer to a press: the capture's name, or the refusal."""
     if isinstance(answer, dict):
         return answer
     error = answer.exception(0)
@@ -386,7 +392,7 @@ def answered(answer: Any) -> Any:
 
 
 def numbered(value: Any) -> Any:
-    """Return the same with the names of captures replaced, in the order in which they first appear."""
+    """Return the value with names of captures replaced in order of first appearance."""
     text = json.dumps(value)
     for number, name in enumerate(dict.fromkeys(CAPTURE.findall(text)), 1):
         text = text.replace(name, f"capture-{number}")

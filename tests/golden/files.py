@@ -2,12 +2,14 @@
 
 kept/data/              the instrument's data folder: store, dose ledger, journal of interrupted captures, settings
 kept/calibrations/      two calibrations
-kept/sent.calibration   one of them as a signed file; key, key.pub are those of this record alone
-kept/export.zip         a visit as it is downloaded
+kept/sent.calibration   one of them as a signed file; key, key.pub belong to this record only
+kept/export.zip         a downloaded visit
 kept/send.toml          settings of the upload
 kept/update/            the state of an update
-records/files.json      what is read from all of these
+records/files.json      the content of all of these as read by the code
 records/schema.sql      the tables
+kept-r0004/data/        a data folder of an earlier release, with the schema in its name
+records/files-r0004.json    its content as that release read it
 """
 
 import hashlib
@@ -15,6 +17,7 @@ import json
 import re
 import shutil
 import sqlite3
+import tomllib
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
@@ -23,32 +26,36 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from device.calibration.archive import Archive
-from device.calibration.signed import export, new_key, read_export, read_signer
+from device.calibration.signing import create_key_pair, export, read_export, read_signer
 from device.clock import VirtualClock
-from device.errors import PinWrong, SendUnreachable
-from device.spec import load_head
-from services.instrument.carrier import load_settings
-from services.instrument.explorer import Explorer
-from services.instrument.exporting import exported, folder_name, zipped
-from services.instrument.technician import Door
-from services.instrument.visits_api import shown_visit
-from services.records.light_book import LightBook
-from services.records.outbox import Outbox, Receipt
-from services.records.people import People
+from device.config.head_file import load_head
+from services.delivery.uploader import load_settings
+from services.delivery.visit_export import export_files, folder_name, zip_archive
+from services.delivery.visit_json import visit_as_json
+from services.errors import PinWrong, ReceiverUnreachable
+from services.http.authentication import PinAuthenticator
+from services.instrument.accuracy_explorer import AccuracyExplorer
+from services.lab.frontier import measure_scene
+from services.records.capture_journal import CaptureJournal, InterruptedCapture
+from services.records.capture_report import report_as_json
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
-from services.records.store import Store
-from services.records.underway import Lost, Underway
-from services.records.update_notes import JOURNAL, Trouble, read_entry, write_entry
-from services.update.journal import Journal
+from services.records.upload_queue import UploadQueue, UploadReceipt
+from services.records.visit import Visit
+from services.records.visit_repository import VisitRepository
+from services.update.ipc import STATE_FILE, StoredError, read_state, write_state
+from services.update.state import StateFile
 from tests.golden import compare
-from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, builder, traced, until
+from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, rig_builder, traced_world, until
 from tests.unit.test_archive import WHO, calibration
 
 KEPT = Path(__file__).parent / "kept"
+EARLIER = {"r0004": Path(__file__).parent / "kept-r0004" / "data"}  # data folders of earlier releases, by schema
 SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)
-LATER = NOON + timedelta(days=5)  # when everything is read: no finish can be undone any more
+LATER = NOON + timedelta(days=5)  # time of reading: no finish can be undone any more
 PIN = "2468"
 SETTINGS = 'address = "https://reader.example.org/inbox"\ntoken = "send.token"\nanswer_s = 12.5\n'
 NAMES = re.compile(r"\d{8}T\d{6}-(?:(?:OD|OS)-)?[0-9a-f]{6}")
@@ -59,26 +66,29 @@ DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
 
 
 def make(folder: Path) -> None:
-    """Write every file with the present code; `folder` must not be there yet."""
+    """Write every file with the present code; `folder` must not exist yet."""
     folder.mkdir(parents=True)
     _make_data(folder)
     archive = Archive(folder / "calibrations")
-    archive.keep(calibration(65.0), WHO)
-    archive.keep(calibration(), WHO)
-    new_key(folder / "key", "Golden record")
-    export(archive.files(archive.current()), folder / "sent.calibration", folder / "key")
+    archive.add_and_activate(calibration(65.0), WHO)
+    archive.add_and_activate(calibration(), WHO)
+    create_key_pair(folder / "key", "Golden record")
+    export(archive.files(archive.active_id()), folder / "sent.calibration", folder / "key")
     (folder / "send.toml").write_text(SETTINGS, encoding="utf-8")
     (folder / "update").mkdir()
     state = {"state": "installed", "version": "0.2.0", "before": "0.1.0", "share": 1.0, "ill": ("clock",)}
-    Journal(folder / "update").write(**state, spent_s=61.5, took_s=140.0)
-    trouble = Trouble(code="update.failed", message="the page does not answer", remedy="Call the technician.")
-    Journal(folder / "update").write(trouble=trouble)
+    StateFile(folder / "update").write(**state, spent_s=61.5, took_s=140.0)
+    trouble = StoredError(code="update.failed", message="the page does not answer", remedy="Call the technician.")
+    StateFile(folder / "update").write(trouble=trouble)
     for lock in folder.rglob(".lock"):
         lock.unlink()
 
 
 def _make_data(folder: Path) -> None:
-    """Write the data folder: a sent visit, an open one, one that waits to be sent, a test picture, a torn capture."""
+    """Write the data folder.
+
+    The folder holds a sent visit, an open one, one waiting for upload, a test picture and a quarantined capture.
+    """
     with TemporaryDirectory() as place, ExitStack() as undo:
         head = Path(place) / "small.toml"
         head.write_text(SMALL_HEAD)
@@ -87,14 +97,18 @@ def _make_data(folder: Path) -> None:
         spec = spec.model_copy(update={"camera": spec.camera.model_copy(update=tiny)})
         clock = GateClock()
         clock.start = NOON
-        rig = builder(traced(spec), Path(place) / "plans")(Path(place), undo, clock=clock)
+        rig = rig_builder(traced_world(spec), Path(place) / "plans")(Path(place), undo, clock=clock)
         _visits(rig)
-        rig.owner.close()
-        ledger = LightBook(rig.store.engine, clock, DAY_S, boot="once")
+        rig.arbiter.close()
+        ledger = DoseLedgerStore(rig.store.engine, clock, DAY_S, boot="once")
         ledger.reserve(("OS",), 0.001, 0.1)  # never settled: the process was killed
-        Underway(rig.store).begin(Lost("20260302T120500-OS-abcdef", "OS", "v", "L-nerve", 1), "0" * 16)
-        Explorer(rig.store.folder / "explorer", Path(place), clock, spec, lambda *_, **__: None).choose("best")
-        Door(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
+        CaptureJournal(rig.store).begin(
+            InterruptedCapture("20260302T120500-OS-abcdef", "OS", "v", "L-nerve", 1), "0" * 16
+        )
+        AccuracyExplorer(
+            rig.store.folder / "explorer", Path(place), clock, spec, lambda *_, **__: None, measure_scene
+        ).choose("best")
+        PinAuthenticator(rig.store.folder / "technician.json", clock).set_pin(PIN, None)
         visit = next(one for one in rig.request("GET", "/api/visits").json()["visits"] if one["number"] == "B-7")
         (folder / "export.zip").write_bytes(rig.request("GET", f"/api/visits/{visit['id']}/export.zip").content)
         rig.store.close()
@@ -107,16 +121,16 @@ def _make_data(folder: Path) -> None:
 def _visits(rig: Rig) -> None:
     keys = (f"{number:016x}" for number in range(1, 1000))
 
-    def ask(method: str, path: str, **order: Any) -> dict[str, Any]:
-        answer = rig.request(method, f"/api/{path}", json={"key": next(keys), **order})
+    def ask(method: str, path: str, **body: Any) -> dict[str, Any]:
+        answer = rig.request(method, f"/api/{path}", json={"key": next(keys), **body})
         assert answer.status_code in (200, 201), answer.text
         rig.clock.sleep(60)
         return dict(answer.json())
 
-    def begun(**said: Any) -> str:
-        number = said.pop("number", None)
+    def begin(**fields: Any) -> str:
+        number = fields.pop("number", None)
         id = str(ask("POST", "visits", **({"number": number} if number else {}))["id"])
-        for name, value in said.items():
+        for name, value in fields.items():
             ask("PATCH", f"visits/{id}", field=name, value=value)
         return f"visits/{id}"
 
@@ -127,97 +141,110 @@ def _visits(rig: Rig) -> None:
         return str(made["id"])
 
     known = {"name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54, "vision_od": "6/9"}
-    sent = begun(consent="agreed", **known)
+    sent = begin(consent="agreed", **known)
     pressed(sent, "R-centre", "R-nerve", "R-centre")
     ask("POST", f"{sent}/could-not", slot="L-centre", reason="cloudy")
     ask("POST", f"{sent}/finish")
-    still_open = begun(number="B-7", consent="agreed", complaints=["pain"])
+    still_open = begin(number="B-7", consent="agreed", complaints=["pain"])
     moved = pressed(still_open, "L-centre")
     ask("POST", f"captures/{moved}/eye", eye="OD")
-    waits = begun(consent="declined")
+    waits = begin(consent="declined")
     ask("POST", f"{waits}/finish")
     ask("POST", "captures", eye="OS")
-    until(lambda: not rig.exam.fitness.due)
-    outbox = Outbox(rig.store.engine, rig.clock)
-    first, second = outbox.waiting()
-    outbox.failed([first, second], SendUnreachable("the receiver answers 503"))
-    outbox.arrived(first, Receipt("5a" * 32, "sha256"))
+    until(lambda: not rig.exam.calibration_monitor.has_pending)
+    outbox = UploadQueue(rig.store.engine, rig.clock)
+    first, second = outbox.queued()
+    outbox.record_failure([first, second], ReceiverUnreachable("the receiver answers 503"))
+    outbox.record_success(first, UploadReceipt("5a" * 32, "sha256"))
 
 
 # Reading
 
 
 def read_all(folder: Path) -> dict[str, Any]:
-    """Return what the present code reads from a copy of these files; times are UTC, names are as kept."""
-    clock = VirtualClock(LATER)
-    with Store(folder / "data", reserve_bytes=0, clock=clock) as store:
-        found = {
-            "store": _read_store(store),
-            "visits": _read_visits(store, clock),
-            "uploads": _read_uploads(store, clock),
-            "interrupted": [asdict(one) for one in Underway(store).lost],
-            "spent_j_per_cm2": _read_doses(store),
-        }
-    return found | {
-        "settings": _read_settings(folder, clock),
+    """Return the content of a copy of these files as read by the present code; times are UTC, names as kept."""
+    return read_data(folder / "data") | {
+        "settings": _read_settings(folder, VirtualClock(LATER)),
         "calibrations": _read_calibrations(folder),
-        "update": read_entry(folder / "update").model_dump(mode="json", exclude={"boot"}),
+        "update": read_state(folder / "update").model_dump(mode="json", exclude={"boot"}),
     }
 
 
-def _read_store(store: Store) -> dict[str, Any]:
+def read_data(folder: Path) -> dict[str, Any]:
+    """Return the content of a copy of a data folder as read by the present code."""
+    clock = VirtualClock(LATER)
+    with CaptureStore(folder, reserve_bytes=0, clock=clock) as store:
+        return {
+            "store": _read_store(store),
+            "visits": _read_visits(store, clock),
+            "uploads": _read_uploads(store, clock),
+            "interrupted": [asdict(one) for one in CaptureJournal(store).interrupted],
+            "spent_j_per_cm2": _read_doses(store),
+        }
+
+
+def _read_store(store: CaptureStore) -> dict[str, Any]:
     kept = [
         {
             "id": one.id, "eye": one.eye, "taken_at": one.taken_at.isoformat(), "simulated": one.simulated,
-            "calibration": one.calibration_id, "report": one.report, "files": dict(one.files),
+            "calibration": one.calibration_id, "report": report_as_json(one.report), "files": dict(one.files),
             "sizes": {name: len(store.read(one.id, name)) for name in one.files},
         }
         for one in store.captures()
     ]  # fmt: skip
-    return {"captures": kept, "damaged": store.damaged(), "torn": list(store.torn()), "orphans": store.orphans()}
+    return {
+        "captures": kept,
+        "damaged": store.damaged(),
+        "torn": list(store.quarantine.sizes_bytes()),
+        "orphans": store.quarantine.orphans(),
+    }
 
 
-def _read_visits(store: Store, clock: VirtualClock) -> dict[str, Any]:
-    people = People(store.engine, load_protocol(), clock)
-    visits = [shown_visit(one, people) for one in people.visits(50)]
+def _read_visits(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
+    people = VisitRepository(store.engine, load_protocol(), clock)
+    visits = [_shown(one, people.undo_until(one)) for one in people.visits(50)]
     exports = {}
     for one in people.visits(50):
         name = folder_name(one)
-        content = zipped(name, exported(store, one, shown_visit(one, people)), one.begun_at)
+        content = zip_archive(name, export_files(store, one, people.undo_until(one)), one.begun_at)
         exports[one.number] = hashlib.sha256(content).hexdigest()
     return {"visits": visits, "counts": people.counts(), "damaged": people.damaged(), "exports": exports}
 
 
-def _read_uploads(store: Store, clock: VirtualClock) -> dict[str, Any]:
-    outbox = Outbox(store.engine, clock)
+def _shown(visit: Visit, undo_until: datetime | None) -> dict[str, Any]:
+    return visit_as_json(visit) | {"undo_until": undo_until and undo_until.isoformat()}
+
+
+def _read_uploads(store: CaptureStore, clock: VirtualClock) -> dict[str, Any]:
+    outbox = UploadQueue(store.engine, clock)
     waiting = [
         {
             "visit": one.visit, "number": one.number, "finished_at": one.finished_at.isoformat(), "tries": one.tries,
             "failing_since": one.failing_since and one.failing_since.isoformat(), "error": one.error,
-            "said": one.said, "stuck": one.stuck, "size_bytes": one.size_bytes,
+            "said": one.message, "stuck": one.stuck, "size_bytes": one.size_bytes,
         }
-        for one in outbox.waiting(sizes=True)
+        for one in outbox.queued(sizes=True)
     ]  # fmt: skip
-    trouble = outbox.trouble()
+    trouble = outbox.status()
     return {"waiting": waiting, "numbers": [trouble.waiting, trouble.stuck, trouble.failing]}
 
 
-def _read_doses(store: Store) -> dict[str, float]:
-    """Return the doses as the process after a restart counts them, before any slot is too old."""
-    ledger = LightBook(store.engine, VirtualClock(), DAY_S, boot="another")
+def _read_doses(store: CaptureStore) -> dict[str, float]:
+    """Return the doses as counted by the process after a restart, before any interval expires."""
+    ledger = DoseLedgerStore(store.engine, VirtualClock(), DAY_S, boot="another")
     return {eye: float(f"{ledger.spent_j_per_cm2(eye):.9g}") for eye in ("OD", "OS")}
 
 
 def _read_settings(folder: Path, clock: VirtualClock) -> dict[str, Any]:
-    door = Door(folder / "data" / "technician.json", clock)
+    door = PinAuthenticator(folder / "data" / "technician.json", clock)
     try:
-        door.unlock(PIN[::-1])
+        door.log_in(PIN[::-1])
     except PinWrong as wrong:
         refused = wrong.code
     clock.sleep(10)
-    door.unlock(PIN)
+    door.log_in(PIN)
     spec = load_head(Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml")
-    chosen = Explorer(folder / "data" / "explorer", folder, clock, spec, lambda *_, **__: None)
+    chosen = AccuracyExplorer(folder / "data" / "explorer", folder, clock, spec, lambda *_, **__: None, measure_scene)
     send = load_settings(folder / "send.toml")
     return {
         "wrong pin": refused, "pace": chosen.pace, "budget_s": chosen.budget_s,
@@ -240,7 +267,7 @@ def _read_calibrations(folder: Path) -> dict[str, Any]:
         }  # fmt: skip
     files, signer = read_export(folder / "sent.calibration", (read_signer(folder / "key.pub"),))
     signed = {"files": {name: digest(content) for name, content in files.items()}, "signer": signer.name}
-    return {"kept": found, "in force": archive.current(), "signed": signed}
+    return {"kept": found, "in force": archive.active_id(), "signed": signed}
 
 
 def digest(content: bytes) -> str:
@@ -248,43 +275,54 @@ def digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-# Writing again what was read
+# Rewriting the content
 
 
-def written_again(folder: Path, place: Path) -> dict[str, bool]:
-    """Return for each file that is a function of what was read whether the present code writes the same bytes."""
-    clock = VirtualClock(LATER)
-    archive, again = Archive(folder / "calibrations"), Archive(place / "again")
-    id = archive.current()
-    kept = archive.load(id)
-    again.keep(kept.calibration, kept.provenance)
-    export(archive.files(id), place / "sent", folder / "key")
-    write_entry(place, read_entry(folder / "update"))
-    with Store(folder / "data", reserve_bytes=0, clock=clock) as store:
-        people = People(store.engine, load_protocol(), clock)
-        (visit,) = (one for one in people.visits(50) if one.number == "B-7")
-        name = folder_name(visit)
-        zip_bytes = zipped(name, exported(store, visit, shown_visit(visit, people)), visit.begun_at)
-        lost = Underway(store).lost[0]
-        note = store.folder / "underway" / f"{lost.id}.json"
-        before = note.read_bytes()
-        note.unlink()
-        Underway(store).begin(lost, "0" * 16)
-        journal = note.read_bytes() == before
+def contents(calibration: dict[str, bytes]) -> dict[str, object]:
+    """Return the files of a calibration, with its manifest parsed: earlier releases laid out the TOML differently."""
     return {
-        "calibration": again.files(id) == archive.files(id),
-        "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),
-        "export": zip_bytes == (folder / "export.zip").read_bytes(),
-        "journal of interrupted captures": journal,
-        "state of an update": (place / JOURNAL).read_bytes() == (folder / "update" / JOURNAL).read_bytes(),
+        name: tomllib.loads(content.partition(b"\n")[2].decode()) if name == "manifest.toml" else content
+        for name, content in calibration.items()
     }
 
 
-# The shape of what is written: everything but what chance or the solver decides
+def written_again(folder: Path, place: Path) -> dict[str, bool]:
+    """Return for each file that is a function of its content whether the present code writes the same bytes.
+
+    The manifest of a calibration is compared by its content.
+    """
+    clock = VirtualClock(LATER)
+    archive, again = Archive(folder / "calibrations"), Archive(place / "again")
+    id = archive.active_id()
+    kept = archive.load(id)
+    again.add_and_activate(kept.calibration, kept.provenance)
+    export(archive.files(id), place / "sent", folder / "key")
+    write_state(place, read_state(folder / "update"))
+    with CaptureStore(folder / "data", reserve_bytes=0, clock=clock) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        (visit,) = (one for one in people.visits(50) if one.number == "B-7")
+        name = folder_name(visit)
+        zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
+        lost = CaptureJournal(store).interrupted[0]
+        note = store.folder / "underway" / f"{lost.id}.json"
+        before = note.read_bytes()
+        note.unlink()
+        CaptureJournal(store).begin(lost, "0" * 16)
+        journal = note.read_bytes() == before
+    return {
+        "calibration": contents(again.files(id)) == contents(archive.files(id)),
+        "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),
+        "export": zip_bytes == (folder / "export.zip").read_bytes(),
+        "journal of interrupted captures": journal,
+        "state of an update": (place / STATE_FILE).read_bytes() == (folder / "update" / STATE_FILE).read_bytes(),
+    }
+
+
+# Shape of the written files: everything except random values and results of the solver
 
 
 def shape(folder: Path) -> dict[str, Any]:
-    """Return names of files and rows of tables; names of captures and visits by their order, digests left out."""
+    """Return names of files and rows of tables, with captures and visits numbered and without digests."""
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     names = [name for name in names if not name.endswith((".lock", "-wal", "-shm"))]
     with closing(sqlite3.connect(folder / "data" / "shelf.sqlite")) as tables:
@@ -300,8 +338,8 @@ def _rows(tables: sqlite3.Connection, name: str) -> list[dict[str, Any]]:
 
 
 def _plain(column: str, value: Any) -> Any:
-    """Return a value of a row: of a report its keys, of a file no length, of a dose nine digits."""
-    if column == "report":
+    """Return a value of a row: the keys of a report and its parts, no length of a file, nine digits of a dose."""
+    if column in ("report", "verdict", "laterality") and value is not None:
         return keys_of(json.loads(value))
     if column == "bytes":
         return None
@@ -314,27 +352,27 @@ def keys_of(value: Any) -> Any:
 
 
 def numbered(value: Any) -> Any:
-    """Return the same with names of captures and visits replaced in order of appearance, and digests by a word."""
+    """Return the value with names of captures and visits numbered, and digests replaced by a placeholder."""
     text = DIGEST.sub("sha256", json.dumps(value))
     for number, name in enumerate(dict.fromkeys(NAMES.findall(text)), 1):
         text = text.replace(name, f"name-{number}")
     return json.loads(text)
 
 
-def schema(folder: Path) -> str:
+def schema(data: Path) -> str:
     """Return the statements of the tables and indices of a data folder, sorted, as text."""
-    with closing(sqlite3.connect(folder / "data" / "shelf.sqlite")) as tables:
+    with closing(sqlite3.connect(data / "shelf.sqlite")) as tables:
         found = tables.execute("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL ORDER BY type, name").fetchall()
     return "".join(f"{statement.strip()};\n\n" for (statement,) in found)
 
 
 def write() -> Path:
-    """Write all files anew, and the record of what is read from them."""
+    """Rewrite all files, and the record of their content."""
     shutil.rmtree(KEPT, ignore_errors=True)
     make(KEPT)
     with TemporaryDirectory() as place:
         copy = Path(shutil.copytree(KEPT, Path(place) / "copy"))
-        SCHEMA.write_text(schema(copy), encoding="utf-8")
+        SCHEMA.write_text(schema(copy / "data"), encoding="utf-8")
         shapes = shape(copy)
         compare.write("files", {"read": read_all(copy), "shape": shapes})
     return KEPT

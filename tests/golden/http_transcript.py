@@ -4,19 +4,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from services.instrument.sending import FIRST_S
+from services.delivery.upload_worker import BACKOFF_FIRST_S
 from tests.golden import compare
 from tests.golden.instrument import Refusing, instrument, until
 from tests.golden.transcript import Transcript
 
 Chapter = Callable[[], list[dict[str, Any]]]
 UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-ffffff"
-RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, whose thread measures meanwhile
+RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, which measures in another thread
 PIN, STANDS = {"pin": "2580"}, ("cap", "screen", "point")
 
 
 def captures() -> list[dict[str, Any]]:
-    """Test pictures without a visit: press, list, files, live picture, events, a camera that fails."""
+    """Record test pictures without a visit: press, list, files, live picture, events, a camera failure."""
     with instrument() as device:
         log = Transcript(device)
         log.ask("GET /api/status", note="before the first picture")
@@ -52,7 +52,7 @@ def captures() -> list[dict[str, Any]]:
 
 
 def _failures(log: Transcript, id: str) -> None:
-    """What a press, the status and the checks answer after a camera fails, and after a file is damaged."""
+    """Record press, status and checks after a camera failure and after damage to a file."""
     until(lambda: bool(log.instrument.owner.findings))
     log.ask("GET /api/health")
     (camera,) = log.instrument.cameras
@@ -64,7 +64,7 @@ def _failures(log: Transcript, id: str) -> None:
 
 
 def visits() -> list[dict[str, Any]]:
-    """A visit from its number to its outcome, the right to take pictures, and every refusal of the two."""
+    """Record a visit from number to outcome, the control lease, and every refusal of both."""
     with instrument() as device:
         log = Transcript(device)
         log.ask("GET /api/protocol")
@@ -112,7 +112,7 @@ def _answers(log: Transcript, at: str) -> None:
 
 
 def _slots(log: Transcript, at: str, first: str, second: str) -> None:
-    """Which capture stands for a slot, which eye it shows, and why a picture could not be taken."""
+    """Record the capture chosen for a slot, its eye, and the reason for a missing picture."""
     log.ask("POST /api/captures/{id}/keep", f"/api/captures/{first}/keep", json=log.key())
     log.ask("POST /api/captures/{id}/keep", f"/api/captures/{UNKNOWN_CAPTURE}/keep", json=log.key())
     log.ask("POST /api/visits/{id}/slots", f"{at}/slots", json=log.key(slot="R-centre", capture=None))
@@ -135,7 +135,7 @@ def _listing(log: Transcript, visit: dict[str, Any]) -> None:
 
 
 def _ends(log: Transcript, at: str, id: str) -> None:
-    """Finish, what a finished visit refuses, and the undo until the end of the day."""
+    """Record the finish of a visit, the refusals of a finished visit, and the undo until the end of the day."""
     finish, reopen = "POST /api/visits/{id}/finish", "POST /api/visits/{id}/reopen"
     order = log.key()
     log.ask(finish, f"{at}/finish", json=order)
@@ -150,7 +150,7 @@ def _ends(log: Transcript, at: str, id: str) -> None:
 
 
 def _controllers(log: Transcript) -> None:
-    """The right to take pictures: two screens, one of them holds it."""
+    """Record the control lease between two screens."""
     mine, other = {"key": "00000000000000aa"}, {"key": "00000000000000bb"}
     log.ask("POST /api/controller", json=mine)
     log.ask("POST /api/controller", json=other, note="another screen holds it")
@@ -161,7 +161,7 @@ def _controllers(log: Transcript) -> None:
 
 
 def exports() -> list[dict[str, Any]]:
-    """Ways to take a visit away: a ZIP file, a copy on a USB stick, and the diary."""
+    """Record the exports of a visit: a ZIP file, a copy on a USB drive, and the event log."""
     with instrument() as device:
         log = Transcript(device)
         visit = _finished_visit(log)
@@ -205,7 +205,7 @@ def _finished_visit(log: Transcript) -> str:
 
 
 def technician() -> list[dict[str, Any]]:
-    """The PIN: first choice, wrong tries and their waits, logging out, and the time-out."""
+    """Record the PIN: first choice, wrong attempts with their lock-out, logging out, and the time-out."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         log.ask("GET /api/technician")
@@ -230,7 +230,7 @@ def technician() -> list[dict[str, Any]]:
 
 
 def calibration() -> list[dict[str, Any]]:
-    """Two calibrations of a head that has none: each step, a mishap, a stop, the way back to the first."""
+    """Record two calibrations of a new head: each step, a fault, a stop, and the return to the first."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         log.ask("GET /api/status", note="without a calibration")
@@ -255,7 +255,7 @@ def calibration() -> list[dict[str, Any]]:
 
 
 def _calibrated(log: Transcript) -> str:
-    """Measure every step, the first one twice because the lamp is on the first time; the id of the result."""
+    """Measure every step, the first one twice because the lamp is on the first time; return the id of the result."""
     ready = "POST /api/calibration/ready"
     _settled(log, "begin")
     log.ask("POST /api/calibration", json={"by": "Ada"}, racing=RACING)
@@ -288,17 +288,17 @@ def _stopped(log: Transcript) -> None:
 
 
 def _settled(log: Transcript, state: str, stand: str | None = None, failed: bool = False) -> None:
-    """Wait, in real time, until the thread that owns the head is in this state."""
+    """Wait, in real time, until the head's thread is in this state."""
 
     def is_there() -> bool:
-        said = log.instrument.send("GET", "/api/calibration").json()
-        return said["state"] == state and stand in (None, said["stand"]) and (said["error"] is not None or not failed)
+        now = log.instrument.send("GET", "/api/calibration").json()
+        return now["state"] == state and stand in (None, now["stand"]) and (now["error"] is not None or not failed)
 
     until(is_there)
 
 
 def updates() -> list[dict[str, Any]]:
-    """An update from a USB stick and one from a tablet, with the updater and its stand-in for RAUC."""
+    """Record an update from a USB drive and one from a tablet, with the updater and its stand-in for RAUC."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         for call, body in {"GET ": None, "POST /check": None, "POST /restart": None}.items():
@@ -327,7 +327,7 @@ def updates() -> list[dict[str, Any]]:
 
 
 def tablets() -> list[dict[str, Any]]:
-    """Files that a tablet sends, an installed update that is tried later, and a computer without an updater."""
+    """Record uploads from a tablet, an installed update that is tried later, and a computer without an updater."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         log.ask("POST /api/technician/pin", json=PIN)
@@ -339,7 +339,7 @@ def tablets() -> list[dict[str, Any]]:
         device.board.updater("1.0").install(bundle, restart=False)
         log.ask("GET /api/update", note="installed, and not tried yet")
         log.ask("POST /api/update/restart")
-        for folder in (device.board.wishes, device.board.state):
+        for folder in (device.board.requests, device.board.state):
             folder.rename(folder.with_name(f"{folder.name}.gone"))
         log.ask("GET /api/update", note="no updater")
         log.ask("POST /api/update/restart", note="no updater")
@@ -347,7 +347,7 @@ def tablets() -> list[dict[str, Any]]:
 
 
 def outbox() -> list[dict[str, Any]]:
-    """The upload queue: not set up, a visit that waits, one that the receiver refuses, one that arrived."""
+    """Record the upload queue: not set up, a waiting visit, a refused one, and a delivered one."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         log.ask("GET /api/outbox", note="no receiver is set up")
@@ -358,9 +358,10 @@ def outbox() -> list[dict[str, Any]]:
         log = Transcript(device)
         _finished_visit(log)
         log.exchanges.clear()
-        device.clock.elapsed_s += FIRST_S
+        device.clock.elapsed_s += BACKOFF_FIRST_S
         log.ask("GET /api/outbox", note="one visit waits")
-        sender = device.app.state.notices.sender
+        sender = device.application.upload_worker
+        assert sender is not None
         assert sender.step()
         log.ask("GET /api/outbox", note="the receiver refused it")
         log.ask("GET /api/status", note="the receiver refused it")
@@ -373,7 +374,7 @@ def outbox() -> list[dict[str, Any]]:
 
 
 def explorer() -> list[dict[str, Any]]:
-    """Accuracy against time: measured, chosen, and a capture that another method makes again."""
+    """Record accuracy against time: measurement, choice, and a capture reconstructed by another method."""
     with instrument() as device:
         log = Transcript(device)
         made = log.ask("POST /api/captures", json={"eye": "OD"})["id"]
@@ -393,13 +394,13 @@ def explorer() -> list[dict[str, Any]]:
         log.ask(again, f"/api/technician/captures/{UNKNOWN_CAPTURE}/again.png?method=gradient")
         log.ask("POST /api/technician/explorer", note="a measurement begins")
         log.ask("POST /api/technician/explorer", note="a measurement is under way")
-        until(lambda: not device.explorer.state()["busy"])
+        until(lambda: not device.explorer.state().busy)
         log.ask("GET /api/technician/explorer", note="measured")
         return log.exchanges
 
 
 def security() -> list[dict[str, Any]]:
-    """Who may ask, and how: host, origin, methods, paths, the pages; then every operation by a foreign host name."""
+    """Record host, origin, method and path checks and the pages; then every operation with a foreign host name."""
     with instrument(calibrated_before=False) as device:
         log = Transcript(device)
         foreign, json_type = {"Host": "evil.example"}, {"Content-Type": "application/json"}
@@ -424,7 +425,7 @@ CHAPTERS: dict[str, Chapter] = {
 
 
 def openapi() -> dict[str, Any]:
-    """Return the OpenAPI document as the application gives it, its version number replaced."""
+    """Return the OpenAPI document of the application, with its version number replaced."""
     with instrument(calibrated_before=False) as device:
         document: dict[str, Any] = device.send("GET", "/api/openapi.json").json()
     return document | {"info": document["info"] | {"version": "<version>"}}

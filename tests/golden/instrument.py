@@ -20,54 +20,38 @@ from numpy.typing import NDArray
 
 from device.calibration.archive import Archive
 from device.clock import VirtualClock
-from device.errors import CameraMissing, SendRejected
+from device.config.head_file import CalibrationTable, InstrumentSpec, load_head
+from device.errors import CameraMissing
 from device.head import Bench, Head, open_bench, open_head
 from device.ports import Camera
-from device.spec import CalibrationTable, InstrumentSpec, load_head
-from device.values import Frame, Shot
-from services.instrument.api import create_app
-from services.instrument.bulletin import Bulletin
-from services.instrument.carrier import Carrier, Parcel
-from services.instrument.diary import Diary
-from services.instrument.diary_api import diary_routes
-from services.instrument.exam import Exam
-from services.instrument.explorer import Explorer
-from services.instrument.explorer_api import explorer_routes
-from services.instrument.exporting import Sticks
-from services.instrument.owner import House, Owner, archive_of, calibrated
-from services.instrument.technician import Door
-from services.instrument.updates_api import update_routes
-from services.instrument.updating import UpdateDesk
+from device.values import ExposureSettings, Frame
+from services.delivery.uploader import Uploader, VisitArchive
+from services.delivery.usb_drives import UsbDrives
+from services.errors import UploadRejected
+from services.health.event_log import EventLog
+from services.http.app import Application, create_app
+from services.http.authentication import PinAuthenticator
+from services.http.routes.accuracy import accuracy_routes
+from services.http.routes.event_log import event_log_routes
+from services.http.routes.updates import update_routes
+from services.instrument.accuracy_explorer import AccuracyExplorer
+from services.instrument.events import EventBus
+from services.instrument.exam import ExamService
+from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
+from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
-from services.records.light_book import LightBook
-from services.records.outbox import Receipt
-from services.records.store import Store
+from services.lab.frontier import measure_scene
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.upload_queue import UploadReceipt
+from tests.simulated import small_head_toml
 from tests.updates import Board
 
 DAY_S = 86400.0
 PATIENCE_S = 120.0
 PACE, LONGEST_PAUSE_S = 5.0, 0.02
 FREE_BYTES = 10**12
-HEAD = """\
-name = "Golden head"
-
-[camera]
-backend = "sim"
-rows = 136
-cols = 240
-pitch_um = 40.32
-full_well_e = 23000
-read_noise_e = 1.03
-
-[light]
-backend = "sim"
-
-[optics]
-iris_um = 3200
-diffuser_to_sensor_um = 6000
-angular_magnification = 0.75
-field_deg = 33.4
-
+TABLES = """\
 [bus]
 backend = "sim"
 thermometer = 0x48
@@ -84,24 +68,25 @@ prnu = 0.01
 dsnu_e = 2.0
 hot_pixels = 0.0003
 """
+HEAD = small_head_toml("Golden head", TABLES, summed=2)
 Heard = Callable[[list[dict[str, Any]]], bool]
 
 
 class PacedClock(VirtualClock):
-    """Virtual time that passes at most PACE times as fast as real time while a thread polls.
+    """Virtual time, limited to PACE times real time while a thread polls.
 
-    Faster, a lease or a pause would run out between two requests of a transcript on a busy machine.
+    Faster, a lease or a pause would expire between two requests of a transcript on a busy machine.
     """
 
     def sleep(self, duration_s: float) -> None:
-        """Move the clock on by `duration_s`, after a short real pause."""
+        """Advance the clock by `duration_s`, after a short real pause."""
         time.sleep(min(max(0.0, duration_s) / PACE, LONGEST_PAUSE_S))
         super().sleep(duration_s)
 
 
 @dataclass
 class BreakableCamera:
-    """A camera that answers no more while `broken`."""
+    """A camera that stops answering while `broken`."""
 
     inner: Camera
     broken: bool = False
@@ -110,12 +95,12 @@ class BreakableCamera:
     def shape(self) -> tuple[int, int]:
         return self.inner.shape
 
-    def expose(self, shot: Shot, into: NDArray[np.uint16] | None = None) -> Frame:
+    def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
         if self.broken:
             raise CameraMissing("the camera was unplugged")
         return self.inner.expose(shot, into)
 
-    def prepare(self, shot: Shot) -> None:
+    def prepare(self, shot: ExposureSettings) -> None:
         self.inner.prepare(shot)
 
     def close(self) -> None:
@@ -124,16 +109,16 @@ class BreakableCamera:
 
 @dataclass
 class Refusing:
-    """A receiver that refuses the next parcels while `refuses`."""
+    """A receiver that refuses uploads while `refuses`."""
 
     refuses: bool = True
     kept: list[str] = field(default_factory=list)
 
-    def deliver(self, parcel: Parcel, pause: Callable[[], None]) -> Receipt:
+    def upload(self, archive: VisitArchive, pause: Callable[[], None]) -> UploadReceipt:
         if self.refuses:
-            raise SendRejected("the receiver answers 403 Forbidden")
-        self.kept.append(parcel.name)
-        return Receipt(parcel.sha256, "length")
+            raise UploadRejected("the receiver answers 403 Forbidden")
+        self.kept.append(archive.name)
+        return UploadReceipt(archive.sha256, "length")
 
     def abort(self) -> None:
         pass
@@ -143,19 +128,24 @@ class Refusing:
 class Instrument:
     """The application and the parts that a transcript changes from outside."""
 
-    app: FastAPI
+    application: Application
     folder: Path
     clock: VirtualClock
-    owner: Owner
-    store: Store
+    owner: HeadArbiter
+    store: CaptureStore
     board: Board
     cameras: list[BreakableCamera]
-    explorer: Explorer
+    explorer: AccuracyExplorer
     cookies: httpx.Cookies = field(default_factory=httpx.Cookies)
 
     @property
+    def app(self) -> FastAPI:
+        """The ASGI application."""
+        return self.application.http
+
+    @property
     def stick(self) -> Path:
-        """The one USB stick that is present."""
+        """The one USB drive present."""
         return self.folder / "media" / "STICK"
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
@@ -174,7 +164,7 @@ class Instrument:
         return asyncio.run(sent())
 
     def follow(self, enough: Heard, after: int | None = None) -> list[dict[str, Any]]:
-        """Read `/api/events` as a browser does, until `enough`; number, kind and data of each event."""
+        """Read `/api/events` as a browser does, until `enough`; return number, kind and data of each event."""
         return asyncio.run(_followed(self.app, enough, after))
 
 
@@ -208,16 +198,16 @@ def _parsed(block: str) -> dict[str, Any]:
 
 @cache
 def _plans() -> TemporaryDirectory[str]:
-    """The folder of FFT plans, one for the process: measuring them takes seconds."""
+    """Return the folder of FFT plans, one per process: measuring plans takes seconds."""
     return TemporaryDirectory()
 
 
 @contextmanager
-def instrument(calibrated_before: bool = True, carrier: Carrier | None = None) -> Iterator[Instrument]:
-    """Build an instrument in a temporary folder, with every room of `diffuscope run`; close it at the end.
+def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) -> Iterator[Instrument]:
+    """Build an instrument in a temporary folder with all parts of `diffuscope run`; close it at the end.
 
-    With `calibrated_before` false the head file names an archive of calibrations that is empty: no picture can be
-    taken, and the instrument is there at once.
+    With `calibrated_before` false, the head file names an empty calibration archive: no picture can be taken, and the
+    instrument is ready at once.
     """
     with TemporaryDirectory() as temporary, ExitStack() as undo:
         folder, clock = Path(temporary).resolve(), PacedClock()
@@ -226,42 +216,44 @@ def instrument(calibrated_before: bool = True, carrier: Carrier | None = None) -
         if not calibrated_before:
             spec = spec.model_copy(update={"calibration": CalibrationTable(archive=folder / "archive")})
         store = undo.enter_context(
-            Store(folder / "data", clock=clock, reserve_bytes=0, free_bytes=lambda _: FREE_BYTES)
+            CaptureStore(folder / "data", clock=clock, reserve_bytes=0, free_bytes=lambda _: FREE_BYTES)
         )
         owner, cameras, explorer = _owner(folder, spec, clock, store, undo)
         undo.callback(owner.close)
         sticks, board = _sticks(folder), Board.new(folder / "board")
-        door = Door(folder / "technician.json", clock)
-        diary = Diary(folder / "diary")
+        door = PinAuthenticator(folder / "technician.json", clock)
+        diary = EventLog(folder / "diary")
         undo.callback(diary.close)
-        desk = UpdateDesk(board.state, board.wishes, clock, "1.0")
+        desk = UpdateRequests(board.state, board.requests, clock, "1.0")
         rooms = [
-            explorer_routes(explorer, store, lambda: owner.exam.head.calibration),
+            accuracy_routes(explorer, store, lambda: owner.exam.head.calibration),
             update_routes(desk, door),
-            diary_routes(diary, sticks, clock),
+            event_log_routes(diary, sticks, clock),
         ]
-        app = create_app(owner, door, names=("eye.local",), sticks=sticks, rooms=rooms, carrier=carrier)
+        application = create_app(
+            owner, door, host_names=("eye.local",), usb_drives=sticks, technician_routers=rooms, uploader=carrier
+        )
         if calibrated_before:
             assert owner.exam.ready.wait(120)
-        yield Instrument(app, folder, clock, owner, store, board, cameras, explorer)
+        yield Instrument(application, folder, clock, owner, store, board, cameras, explorer)
 
 
 def _owner(
-    folder: Path, spec: InstrumentSpec, clock: VirtualClock, store: Store, undo: ExitStack
-) -> tuple[Owner, list[BreakableCamera], Explorer]:
-    root, bulletin, cameras, benches = archive_of(spec, folder), Bulletin(), list[BreakableCamera](), list[Bench]()
+    folder: Path, spec: InstrumentSpec, clock: VirtualClock, store: CaptureStore, undo: ExitStack
+) -> tuple[HeadArbiter, list[BreakableCamera], AccuracyExplorer]:
+    root, bulletin, cameras, benches = archive_path(spec, folder), EventBus(), list[BreakableCamera](), list[Bench]()
     plans = Path(_plans().name)
-    house = House(spec, Archive(root), store, bulletin, clock, Watchdog(None), Event().set)
-    book = LightBook(store.engine, clock, DAY_S, boot="once")
+    house = AppContext(spec, Archive(root), store, bulletin, clock, Watchdog(None), Event().set)
+    book = DoseLedgerStore(store.engine, clock, DAY_S, boot="once")
     coarse = spec.camera.model_copy(update={"rows": 68, "cols": 120, "pitch_um": 2 * spec.camera.pitch_um})
-    measured = spec.model_copy(update={"camera": coarse})  # by the explorer: a quarter of the time
-    explorer = Explorer(folder / "explorer", plans, clock, measured, bulletin.tell)
+    measured = spec.model_copy(update={"camera": coarse})  # for the explorer: a quarter of the time
+    explorer = AccuracyExplorer(folder / "explorer", plans, clock, measured, bulletin.publish, measure_scene)
 
-    def exam() -> Exam:
-        head: Head = open_head(calibrated(spec, root), clock, book)
+    def exam() -> ExamService:
+        head: Head = open_head(with_calibration(spec, root), clock, book)
         cameras.append(BreakableCamera(head.camera))
-        return Exam(
-            replace(head, camera=cameras[-1]), store, bulletin, clock, plans, house.died, Watchdog(None),
+        return ExamService(
+            replace(head, camera=cameras[-1]), store, bulletin, clock, plans, house.on_failure, Watchdog(None),
             lambda: explorer.budget_s,
         )  # fmt: skip
 
@@ -271,14 +263,14 @@ def _owner(
         opened.world.frames = 1000 * len(benches)  # the noise of a second calibration differs from that of the first
         return opened
 
-    return Owner(house, exam, bench), cameras, explorer
+    return HeadArbiter(house, exam, bench), cameras, explorer
 
 
-def _sticks(folder: Path) -> Sticks:
+def _sticks(folder: Path) -> UsbDrives:
     stick, mounts = folder / "media" / "STICK", folder / "mounts"
     stick.mkdir(parents=True)
     mounts.write_text(f"proc /proc proc rw 0 0\n/dev/sda1 {stick} vfat rw 0 0\n")
-    return Sticks((folder / "media",), mounts)
+    return UsbDrives((folder / "media",), mounts)
 
 
 def until(holds: Callable[[], bool]) -> None:

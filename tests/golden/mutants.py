@@ -1,6 +1,7 @@
 """Seeded mutants of guard, dose ledger, store and exam, each with the test that must fail.
 
-Each is one replacement in one file; the old text occurs there exactly once. `run` applies each to a copy of the tree.
+Each mutant is one replacement in one file, whose old text occurs there exactly once. `run` applies each mutant to a
+copy of the tree.
 """
 
 import os
@@ -16,21 +17,31 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NEEDED = ("device", "services", "web", "tests", "hardware", "pyproject.toml", "CHANGELOG.md")
-LIMIT_S = 300.0  # a mutant that hangs is killed too
+LIMIT_S = 300.0  # a hanging mutant counts as killed
 GUARD, LEDGER, BOOK, COPY = (
-    "device/guard.py", "device/ledger.py", "services/records/light_book.py", "services/records/dose_copy.py",
+    "device/light_safety/guard.py", "device/light_safety/dose_ledger.py",
+    "services/records/dose_ledger_tables.py", "services/records/dose_copy.py",
 )  # fmt: skip
-STORE, EXAM, EXPOSING = "services/records/store.py", "services/instrument/exam.py", "services/instrument/exposing.py"
+STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
+    "services/records/capture_store.py",
+    "services/records/quarantine.py",
+    "services/instrument/exam.py",
+    "services/instrument/exam_requests.py",
+    "services/instrument/exam_state.py",
+    "services/instrument/exam_loop.py",
+    "services/instrument/live_pictures.py",
+    "services/instrument/capture_pipeline.py",
+)
 T_GUARD, T_BOOK, T_DOSES = (
-    "tests/unit/test_guard.py", "tests/unit/test_light_book.py", "tests/property/test_light_doses.py",
+    "tests/unit/test_guard.py", "tests/unit/test_dose_ledger_tables.py", "tests/property/test_guard_dose_limit.py",
 )  # fmt: skip
 T_RECORDS, T_EXAM, T_TRACE = (
-    "tests/unit/test_records.py", "tests/journey/test_exam.py", "tests/golden/test_golden_exam.py",
+    "tests/unit/test_capture_store.py", "tests/journey/test_exam.py", "tests/golden/test_golden_exam.py",
 )  # fmt: skip
 
 
 def exam(name: str) -> str:
-    """Return one test of the exam's test file: all of them take half a minute."""
+    """Return one test of the exam's test file; all of them take half a minute."""
     return f"{T_EXAM}::{name}"
 
 
@@ -40,7 +51,7 @@ def scenario(name: str) -> str:
 
 
 class Mutant(NamedTuple):
-    """One changed place: a file, its exact old text, the new text, and what pytest is asked to run."""
+    """One changed place: a file, its exact old text, the new text, and the pytest arguments."""
 
     file: str
     old: str
@@ -81,96 +92,105 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(LEDGER, "        self.add(reserved.eyes, reserved.slot, dose_j_per_cm2)\n", "", T_BOOK),
     Mutant(LEDGER, "given_j_per_cm2 - reserved.dose_j_per_cm2)", "given_j_per_cm2)", T_BOOK),
     Mutant(LEDGER, "total = self.spent(eye) + dose_j_per_cm2\n", "total = self.spent(eye)\n", T_BOOK),
-    Mutant(LEDGER, "LightDay if wait_s > LONGEST_REST_S", "LightDay if wait_s < LONGEST_REST_S", T_BOOK),
-    Mutant(BOOK, "            self._copy.higher(page)\n", "", "tests/unit/test_checkpoints.py"),
-    Mutant(BOOK, "row.eye in EYES else EYES", "row.eye in EYES else ()", "tests/unit/test_damaged_rows.py"),
-    Mutant(BOOK, "now_s=page.now_s, observed_s=page.observed_s)", "now_s=page.now_s, observed_s=0.0)", T_BOOK),
-    Mutant(COPY, "= max(page.doses.get(", "= min(page.doses.get(", "tests/unit/test_checkpoints.py"),
-    Mutant(COPY, "self._number % 2 * BLOCK_BYTES", "0", "tests/unit/test_checkpoints.py"),
+    Mutant(LEDGER, "DailyLightLimit if wait_s > LONGEST_REST_S", "DailyLightLimit if wait_s < LONGEST_REST_S", T_BOOK),
+    Mutant(BOOK, "            self._copy.raise_to_copy(state)\n", "", "tests/unit/test_checkpointing.py"),
+    Mutant(BOOK, "row.eye in EYES else EYES", "row.eye in EYES else ()", T_BOOK),
+    Mutant(BOOK, "now_s=state.now_s, observed_s=state.observed_s)", "now_s=state.now_s, observed_s=0.0)", T_BOOK),
+    Mutant(COPY, "= max(state.doses.get(", "= min(state.doses.get(", "tests/unit/test_checkpointing.py"),
+    Mutant(COPY, "self._number % 2 * BLOCK_BYTES", "0", "tests/unit/test_checkpointing.py"),
     # Store
     Mutant(STORE, "if hashlib.sha256(content).hexdigest() != files[name]:", "if False:", T_RECORDS),
-    Mutant(STORE, "            self._refuse_twice(part, kept)\n", "", T_RECORDS),
-    Mutant(STORE, "< need_bytes + self._reserve_bytes:", "< need_bytes:", T_RECORDS),
+    Mutant(STORE, "            self._refuse_duplicate(part, kept)\n", "", T_RECORDS),
+    Mutant(
+        "services/records/store_space.py", "free := self._free_bytes(self._folder), self._reserve_bytes):",
+        "free := self._free_bytes(self._folder), 0):", T_RECORDS,
+    ),
     Mutant(STORE, "if limit < 1:", "if limit < 0:", T_RECORDS),
     Mutant(STORE, "before).kept)", "before).kept - 1)", T_RECORDS),
     Mutant(
-        STORE, 'if stray.name.startswith(".") or not _is_whole(stray)]',
-        'if stray.name.startswith(".")]', T_RECORDS,
+        QUARANTINE, 'stray.name.startswith(".") or not _is_complete(stray)',
+        'stray.name.startswith(".")', T_RECORDS,
     ),
-    Mutant(STORE, 'if stray.name.startswith(".") or not _is_whole(stray)]', "if not _is_whole(stray)]", T_RECORDS),
+    Mutant(QUARANTINE, 'stray.name.startswith(".") or not _is_complete(stray)', "not _is_complete(stray)", T_RECORDS),
     Mutant(STORE, "if missing and any(", "if False and any(", T_RECORDS),
     Mutant(STORE, "        if not (self._captures / capture.id).is_dir():", "        if False:", T_RECORDS),
     Mutant(
-        STORE, "                disk.settle(self._captures)\n                with",
-        "                with", "tests/hard/test_keep_kill.py",
+        STORE, "atomic_io.replace_durably(part, kept)",
+        "part.rename(kept)", "tests/hard/test_capture_store_kills.py",
     ),
     Mutant(
-        STORE, "shutil.rmtree(folder, ignore_errors=True)  # what stays",
-        "pass  # what stays", "tests/hard/test_keep_full.py",
+        STORE, "shutil.rmtree(folder, ignore_errors=True)  # a folder that stays",
+        "pass  # a folder that stays", "tests/hard/test_capture_store_full.py",
     ),
     Mutant(
-        STORE, "                    if beside is not None:",
-        "                    if False:", "tests/journey/test_request_keys.py",
+        STORE, "                    if write_rows is not None:",
+        "                    if False:", "tests/journey/test_idempotency_keys.py",
     ),
     # Exam
     Mutant(
-        EXAM, "            future.set_running_or_notify_cancel()",
-        "            #", exam("test_a_press_cannot_be_cancelled_by_a_page_that_goes_away"),
+        EXAM, "        future.set_running_or_notify_cancel()",
+        "        #", exam("test_a_press_cannot_be_cancelled_by_a_disconnected_client"),
     ),
     Mutant(
-        EXAM, "            if self._is_busy():",
+        REQUESTS, "            if not self._snapshot.state.accepts_press:",
         "            if False:", exam("test_a_second_press_while_one_is_under_way_is_refused_and_the_first_is_kept"),
     ),
     Mutant(
-        EXAM, " or self._in_the_making == SEATS",
-        "", exam("test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made"),
+        STATES, 'MAKING_TWO = "two exposed captures", "busy", 2, False',
+        'MAKING_TWO = "two exposed captures", "busy", 2, True',
+        exam("test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made"),
     ),
     Mutant(
-        EXAM, "self._pressed.remember(key, self._press)",
+        REQUESTS, "self._idempotency_keys.remember(press.key, press)",
         "pass", exam("test_the_same_key_is_the_same_picture_while_it_is_made_and_afterwards"),
     ),
-    Mutant(EXAM, "            press.errand.permit()  # again", "            #", "tests/journey/test_consent.py"),
+    Mutant(LOOP, "        press.target.permit()  # again", "        #", "tests/journey/test_consent.py"),
     Mutant(
-        EXAM, "                self._died()\n",
-        "                pass\n", exam("test_a_lamp_that_cannot_be_darkened_ends_the_process"),
+        LOOP, "            on_failure()\n",
+        "            pass\n", exam("test_a_lamp_that_cannot_be_darkened_ends_the_process"),
     ),
     Mutant(
-        EXAM, "while not self._closing or self._exposed:",
-        "while not self._closing:", exam("test_closing_answers_a_press_that_waits_and_refuses_the_next"),
+        LOOP, "while not (now := self._requests.snapshot).is_closing or self._exposed:",
+        "while not (now := self._requests.snapshot).is_closing:",
+        exam("test_close_completes_a_waiting_press_and_refuses_the_next"),
     ),
     Mutant(
-        EXAM, "        if self._press is not None and not self._closing:\n            self._let_in()",
-        "        if False:\n            self._let_in()",
-        exam("test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture"),
+        LOOP,
+        "        if self._requests.snapshot.has_press:\n            self._expose_during_refinement()",
+        "        if False:\n            self._expose_during_refinement()",
+        exam("test_a_press_suspends_a_refinement_which_resumes_to_the_same_picture"),
     ),
     Mutant(
-        EXAM, "made = unmade(shot.frame, error)",
-        "raise", exam("test_a_shot_of_which_no_picture_can_be_made_is_kept_as_it_is"),
+        PIPELINE, "yield unreconstructed(shot.frame, error)",
+        "raise", exam("test_a_capture_without_reconstruction_is_stored"),
     ),
-    Mutant(EXAM, "            self._over(id, kept=False)\n", "", scenario("camera_stalled")),
-    Mutant(EXAM, "            self.underway.begin(press.under_way(id), press.key)\n", "", scenario("press")),
+    Mutant(LOOP, "            self._end_journal_entry(id)\n", "", scenario("camera_stalled")),
     Mutant(
-        EXAM, "self._wanted_until_s = 0.0  # aiming is over",
+        LOOP, "        self._parts.capture_journal.begin(press.journal_entry(id), press.key)\n",
+        "", scenario("press"),
+    ),
+    Mutant(
+        REQUESTS, "self._change(replace(self._snapshot, live_until_s=0.0))  # aiming is over",
         "pass  # aiming is over", scenario("press_while_aiming"),
     ),
     Mutant(
-        EXAM, "self._pause(2 * dark_s - self._preview.exposed_s - self.clock.now_s())",
+        LIVE, "self._pause(2 * seen.dark_s - seen.exposed_s - self._clock.now_s())",
         "self._pause(0.0)", scenario("press_while_aiming"),
     ),
-    Mutant(EXAM, "            self._wanted = wanted\n", "", "tests/journey/test_consent.py"),
+    Mutant(REQUESTS, "            self._live_request = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
-        EXPOSING, "    head.check()\n    shot = Shot(head.spec.camera.exposure_s)",
-        "    shot = Shot(head.spec.camera.exposure_s)", scenario("head_lost"),
+        PIPELINE, "    head.check()\n    shot = ExposureSettings(head.spec.camera.exposure_s)",
+        "    shot = ExposureSettings(head.spec.camera.exposure_s)", scenario("head_lost"),
     ),
     Mutant(
-        EXPOSING, "head.light.on(Glow(head.spec.light.preview_colour), eyes)",
-        "head.light.on(Glow(head.spec.light.colour), eyes)", scenario("press_while_aiming"),
+        PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes)",
+        "head.light.on(Illumination(head.spec.light.colour), eyes)", scenario("press_while_aiming"),
     ),
 )  # fmt: skip
 
 
 def run(only: Sequence[int] | None = None) -> int:
-    """Run the test of each mutant, print a line for each, and return 1 if one survived or its test cannot be run."""
+    """Run the test of each mutant and print a line for each; return 1 if one survived or its test cannot run."""
     chosen = [number for number in range(1, len(MUTANTS) + 1) if not only or number in only]
     survived = []
     with copied_tree() as tree:
@@ -193,7 +213,7 @@ def run(only: Sequence[int] | None = None) -> int:
 
 @contextmanager
 def copied_tree() -> Iterator[Path]:
-    """Give a copy of the tree, with what was compiled of it."""
+    """Yield a copy of the tree with its compiled files."""
     with TemporaryDirectory(prefix="mutants") as place:
         for name in NEEDED:
             source, target = ROOT / name, Path(place) / name
@@ -202,7 +222,7 @@ def copied_tree() -> Iterator[Path]:
 
 
 def tried(tree: Path, mutant: Mutant) -> str:
-    """Return `killed`, `survived`, or `broken` where pytest could not run the test at all; the tree is as before."""
+    """Return `killed`, `survived`, or `broken` if pytest could not run the test; restore the tree."""
     path = tree / mutant.file
     before, stat = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(mutated(before, mutant), encoding="utf-8")
@@ -220,7 +240,7 @@ def tried(tree: Path, mutant: Mutant) -> str:
 
 
 def mutated(text: str, mutant: Mutant) -> str:
-    """Return the text with the mutant in it; ValueError unless its old text occurs exactly once."""
+    """Return the text with the mutant applied; ValueError unless its old text occurs exactly once."""
     if (count := text.count(mutant.old)) != 1:
         raise ValueError(f"{mutant.file}: {mutant.old!r} occurs {count} times: correct tests/golden/mutants.py")
     return text.replace(mutant.old, mutant.new)

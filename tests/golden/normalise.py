@@ -1,4 +1,4 @@
-"""Replacement of what differs from run to run (names, times, measured numbers, digests, paths) by placeholders."""
+"""Replacement of values that differ from run to run by placeholders: names, times, measured numbers, digests, paths."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 TIME = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(?:\.\d+)?(?:\+\d\d:\d\d|Z)?"
-NAMED = (  # a name is numbered by its first appearance, so that equal names stay equal
+NAMED = (  # names are numbered by first appearance, so that equal names stay equal
     ("capture", r"\b\d{8}T\d{6}-O[DS]-[0-9a-f]{6}\b"),
     ("visit", r"\b\d{8}T\d{6}-[0-9a-f]{6}\b"),
     ("id", r"\b(?!0{8})[0-9a-f]{16}\b"),
 )
-MEASURED = {"report", "numbers", "verdict", "measured", "found", "x-aim"}  # floats below these keys are results
+MEASURED = {"report", "numbers", "verdict", "measured", "found", "x-aim"}  # floats below these keys are measured
 COUNTS = {"free_bytes", "size_bytes", "space_left", "people_left", "takes_s", "took_s", "left_s", "spent_s"}
-TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # what the explorer concludes from times of the computer
-OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer that runs them
+TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
+OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer
 
 
 class Normaliser:
@@ -26,23 +26,24 @@ class Normaliser:
         self._names: dict[str, str] = {}
         self._counts: dict[str, int] = {}
 
-    def text(self, said: str) -> str:
+    def text(self, plain: str) -> str:
         """Return a text with its names, times and paths replaced."""
-        said = said.replace(self._folder, "<folder>")
+        plain = plain.replace(self._folder, "<folder>")
         for kind, pattern in NAMED:
-            said = re.sub(pattern, self._numbered(kind), said)
-        said = re.sub(r"\b[0-9a-f]{64}\b", "<sha256>", said)
-        said = re.sub(r"/web/[0-9a-f]{12}/", "/web/<mark>/", said)
-        said = re.sub(r"technician=[\w-]{20,}", "technician=<token>", said)
-        said = re.sub(TIME, "<time>", said)
-        return re.sub(r"\b\d{4}-\d\d-\d\d( \d\d:\d\d)?\b", "<date>", said)
+            plain = re.sub(pattern, self._numbered(kind), plain)
+        plain = re.sub(r"\b[0-9a-f]{64}\b", "<sha256>", plain)
+        plain = re.sub(r"/web/[0-9a-f]{12}/", "/web/<mark>/", plain)
+        plain = re.sub(r"technician=[\w-]{20,}", "technician=<token>", plain)
+        plain = re.sub(r"\bin frame \d+\b", "in frame <number>", plain)  # how many came before depends on the load
+        plain = re.sub(TIME, "<time>", plain)
+        return re.sub(r"\b\d{4}-\d\d-\d\d( \d\d:\d\d)?\b", "<date>", plain)
 
     def json(self, value: Any, key: str = "", measured: bool = False) -> Any:
-        """Return a JSON value with its texts, and the floats that were measured, replaced."""
+        """Return a JSON value with its texts and its measured floats replaced."""
         measured = measured or key in MEASURED
         if isinstance(value, str):
-            said = "<version>" if value == version("diffuscope") else self.text(value)
-            return re.sub(r"-?\d+\.\d+", "<number>", said) if measured else said
+            replaced = "<version>" if value == version("diffuscope") else self.text(value)
+            return re.sub(r"-?\d+\.\d+", "<number>", replaced) if measured else replaced
         if key in TIMED:
             return "<timed>"
         if isinstance(value, list | tuple):

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from device.clock import VirtualClock
+from device.config.head_file import load_head
 from device.recon.methods import METHODS
-from device.recon.plan import Planner
+from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Recipe, Reconstructor
-from device.sim.calibrate import simulated_calibration
-from device.spec import load_head
+from device.sim.simulated_calibration import simulated_calibration
 from device.values import Image, Reconstruction
 from tests.golden import compare
-from tests.simulated import SCENES, coarse, exposed, world
+from tests.simulated import SCENES, coarse, exposed_counts, world
 
-K = 4  # pixels of the scene's sensor that are one here, K x K
+K = 4  # K x K pixels of the scene's sensor are combined
 ROUNDS = 6
 LADDER = "default ladder"
 FOLDER = compare.RECORDS / "reconstructions"
@@ -25,13 +25,14 @@ TIMED = ("seconds",)
 
 
 def cases() -> Iterator[tuple[str, Reconstruction]]:
-    """Yield a name and its reconstruction: every method, the default ladder, and the ladder with a saturated disc.
+    """Yield name and reconstruction of every method and of the default schedule, without and with a saturated disc.
 
     The frame is the scene `healthy` with 4 x 4 pixels summed, (270, 480). FFTs are planned by estimate and run on one
-    thread, and no deadline ends the rounds, so that equal code gives equal pictures.
+    thread, and no deadline ends the rounds, so that equal code gives equal pictures. The saturated disc applies to the
+    schedule only.
     """
     scene = world(coarse(load_head(SCENES / "healthy.toml"), K))
-    calibration, counts = simulated_calibration(scene), exposed(scene)
+    calibration, counts = simulated_calibration(scene), exposed_counts(scene)
     shape, planner = (counts.shape[0], counts.shape[1]), Planner(None, effort="FFTW_ESTIMATE", threads=1)
     for name in METHODS:
         known = replace(calibration, field_deg=None) if name == "open" else calibration

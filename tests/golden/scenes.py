@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from device.sim.calibrate import simulated_calibration
-from device.sim.render import fitted
-from device.spec import load_head
+from device.config.head_file import load_head
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
 from tests.golden import compare
-from tests.simulated import SCENES, coarse, exposed, world
+from tests.simulated import SCENES, coarse, exposed_counts, world
 
-K = 4  # pixels of the scene's sensor that are one in the simulated calibration, K x K
+K = 4  # K x K pixels of the scene's sensor are combined in the simulated calibration
 
 
 def names() -> list[str]:
@@ -23,16 +23,16 @@ def names() -> list[str]:
 def record(name: str) -> dict[str, Any]:
     """Return digests of one scene: lit and dark counts, truth, noise-free PSF, its plan, its coarse calibration.
 
-    Frames and PSF are at the scene's full size, as `diffuscope simulate` makes them. Beside each digest stand mean and
-    maximum: equal figures with another digest mean a difference in rounding.
+    Frames and PSF are at full size, as written by `diffuscope simulate`. Each digest has mean and maximum beside it:
+    equal figures with another digest mean a difference in rounding.
     """
     spec = load_head(SCENES / f"{name}.toml")
     scene, colour = world(spec), spec.light.colour
     arrays = {
-        "counts": exposed(scene),
-        "dark": exposed(scene, lit=False),
+        "counts": exposed_counts(scene),
+        "dark": exposed_counts(scene, lit=False),
         "truth": scene.truth(colour),
-        "psf": fitted(scene.psf(colour), scene.shape),
+        "psf": crop_or_pad(scene.psf(colour), scene.shape),
     }
     calibration = simulated_calibration(world(coarse(spec, K)))
     plan = {

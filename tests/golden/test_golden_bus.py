@@ -1,4 +1,4 @@
-"""The same bytes go over SPI and I2C as when their record was written: open, aim, press, close, kill."""
+"""Golden test of the bytes on SPI and I2C: open, aim, press, close, kill."""
 
 import shutil
 

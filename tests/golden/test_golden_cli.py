@@ -1,4 +1,4 @@
-"""The command line, and the codes and sentences of the sources, are as recorded."""
+"""Golden tests of the command line, and of the codes and sentences in the sources."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from tests.golden import command_line, compare, error_codes
 
 @pytest.fixture(scope="module")
 def present() -> dict[str, Any]:
-    """What the command line says now: one process for all tests."""
+    """Return the present record of the command line, from one process for all tests."""
     return command_line.record()
 
 

@@ -1,4 +1,4 @@
-"""The exam tells the same events and switches the lamp at the same virtual moments as when its record was written."""
+"""Golden tests of the exam: events and lamp changes at their virtual times."""
 
 from collections.abc import Callable, Iterator
 
@@ -17,7 +17,7 @@ def test_the_record_holds_every_scenario() -> None:
     assert sorted(compare.read("exam")) == sorted(exam.SCENARIOS)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # a lamp that cannot be darkened
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # of `lamp_lost`
 @pytest.mark.parametrize("name", exam.SCENARIOS)
 def test_a_scenario_is_as_recorded(name: str, built: Callable[[str], exam.Stage]) -> None:
     difference = compare.difference(compare.read("exam")[name], exam.play(built(name), name))

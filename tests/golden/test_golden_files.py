@@ -1,4 +1,4 @@
-"""Files of the record are read as when they were written, and the present code still writes the same."""
+"""Golden tests of stored files: the present code reads them as before and writes the same."""
 
 import shutil
 from pathlib import Path
@@ -10,7 +10,7 @@ from tests.golden import compare, files
 
 @pytest.fixture
 def kept(tmp_path: Path) -> Path:
-    """A copy of the recorded files, as an instrument would find them."""
+    """Return a copy of the recorded files."""
     return Path(shutil.copytree(files.KEPT, tmp_path / "kept"))
 
 
@@ -28,5 +28,13 @@ def test_the_present_code_writes_files_and_rows_of_the_same_shape(kept: Path, tm
     files.make(tmp_path / "present")
     difference = compare.difference(compare.read("files")["shape"], files.shape(tmp_path / "present"))
     assert not difference, difference
-    assert files.schema(tmp_path / "present") == files.SCHEMA.read_text(encoding="utf-8")
-    assert files.schema(kept) == files.SCHEMA.read_text(encoding="utf-8")
+    assert files.schema(tmp_path / "present" / "data") == files.SCHEMA.read_text(encoding="utf-8")
+    assert files.schema(kept / "data") == files.SCHEMA.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("version", files.EARLIER)
+def test_the_data_folder_of_an_earlier_release_is_read_as_by_that_release(version: str, tmp_path: Path) -> None:
+    data = Path(shutil.copytree(files.EARLIER[version], tmp_path / "data"))
+    difference = compare.difference(compare.read(f"files-{version}"), files.read_data(data))
+    assert not difference, difference
+    assert files.schema(data) == files.SCHEMA.read_text(encoding="utf-8")

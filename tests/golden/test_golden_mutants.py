@@ -1,4 +1,4 @@
-"""The table of mutants fits the present tree; `make test-mutants` runs them."""
+"""Consistency of the table of mutants with the present tree; `make test-mutants` runs the mutants."""
 
 import ast
 

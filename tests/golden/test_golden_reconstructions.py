@@ -1,4 +1,4 @@
-"""Every method gives the picture and the report that were recorded."""
+"""Golden tests of picture and report of every method."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from device.values import Reconstruction
 from tests.golden import compare, reconstructions
 
-TOLERANCE = 1e-5  # of the largest value: other processors order the sums of an FFT differently
+TOLERANCE = 1e-5  # of the largest value: the order of sums in an FFT depends on the processor
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The shipped scenes give the same frames, PSFs and plans as when their record was written."""
+"""Golden tests of frames, PSFs and plans of the shipped scenes."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""No recorded test is lost: each is collected, under its own name or under the one in `moved_tests.txt`."""
+"""Completeness of the tests: each recorded test is collected, under its own name or that in `moved_tests.txt`."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A transcript of HTTP exchanges as plain values: request and response, normalised, binary bodies described."""
+"""Transcript of HTTP exchanges as plain values: normalised requests and responses, binary bodies described."""
 
 import io
 import json
@@ -10,16 +10,16 @@ import httpx
 import tifffile
 from PIL import Image
 
-from services.instrument.api import HEADERS
+from services.http.security import SECURITY_HEADERS
 from tests.golden.instrument import Instrument, until
 from tests.golden.normalise import Normaliser
 
-PAGE_RULES = {name.lower(): text for name, text in HEADERS.items()}
+PAGE_RULES = {name.lower(): text for name, text in SECURITY_HEADERS.items()}
 VOLATILE = {"content-length", "x-age-ms", "x-frame", "x-exposure-ms", "x-brightest", "x-mean", "x-full"}
 
 
 class Transcript:
-    """Exchanges with one instrument in their order; `keys` of requests are counted up."""
+    """Exchanges with one instrument in order; the idempotency keys of requests are counted up."""
 
     def __init__(self, instrument: Instrument) -> None:
         self.instrument = instrument
@@ -30,9 +30,9 @@ class Transcript:
     def ask(
         self, operation: str, path: str | None = None, note: str = "", racing: Iterable[str] = (), **options: Any
     ) -> Any:
-        """Send `METHOD /api/template` (to `path` where it has parameters), record it, and return its JSON, if any.
+        """Send `METHOD /api/template` (to `path` if it has parameters), record it, and return its JSON, if any.
 
-        `racing` are keys of the answer that depend on how far another thread is; their values are not recorded.
+        `racing` are keys of the answer that depend on the progress of another thread; their values are not recorded.
         """
         method, template = operation.split(" ")
         answer = self.instrument.send(method, path or template, **options)
@@ -43,15 +43,15 @@ class Transcript:
             request["content"] = described_content(options["content"])
         if "headers" in options:
             request["headers"] = dict(options["headers"])
-        said = self._answer(answer)
+        recorded = self._answer(answer)
         for key in racing:
-            assert key in said["body"], key
-            said["body"][key] = "<racing>"
-        self._add(operation, note, request, said)
+            assert key in recorded["body"], key
+            recorded["body"][key] = "<racing>"
+        self._add(operation, note, request, recorded)
         return answer.json() if "json" in answer.headers.get("content-type", "") else None
 
     def ask_for_live(self, operation: str, path: str | None = None) -> None:
-        """Record a request for a live picture once there is one: on a busy computer it may take more than 2 s."""
+        """Record a request for a live picture once one exists: on a busy computer that may take more than 2 s."""
         method, template = operation.split(" ")
         until(lambda: self.instrument.send(method, path or template).status_code == 200)
         self.ask(operation, path)
@@ -66,7 +66,7 @@ class Transcript:
         self._add("GET /api/events", note, request, {"status": 200, "events": body})
 
     def key(self, **more: Any) -> dict[str, Any]:
-        """Return a request body with a key that no request before it had."""
+        """Return a request body with a new idempotency key."""
         self._key += 1
         return {"key": f"{self._key:016x}"} | more
 
@@ -85,11 +85,11 @@ class Transcript:
     def _answer(self, answer: httpx.Response) -> dict[str, Any]:
         rules = {name: answer.headers.get(name) for name in PAGE_RULES}
         headers = {name: self._header(name, text) for name, text in answer.headers.items() if name not in PAGE_RULES}
-        said: dict[str, Any] = {"status": answer.status_code, "headers": dict(sorted(headers.items()))}
+        recorded: dict[str, Any] = {"status": answer.status_code, "headers": dict(sorted(headers.items()))}
         if rules != PAGE_RULES:
-            said["page rules"] = rules
+            recorded["page rules"] = rules
         body = self._body(answer)
-        return said if body is None else said | {"body": body}
+        return recorded if body is None else recorded | {"body": body}
 
     def _header(self, name: str, text: str) -> Any:
         if name in VOLATILE:

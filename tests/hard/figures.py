@@ -1,6 +1,6 @@
-"""The figures of the README: `python -m tests.hard.figures` runs the tests with bounds and writes what they saw.
+"""Table of margins in the README: `python -m tests.hard.figures` runs the tests with bounds and records their figures.
 
-Every call of `within` is kept in `margins.json`, by test; the README's table holds the worst of each test function.
+Every call of `within` is stored in `margins.json`, by test; the README's table holds the worst of each test function.
 """
 
 import json
@@ -21,13 +21,13 @@ Margins = Mapping[str, list[list[float]]]
 
 
 class Recorder:
-    """A plugin of pytest that keeps what tests say of their margins."""
+    """Pytest plugin that collects the margins of the tests."""
 
     def __init__(self) -> None:
         self.margins: dict[str, list[list[float]]] = {}
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Keep the margins of a test that passed."""
+        """Store the margins of a test that passed."""
         if report.when == "call" and report.passed:
             found = [value for name, value in report.user_properties if name == "margin"]
             if found:
@@ -36,12 +36,12 @@ class Recorder:
 
 @cache
 def recorded() -> Margins:
-    """What was recorded: for each test the (measured, bound) of its calls in order; empty before the first time."""
+    """Return the recorded (measured, bound) pairs of each test in order; empty without a record."""
     return json.loads(MARGINS.read_text(encoding="utf-8")) if MARGINS.exists() else {}
 
 
 def table(margins: Margins) -> str:
-    """The worst margin of each test function, as Markdown."""
+    """Return the worst margin of each test function as Markdown."""
     worst: dict[str, tuple[float, float]] = {}
     for node, pairs in margins.items():
         name = re.sub(r"\[.*", "", node.split("::")[1]).removeprefix("test_")
@@ -51,28 +51,28 @@ def table(margins: Margins) -> str:
 
 
 def with_table(readme: str, margins: Margins) -> str:
-    """The README with its table made anew."""
+    """Return the README with its table replaced."""
     return re.sub(f"{re.escape(BEGIN)}.*{re.escape(END)}", lambda _: table(margins), readme, flags=re.S)
 
 
 def main(files: Iterable[str] = FILES) -> int:
-    """Run the tests, keep the margins and rewrite the table; the exit status of pytest."""
+    """Run the tests, store the margins and rewrite the table; return the exit status of pytest."""
     recorder = Recorder()
-    status = pytest.main(["-q", *(str(HERE / name) for name in files)], plugins=[Named(recorder)])
+    status = pytest.main(["-q", *(str(HERE / name) for name in files)], plugins=[RecorderRegistration(recorder)])
     kept = dict(sorted({**recorded(), **recorder.margins}.items()))
     MARGINS.write_text(json.dumps(kept, indent=0) + "\n", encoding="utf-8")
     README.write_text(with_table(README.read_text(encoding="utf-8"), kept), encoding="utf-8")
     return int(status)
 
 
-class Named:
-    """Registers a recorder under its name, which the fixture asks for."""
+class RecorderRegistration:
+    """Pytest plugin that registers a recorder under the name used by the fixture `within`."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
 
     def pytest_configure(self, config: pytest.Config) -> None:
-        """Register it."""
+        """Register the recorder."""
         config.pluginmanager.register(self._recorder, RECORDER)
 
 

@@ -1,8 +1,8 @@
-"""Power cuts: what a program wrote is noted down call by call, and cut off after each of them.
+"""Simulated power cuts: record the system calls of a program with strace, and cut the power after each.
 
-A disk may forget whatever was not synced, any part of it, in any order. `Disk` is such a disk in memory: it follows the
-system calls that `strace` noted, and says what it could hold after a cut. A part of it may be FAT, where a rename is
-three writes. See README.md for what it does not know.
+A disk may lose any unsynced change, in any order. `Disk` simulates such a disk in memory: it follows the recorded calls
+and yields the possible contents after a cut. A part of the disk may be FAT, where a rename is three writes. See
+README.md for the limits of the simulation.
 """
 
 import random
@@ -23,30 +23,30 @@ WORD = re.compile(r'"((?:\\x..)*)"')
 OPENED = re.compile(r"\d+<((?:\\x..)*)>")
 OPEN = re.compile(r"^(?:AT_FDCWD|\d+)<((?:\\x..)*)>")
 DRAWS = 3
-MOST_ALONE = 8  # changes of which each is once the only one that is left: the last ones
+MOST_ALONE = 8  # the last changes, each of which is once the only survivor
 SECTOR_BYTES = 512
 
 
-def noted(words: list[str], folder: Path, cwd: Path, devices: Mapping[str, Path] | None = None) -> list[str]:
-    """Run a program under strace; what it said, and the calls that did something below a folder, in order.
+def record_calls(words: list[str], folder: Path, cwd: Path, devices: Mapping[str, Path] | None = None) -> list[str]:
+    """Run a program under strace; return the calls that changed anything below a folder, and its output, in order.
 
-    `devices` are read as if they were files in there.
+    `devices`: device paths that are replaced by files of the folder.
     """
     if shutil.which("strace") is None:
         raise RuntimeError("strace is missing; tests/hard/install installs it")
     log, below = folder / "log", _escaped(folder)
     trace = ["strace", "-f", "--seccomp-bpf", "-y", "-xx", "-s", "100000000", "-e", f"trace={CALLS}", "-o", str(log)]
     subprocess.run([*trace, "-e", "signal=none", *words], cwd=cwd, stdout=subprocess.DEVNULL, check=True)
-    said = log.read_text("ascii")
+    recorded = log.read_text("ascii")
     for device, file in (devices or {}).items():
         for end in '>"':
-            said = said.replace(_escaped(Path(device)) + end, _escaped(file) + end)
-    calls = (line for line in _in_one(said.splitlines()) if below in line or " write(1<" in line)
+            recorded = recorded.replace(_escaped(Path(device)) + end, _escaped(file) + end)
+    calls = (line for line in _joined_calls(recorded.splitlines()) if below in line or " write(1<" in line)
     return [line for line in calls if " = -1 " not in line]
 
 
-def _in_one(lines: list[str]) -> Iterator[str]:
-    """Calls that strace noted in two halves, since others came between, stand where they ended."""
+def _joined_calls(lines: list[str]) -> Iterator[str]:
+    """Join calls that strace recorded in two parts, at the position of the second part."""
     begun: dict[str, str] = {}
     for line in lines:
         pid, _, rest = line.partition(" ")
@@ -62,44 +62,44 @@ def _escaped(path: Path) -> str:
     return "".join(f"\\x{byte:02x}" for byte in bytes(path))
 
 
-def plain(escaped: str) -> bytes:
+def unescape(escaped: str) -> bytes:
     return bytes.fromhex(escaped.replace("\\x", ""))
 
 
 @dataclass(eq=False)
-class Thing:
-    """A file or a folder: what programs see, what is on the disk for certain, and what was done since."""
+class DiskEntry:
+    """File or folder: content visible to programs, content certainly on the disk, and the changes since."""
 
-    now: "bytearray | dict[str, Thing]"
-    sure: "bytes | dict[str, Thing]"
-    since: list[tuple[object, ...]] = field(default_factory=list)
+    visible: "bytearray | dict[str, DiskEntry]"
+    durable: "bytes | dict[str, DiskEntry]"
+    pending: list[tuple[object, ...]] = field(default_factory=list)
 
     def do(self, *change: object) -> tuple[object, ...]:
-        self.since.append(change)
-        _apply(self.now, change)
+        self.pending.append(change)
+        _apply(self.visible, change)
         return change
 
     def sync(self) -> None:
-        """All is on the disk; but on FAT, where a thing lies is written with the thing, not with its folder."""
-        if isinstance(self.now, bytearray):
-            self.sure, self.since = bytes(self.now), []
+        """Make all changes durable; on FAT the entry of a file is written with the file, not with its folder."""
+        if isinstance(self.visible, bytearray):
+            self.durable, self.pending = bytes(self.visible), []
             return
-        assert isinstance(self.sure, dict)
-        placed = [change for change in self.since if change[0] == "place"]
-        for change in self.since:
+        assert isinstance(self.durable, dict)
+        placed = [change for change in self.pending if change[0] == "place"]
+        for change in self.pending:
             if change not in placed:
-                _apply(self.sure, change)
-        self.since = placed
+                _apply(self.durable, change)
+        self.pending = placed
 
-    def place(self, thing: "Thing") -> None:
-        """Where a thing in this folder lies is on the disk, and with it, in one entry, what it is called."""
-        assert isinstance(self.sure, dict)
-        for change in [change for change in self.since if change[0] == "place" and change[2] is thing]:
-            _apply(self.sure, change)
-            self.since = [other for other in self.since if other[:2] not in (("name", change[1]), change[:2])]
+    def place(self, thing: "DiskEntry") -> None:
+        """Make the directory entry of a file durable, with its name."""
+        assert isinstance(self.durable, dict)
+        for change in [change for change in self.pending if change[0] == "place" and change[2] is thing]:
+            _apply(self.durable, change)
+            self.pending = [other for other in self.pending if other[:2] not in (("name", change[1]), change[:2])]
 
 
-def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> None:
+def _apply(to: "bytearray | dict[str, DiskEntry]", change: tuple[object, ...]) -> None:
     match change, to:
         case ("write", int(at), bytes(data)), bytearray():
             to.extend(bytes(max(0, at - len(to))))
@@ -107,13 +107,13 @@ def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> No
         case ("length", int(length)), bytearray():
             del to[length:]
             to.extend(bytes(length - len(to)))
-        case ("name" | "place", str(name), Thing() as thing), dict():
+        case ("name" | "place", str(name), DiskEntry() as thing), dict():
             to[name] = thing
         case ("freed",), bytearray():
             to[:] = bytes(len(to))
         case ("forget", str(name), *_), dict():
             to.pop(name, None)
-        case ("rename", str(name), str(new), Thing() as thing), dict():  # one step, if it is within one folder
+        case ("rename", str(name), str(new), DiskEntry() as thing), dict():  # atomic within one folder
             to[new] = thing
             if to.get(name) is thing:
                 del to[name]
@@ -121,45 +121,46 @@ def _apply(to: "bytearray | dict[str, Thing]", change: tuple[object, ...]) -> No
             raise AssertionError(f"{change[0]} of a {type(to).__name__}")
 
 
-Survives = Callable[[Thing, tuple[object, ...]], tuple[object, ...] | None]
+Survives = Callable[[DiskEntry, tuple[object, ...]], tuple[object, ...] | None]
 
 
 class Disk:
-    """A folder on a disk that forgets; everything in it at the beginning is there for certain.
+    """Folder on a disk that loses unsynced data; its initial content is durable.
 
-    `fat` names the folders in it that are FAT, without `sync` among the words of their mount; `parts` what of the
-    folder is on the disk, if not all of it.
+    `fat`: folders on FAT, mounted without `sync`. `parts`: subfolders on the disk, if not all.
     """
 
     def __init__(self, folder: Path, before: Path, fat: tuple[str, ...] = (), parts: tuple[str, ...] = ("",)) -> None:
         self._at, self._fat = f"{folder}/", fat
-        self._on_it = tuple(f"{folder}/{part}" for part in parts)
-        self._root = _found(before)
-        self._places: dict[tuple[str, int], int] = {}
-        self.said = ""
+        self._prefixes = tuple(f"{folder}/{part}" for part in parts)
+        self._root = _read_tree(before)
+        self._offsets: dict[tuple[str, int], int] = {}
+        self.output = ""
 
     def follow(self, line: str) -> bool:
-        """Do what a call did; whether it changed this disk, or was a word of the program."""
+        """Apply one recorded call; return whether it changed this disk or was output of the program."""
         call, words, result = _parsed(line)
         if call == "write" and words.startswith("1<"):
-            self.said += plain(WORD.findall(words)[0]).decode()
+            self.output += unescape(WORD.findall(words)[0]).decode()
             return True
         paths = self._paths(call, words)
-        if not any(f"{path}/".startswith(self._on_it) for path in paths):
+        if not any(f"{path}/".startswith(self._prefixes) for path in paths):
             return False
         return self._do(call, words, result, [f"{path}/".removeprefix(self._at).rstrip("/") for path in paths])
 
     def _paths(self, call: str, words: str) -> list[str]:
         if call in ("rename", "unlink", "rmdir", "mkdir", "openat", "unlinkat", "mkdirat", "renameat2"):
             base = OPEN.match(words)
-            named = [plain(word).decode() for word in WORD.findall(words)]
+            named = [unescape(word).decode() for word in WORD.findall(words)]
             return [
-                name if name.startswith("/") else f"{plain(base[1]).decode()}/{name}" for name in named if base or name
+                name if name.startswith("/") else f"{unescape(base[1]).decode()}/{name}"
+                for name in named
+                if base or name
             ]
-        return [plain(path).decode() for path in OPENED.findall(words)]
+        return [unescape(path).decode() for path in OPENED.findall(words)]
 
     def _do(self, call: str, words: str, result: int, paths: list[str]) -> bool:
-        """Whether the call changed something."""
+        """Apply a call; return whether it changed anything."""
         name = paths[0].rpartition("/")[2]
         match call:
             case "openat":
@@ -172,7 +173,7 @@ class Disk:
                 if paths[0]:
                     self._folder(paths[0]).place(self._thing(paths[0]))
             case "mkdir" | "mkdirat":
-                self._folder(paths[0]).do("name", name, Thing({}, {}))
+                self._folder(paths[0]).do("name", name, DiskEntry({}, {}))
             case "unlink" | "rmdir" | "unlinkat":
                 self._folder(paths[0]).do("forget", name)
             case "rename" | "renameat2":
@@ -185,38 +186,38 @@ class Disk:
         place, thing = (paths[0], int(words.split("<")[0])), self._thing(paths[0])
         match call:
             case "lseek":
-                self._places[place] = result
+                self._offsets[place] = result
                 return False
             case "write" | "pwrite64":
-                data = plain(WORD.findall(words)[0])[:result]
-                at = int(words.rsplit(",", 1)[1]) if call == "pwrite64" else self._places.get(place, 0)
-                self._places[place] = at + result
+                data = unescape(WORD.findall(words)[0])[:result]
+                at = int(words.rsplit(",", 1)[1]) if call == "pwrite64" else self._offsets.get(place, 0)
+                self._offsets[place] = at + result
                 thing.do("write", at, data)
-            case "sendfile":  # a whole copy of a file on this disk
-                source = self._thing(paths[1]).now
+            case "sendfile":  # complete copy of a file of this disk
+                source = self._thing(paths[1]).visible
                 assert isinstance(source, bytearray)
                 assert result in (0, len(source)), words
                 thing.do("write", 0, bytes(source[:result]))
             case "ftruncate":
                 thing.do("length", int(words.rsplit(",", 1)[1]))
             case "fallocate":
-                thing.do("length", max(len(thing.now), sum(map(int, words.rsplit(",", 2)[1:]))))
+                thing.do("length", max(len(thing.visible), sum(map(int, words.rsplit(",", 2)[1:]))))
             case _:
-                raise AssertionError(f"this disk does not know {call}")
+                raise AssertionError(f"the simulated disk does not support {call}")
         return True
 
     def _open(self, path: str, words: str, place: tuple[str, int]) -> bool:
-        """A file that is opened may be made, or emptied."""
+        """Apply an open call, which may create or truncate the file."""
         folder, name = self._folder(path), path.rpartition("/")[2]
-        assert isinstance(folder.now, dict)
-        made = name not in folder.now and "O_CREAT" in words
+        assert isinstance(folder.visible, dict)
+        made = name not in folder.visible and "O_CREAT" in words
         if made:
-            folder.do("name", name, Thing(bytearray(), b""))
-        thing = folder.now.get(name)
-        empties = thing is not None and "O_TRUNC" in words and bool(thing.now)
+            folder.do("name", name, DiskEntry(bytearray(), b""))
+        thing = folder.visible.get(name)
+        empties = thing is not None and "O_TRUNC" in words and bool(thing.visible)
         if thing is not None and empties:
             thing.do("length", 0)
-        self._places[place] = len(thing.now) if thing is not None and "O_APPEND" in words else 0
+        self._offsets[place] = len(thing.visible) if thing is not None and "O_APPEND" in words else 0
         return made or empties
 
     def _rename(self, old: str, new: str) -> None:
@@ -226,41 +227,41 @@ class Disk:
             _rename_on_fat(source, target, names, thing)
         elif source is target:
             source.do("rename", *names, thing)
-        else:  # a journal does not forget the old name before it knows the new one
+        else:  # a journaling file system removes the old name after it stores the new one
             source.do("forget", names[0], target.do("name", names[1], thing))
 
-    def _folder(self, path: str) -> Thing:
+    def _folder(self, path: str) -> DiskEntry:
         return self._thing(path.rpartition("/")[0])
 
-    def _thing(self, path: str) -> Thing:
+    def _thing(self, path: str) -> DiskEntry:
         thing = self._root
         for name in filter(None, path.split("/")):
-            assert isinstance(thing.now, dict)
-            thing = thing.now[name]
+            assert isinstance(thing.visible, dict)
+            thing = thing.visible[name]
         return thing
 
     def as_seen(self) -> dict[str, bytes | None]:
-        """What programs see now, by path; None is a folder."""
+        """Return the content that programs see now, by path; None is a folder."""
         left: dict[str, bytes | None] = {}
         _collect(self._root, "", lambda thing, change: change, left)
         return left
 
     def cuts(self, draw: random.Random, draws: int = DRAWS) -> Iterator[dict[str, bytes | None]]:
-        """What could be on the disk if the power went now, by path; None is a folder.
+        """Yield possible contents after a power cut now, by path; None is a folder.
 
-        All that was not synced is gone; nothing is; only names are left; only content; each change alone; and draws of
-        any part of it.
+        All unsynced changes are lost; none is; only names remain; only content remains; each change alone; random
+        subsets.
         """
         waiting: list[tuple[object, ...]] = []
         _collect(self._root, "", lambda thing, change: waiting.append(change) or change, {})  # type: ignore[func-returns-value]
         ways: list[Survives] = [
             lambda thing, change: None,
             lambda thing, change: change,
-            lambda thing, change: change if isinstance(thing.now, dict) else None,
-            lambda thing, change: change if isinstance(thing.now, bytearray) else None,
+            lambda thing, change: change if isinstance(thing.visible, dict) else None,
+            lambda thing, change: change if isinstance(thing.visible, bytearray) else None,
         ]
 
-        def some(thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+        def some(thing: DiskEntry, change: tuple[object, ...]) -> tuple[object, ...] | None:
             if draw.random() < 0.5:
                 return None
             match change:
@@ -275,31 +276,31 @@ class Disk:
             yield left
 
 
-def _rename_on_fat(source: Thing, target: Thing, names: tuple[str, str], thing: Thing) -> None:
-    """Three writes, of which any may be left: a new entry that leads nowhere, where it leads, the old entry's end.
+def _rename_on_fat(source: DiskEntry, target: DiskEntry, names: tuple[str, str], thing: DiskEntry) -> None:
+    """Apply a rename on FAT as three separate writes: new entry, its location, removal of the old entry.
 
-    Of a file that was there before, the room is given back: its entry, if it is left as it was, leads to anything.
+    The clusters of an overwritten file are freed: its old entry, if it remains, refers to arbitrary content.
     """
-    assert isinstance(target.now, dict)
-    before = target.now.get(names[1])
+    assert isinstance(target.visible, dict)
+    before = target.visible.get(names[1])
     if before is None:
-        target.do("name", names[1], Thing(type(thing.now)(), type(thing.sure)()))
+        target.do("name", names[1], DiskEntry(type(thing.visible)(), type(thing.durable)()))
     else:
         before.do("freed")
     target.do("place", names[1], thing)
     source.do("forget", names[0])
 
 
-def _alone(one: tuple[object, ...], thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+def _alone(one: tuple[object, ...], thing: DiskEntry, change: tuple[object, ...]) -> tuple[object, ...] | None:
     return change if change is one else None
 
 
 def _together(way: Survives, waiting: list[tuple[object, ...]]) -> Survives:
-    """The same, but the old name of what was moved to another folder goes only if the new one is there."""
+    """Return the same rule, but an old name disappears only if the new name in another folder exists."""
     kept: dict[int, tuple[object, ...] | None] = {}
     ids = {id(change) for change in waiting}
 
-    def decide(thing: Thing, change: tuple[object, ...]) -> tuple[object, ...] | None:
+    def decide(thing: DiskEntry, change: tuple[object, ...]) -> tuple[object, ...] | None:
         if id(change) not in kept:
             kept[id(change)] = way(thing, change)
         match change:
@@ -312,21 +313,21 @@ def _together(way: Survives, waiting: list[tuple[object, ...]]) -> Survives:
 
 def _parsed(line: str) -> tuple[str, str, int]:
     found = LINE.match(line)
-    assert found, f"strace says what nobody understands: {line[:200]}"
+    assert found, f"unknown line of strace: {line[:200]}"
     return found[1], found[2], int(found[3], 0)
 
 
-def _found(place: Path) -> Thing:
+def _read_tree(place: Path) -> DiskEntry:
     if place.is_dir():
-        names = {path.name: _found(path) for path in place.iterdir()}
-        return Thing(names, dict(names))
+        names = {path.name: _read_tree(path) for path in place.iterdir()}
+        return DiskEntry(names, dict(names))
     content = place.read_bytes()
-    return Thing(bytearray(content), content)
+    return DiskEntry(bytearray(content), content)
 
 
-def _collect(thing: Thing, path: str, way: Survives, left: dict[str, bytes | None]) -> None:
-    content = bytearray(thing.sure) if isinstance(thing.sure, bytes) else dict(thing.sure)
-    for change in thing.since:
+def _collect(thing: DiskEntry, path: str, way: Survives, left: dict[str, bytes | None]) -> None:
+    content = bytearray(thing.durable) if isinstance(thing.durable, bytes) else dict(thing.durable)
+    for change in thing.pending:
         if (survived := way(thing, change)) is not None:
             _apply(content, survived)
     if isinstance(content, bytearray):
@@ -334,12 +335,12 @@ def _collect(thing: Thing, path: str, way: Survives, left: dict[str, bytes | Non
         return
     left[path] = None
     for name, inner in content.items():
-        if not name.endswith("-shm"):  # an index that SQLite makes anew after every power cut
+        if not name.endswith("-shm"):  # index that SQLite rebuilds after every power cut
             _collect(inner, f"{path}/{name}", way, left)
 
 
-def written(left: dict[str, bytes | None], to: Path) -> Path:
-    """Make a real folder of what was left."""
+def write_tree(left: dict[str, bytes | None], to: Path) -> Path:
+    """Write the remaining content into a real folder."""
     for path, content in left.items():
         place = to / path.lstrip("/")
         if content is None:

@@ -1,6 +1,6 @@
-"""What is done while the power may go: what it begins with, and what must be true of whatever is left.
+"""Cases of power cuts: preparation, action, and the invariants of whatever remains.
 
-Run as a module, this file is the victim: it does one thing after another, and says when each is done.
+Run as a module, this file is the victim process: it runs one action after another and acknowledges each.
 """
 
 import sqlite3
@@ -12,16 +12,19 @@ from datetime import UTC, datetime, timedelta
 from itertools import count
 from pathlib import Path
 
-from device.calibration.archive import Archive, write_synced
+from device import atomic_io
+from device.calibration.archive import Archive
 from device.clock import SystemClock, VirtualClock
-from device.errors import CalibrationMissing, StoreDamaged
-from device.values import Capture
-from services.records.light_book import LightBook
-from services.records.people import People
+from device.errors import CalibrationMissing
+from device.values import Report
+from services.errors import StoreDamaged
+from services.records.capture import Capture, CaptureReport
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.snapshots import Snapshots
-from services.records.store import Store
-from tests.earlier import RAW, Release, shelf_of
+from services.records.visit_repository import VisitRepository
+from tests.earlier import RAW, Release, store_of_version
 from tests.hard.power_fat import (
     FILES,
     commit,
@@ -41,14 +44,14 @@ ADOPTED = "adopted"
 
 def capture(name: str, second: int = 0) -> Capture:
     taken_at = datetime(2026, 3, 1, 12, tzinfo=UTC) + timedelta(seconds=second)
-    return Capture(name, "OS", taken_at, False, "00ff", {"method": "wiener"}, {})
+    return Capture(name, "OS", taken_at, False, "00ff", CaptureReport(Report("wiener")), {})
 
 
-def people(store: Store) -> People:
-    return People(store.engine, load_protocol(), SystemClock())
+def people(store: CaptureStore) -> VisitRepository:
+    return VisitRepository(store.engine, load_protocol(), SystemClock())
 
 
-# What is done, what it begins with, and what must be true of whatever is left; `said` is what was said to be done.
+# A case: preparation, action and judgement; `acknowledged` holds the steps that the action reported as done.
 
 Prepare = Callable[[Path], None]
 Act = Callable[[Path, Callable[[str], None]], None]
@@ -61,129 +64,129 @@ class Case:
     act: Act
     judge: Judge
     outcomes: frozenset[str]
-    fat: tuple[str, ...] = ()  # folders that are FAT
+    fat: tuple[str, ...] = ()  # folders on FAT
 
 
 def shelf_with_one(folder: Path) -> None:
-    with Store(folder, reserve_bytes=0) as store:
-        store.keep(capture("before"), FILES)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        store.save(capture("before"), FILES)
 
 
-def keep(folder: Path, say: Callable[[str], None]) -> None:
-    with Store(folder, reserve_bytes=0) as store:
+def keep(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder, reserve_bytes=0) as store:
         for number in (1, 2):
-            store.keep(capture(f"new{number}", number), FILES)
-            say(f"new{number}")
+            store.save(capture(f"new{number}", number), FILES)
+            acknowledge(f"new{number}")
 
 
-def judge_kept(folder: Path, said: list[str]) -> str:
-    with Store(folder, reserve_bytes=0) as store:
+def judge_kept(folder: Path, acknowledged: list[str]) -> str:
+    with CaptureStore(folder, reserve_bytes=0) as store:
         listed = {one.id for one in store.captures()}
-        assert {*said, *(["before"] if (folder / "captures" / "before").exists() else [])} <= listed
+        assert {*acknowledged, *(["before"] if (folder / "captures" / "before").exists() else [])} <= listed
         for id in listed:
             assert {name: store.read(id, name) for name in store.get(id).files} == FILES
         assert {path.name for path in (folder / "captures").iterdir()} == listed
-        return "new" if "new1" in listed else "torn" if store.swept else "old"
+        return "new" if "new1" in listed else "torn" if store.newly_quarantined else "old"
 
 
-def judge_kept_beside(folder: Path, said: list[str]) -> str:
+def judge_kept_beside(folder: Path, acknowledged: list[str]) -> str:
     assert (folder / "captures" / "before").is_dir()
-    return judge_kept(folder, said)
+    return judge_kept(folder, acknowledged)
 
 
-def answer(folder: Path, say: Callable[[str], None]) -> None:
-    with Store(folder, reserve_bytes=0) as store:
-        mine, keys = people(store), (f"{number:016x}" for number in count())
-        visit = mine.begin(next(keys)).id
+def answer(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        repository, keys = people(store), (f"{number:016x}" for number in count())
+        visit = repository.begin(next(keys)).id
         for age in range(1, 6):
-            mine.answer(next(keys), visit, "age", age)
-            say(str(age))
-        mine.finish(next(keys), visit)
-        say("6")
+            repository.answer(next(keys), visit, "age", age)
+            acknowledge(str(age))
+        repository.finish(next(keys), visit)
+        acknowledge("6")
 
 
-def judge_answers(folder: Path, said: list[str]) -> str:
-    with Store(folder, reserve_bytes=0) as store:
-        visits, last = people(store).visits(10), int(said[-1]) if said else 0
+def judge_answers(folder: Path, acknowledged: list[str]) -> str:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        visits, last = people(store).visits(10), int(acknowledged[-1]) if acknowledged else 0
         if not visits:
-            assert not said
+            assert not acknowledged
             return "old"
         reached = 6 if visits[0].finished_at else visits[0].fields.get("age", 0)
         assert reached in (last, last + 1)
         return "new"
 
 
-def shine(folder: Path, say: Callable[[str], None]) -> None:
-    with Store(folder, reserve_bytes=0) as store:
-        book = LightBook(store.engine, VirtualClock(), 86_400.0, boot="boot")
-        book.reserve(("OD",), 1.0, 10.0)
-        say("reserved")
+def reserve_dose(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        ledger = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, boot="boot")
+        ledger.reserve(("OD",), 1.0, 10.0)
+        acknowledge("reserved")
 
 
-def judge_light(folder: Path, said: list[str]) -> str:
-    with Store(folder, reserve_bytes=0) as store:
-        spent = LightBook(store.engine, VirtualClock(), 86_400.0, boot="boot").spent_j_per_cm2("OD")
-        assert spent == 1.0 or not said
+def judge_light(folder: Path, acknowledged: list[str]) -> str:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        spent = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, boot="boot").spent_j_per_cm2("OD")
+        assert spent == 1.0 or not acknowledged
         return "new" if spent else "old"
 
 
 def calibrated(folder: Path) -> None:
     (folder / "calibrations").mkdir()
-    Archive(folder / "calibrations" / "head").keep(OLD, WHO)
+    Archive(folder / "calibrations" / "head").add_and_activate(OLD, WHO)
 
 
-def recalibrate(folder: Path, say: Callable[[str], None]) -> None:
+def recalibrate(folder: Path, acknowledge: Callable[[str], None]) -> None:
     archive = Archive(folder / "calibrations" / "head")
-    archive.keep(NEW, WHO)
-    say(NEW.id)
-    archive.use(OLD.id)
-    say(OLD.id)
+    archive.add_and_activate(NEW, WHO)
+    acknowledge(NEW.id)
+    archive.activate(OLD.id)
+    acknowledge(OLD.id)
 
 
-def take_in(folder: Path, say: Callable[[str], None]) -> None:
-    """What is imported was exported from elsewhere."""
+def import_calibration(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    """Import a calibration that another archive exported."""
     archive = Archive(folder / "calibrations" / "head")
-    archive.adopt(Archive(folder / "elsewhere").files(NEW.id))
-    say(ADOPTED)
+    archive.add_files(Archive(folder / "elsewhere").files(NEW.id))
+    acknowledge(ADOPTED)
 
 
-def to_take_in(folder: Path) -> None:
+def with_exported_calibration(folder: Path) -> None:
     calibrated(folder)
     Archive(folder / "elsewhere").add(NEW, WHO)
 
 
-def first_calibration(folder: Path, say: Callable[[str], None]) -> None:
-    Archive(folder / "calibrations" / "head").keep(NEW, WHO)
-    say(NEW.id)
+def first_calibration(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    Archive(folder / "calibrations" / "head").add_and_activate(NEW, WHO)
+    acknowledge(NEW.id)
 
 
-def judge_calibration(folder: Path, said: list[str]) -> str:
+def judge_calibration(folder: Path, acknowledged: list[str]) -> str:
     archive = Archive(folder / "calibrations" / "head")
     kept = {archive.load(id).calibration.id for id in archive.ids()}
     try:
         in_force = archive.load().calibration.id
     except CalibrationMissing:
-        assert not said
+        assert not acknowledged
         return "none"
-    if said == [ADOPTED]:
+    if acknowledged == [ADOPTED]:
         assert NEW.id in kept
-    elif said and not (said == [NEW.id] and in_force == OLD.id and OLD.id in kept):
-        assert in_force == said[-1]
+    elif acknowledged and not (acknowledged == [NEW.id] and in_force == OLD.id and OLD.id in kept):
+        assert in_force == acknowledged[-1]
     return "new" if NEW.id in kept else "old"
 
 
 def earlier_shelf(folder: Path) -> None:
-    shelf_of(folder / "data", "r0001")
+    store_of_version(folder / "data", "r0001")
     Release(folder / "data", "r0001").write(1)
 
 
-def migrate(folder: Path, say: Callable[[str], None]) -> None:
-    with Store(folder / "data", reserve_bytes=0):
-        say("open")
+def migrate(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder / "data", reserve_bytes=0):
+        acknowledge("open")
 
 
-def judge_migration(folder: Path, said: list[str]) -> str:
-    """The version before reads it at any moment; every snapshot is whole; this version opens it."""
+def judge_migration(folder: Path, acknowledged: list[str]) -> str:
+    """The earlier release reads the tables at any time; every snapshot is complete; this release opens the store."""
     data = folder / "data"
     snapshots = list(data.glob("snapshots/*.db"))
     for path in snapshots:
@@ -196,9 +199,9 @@ def judge_migration(folder: Path, said: list[str]) -> str:
     (version,) = connection.execute("SELECT version_num FROM alembic_version").fetchone()
     connection.close()
     assert version == "r0001" or snapshots, "changed without a snapshot"
-    assert version != "r0001" or not said
+    assert version != "r0001" or not acknowledged
     assert Release(data, "r0001").read(1)[1][0][0] == "c1"
-    with Store(data, reserve_bytes=0) as store:
+    with CaptureStore(data, reserve_bytes=0) as store:
         assert [one.id for one in store.captures()] == ["c1"]
         assert store.read("c1", "raw.tiff") == RAW
         assert len(list(data.glob("snapshots/*.db"))) == 1
@@ -211,9 +214,9 @@ def half_kept(folder: Path) -> None:
     (folder / "captures" / ".half.part" / "raw.tiff").write_bytes(FILES["raw.tiff"])
 
 
-def judge_swept(folder: Path, said: list[str]) -> str:
+def judge_swept(folder: Path, acknowledged: list[str]) -> str:
     before = {path.name for path in (folder / "torn").iterdir()}
-    with Store(folder, reserve_bytes=0) as store:
+    with CaptureStore(folder, reserve_bytes=0) as store:
         kept = [path.read_bytes() for path in (folder / "torn").glob("half*/raw.tiff")]
         assert kept
         assert set(kept) == {FILES["raw.tiff"]}
@@ -222,8 +225,8 @@ def judge_swept(folder: Path, said: list[str]) -> str:
 
 
 def with_snapshot(folder: Path) -> None:
-    Release(shelf_of(folder / "data", "r0003"), "r0003").write(1)
-    snapshots(folder).make("r0003")
+    Release(store_of_version(folder / "data", "r0003"), "r0003").write(1)
+    snapshots(folder).create("r0003")
     Release(folder / "data", "r0003").write(2)
 
 
@@ -231,48 +234,48 @@ def snapshots(folder: Path) -> Snapshots:
     return Snapshots(folder / "data" / "shelf.sqlite", VirtualClock())
 
 
-def put_back(folder: Path, say: Callable[[str], None]) -> None:
-    snapshots(folder).put_back(snapshots(folder).names()[0])
-    say("back")
+def restore_snapshot(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    snapshots(folder).restore(snapshots(folder).names()[0])
+    acknowledge("back")
 
 
-def judge_put_back(folder: Path, said: list[str]) -> str:
-    """In between it refuses to open, and putting back once more mends it."""
+def judge_restored_snapshot(folder: Path, acknowledged: list[str]) -> str:
+    """In between the store refuses to open, and a second restoration repairs it."""
     outcome = ""
     try:
-        Store(folder / "data").close()
+        CaptureStore(folder / "data").close()
     except StoreDamaged:
-        assert not said
-        put_back(folder, lambda word: None)
+        assert not acknowledged
+        restore_snapshot(folder, lambda word: None)
         outcome = "refused"
-    with Store(folder / "data") as store:
+    with CaptureStore(folder / "data") as store:
         listed = [one.id for one in store.captures()]
-    assert listed == ["c1"] or (listed == ["c2", "c1"] and not said)
+    assert listed == ["c1"] or (listed == ["c2", "c1"] and not acknowledged)
     return outcome or ("new" if listed == ["c1"] else "old")
 
 
-# Programs that do not wait for the disk: if these were not found out, nothing above would mean anything.
+# Negative controls: programs without fsync, whose losses the simulation must detect.
 
 
 def with_note(folder: Path) -> None:
     (folder / "note").write_bytes(b"old")
 
 
-def does_not_wait(folder: Path, say: Callable[[str], None]) -> None:
+def does_not_wait(folder: Path, acknowledge: Callable[[str], None]) -> None:
     (folder / "part").write_bytes(b"new")
     (folder / "part").rename(folder / "note")
-    say("new")
+    acknowledge("new")
 
 
-def waits_for_the_file_alone(folder: Path, say: Callable[[str], None]) -> None:
-    write_synced(folder / "part", b"new")
+def waits_for_the_file_alone(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    atomic_io.write_file(folder / "part", b"new")
     (folder / "part").rename(folder / "note")
-    say("new")
+    acknowledge("new")
 
 
-def judge_note(folder: Path, said: list[str]) -> str:
+def judge_note(folder: Path, acknowledged: list[str]) -> str:
     note = (folder / "note").read_bytes().decode()
-    return "lost" if said and note != "new" else note or "empty"
+    return "lost" if acknowledged and note != "new" else note or "empty"
 
 
 def with_loose_tables(folder: Path) -> None:
@@ -281,30 +284,30 @@ def with_loose_tables(folder: Path) -> None:
         tables.execute("INSERT INTO notes VALUES (zeroblob(60000))")
 
 
-def trusts_the_disk(folder: Path, say: Callable[[str], None]) -> None:
+def trusts_the_disk(folder: Path, acknowledge: Callable[[str], None]) -> None:
     with closing(sqlite3.connect(folder / "loose.sqlite", isolation_level=None)) as tables:
         tables.execute("PRAGMA synchronous = OFF")
         tables.execute("INSERT INTO notes SELECT randomblob(60000)")
-        say("new")
+        acknowledge("new")
 
 
-def judge_loose(folder: Path, said: list[str]) -> str:
+def judge_loose(folder: Path, acknowledged: list[str]) -> str:
     with closing(sqlite3.connect(folder / "loose.sqlite")) as tables:
         try:
             number = len(tables.execute("SELECT hex(note) FROM notes").fetchall())
             whole = tables.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         except sqlite3.DatabaseError:
             return "damaged"
-    return "damaged" if not whole else "lost" if said and number < 2 else "new" if number == 2 else "old"
+    return "damaged" if not whole else "lost" if acknowledged and number < 2 else "new" if number == 2 else "old"
 
 
 def nothing(folder: Path) -> None:
     pass
 
 
-def opened(folder: Path, say: Callable[[str], None]) -> None:
-    with Store(folder, reserve_bytes=0):
-        say("open")
+def opened(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder, reserve_bytes=0):
+        acknowledge("open")
 
 
 OLD_NEW = frozenset({"old", "new"})
@@ -312,14 +315,16 @@ CASES = {
     "a capture is kept": Case(shelf_with_one, keep, judge_kept_beside, frozenset({"old", "torn", "new"})),
     "the first capture of a new device": Case(nothing, keep, judge_kept, frozenset({"old", "torn", "new"})),
     "answers of a visit": Case(shelf_with_one, answer, judge_answers, OLD_NEW),
-    "the book of light": Case(shelf_with_one, shine, judge_light, OLD_NEW),
+    "the book of light": Case(shelf_with_one, reserve_dose, judge_light, OLD_NEW),
     "a calibration is kept and taken back": Case(calibrated, recalibrate, judge_calibration, OLD_NEW),
-    "a calibration is taken in": Case(to_take_in, take_in, judge_calibration, OLD_NEW),
+    "a calibration is taken in": Case(with_exported_calibration, import_calibration, judge_calibration, OLD_NEW),
     "the first calibration": Case(nothing, first_calibration, judge_calibration, frozenset({"none", "new"})),
     "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB"), ("chooser",)),
     "tables are brought forward": Case(earlier_shelf, migrate, judge_migration, OLD_NEW),
     "a torn capture is moved aside": Case(half_kept, opened, judge_swept, OLD_NEW),
-    "a snapshot is put back": Case(with_snapshot, put_back, judge_put_back, frozenset({"old", "refused", "new"})),
+    "a snapshot is put back": Case(
+        with_snapshot, restore_snapshot, judge_restored_snapshot, frozenset({"old", "refused", "new"})
+    ),
     "a visit goes onto a FAT stick": Case(
         with_stick, export, judge_export, frozenset({"old", "empty", "new"}), ("stick",)
     ),
@@ -342,6 +347,6 @@ def folder_of(name: str, folder: Path) -> Path:
 
 if __name__ == "__main__":
     for name, case in CASES.items():
-        print(f"<{name}>", flush=True)  # noqa: T201  # read by whoever traces it
-        case.act(folder_of(name, Path(sys.argv[1])), lambda word: print(word, flush=True))  # noqa: T201  # read by whoever traces it
-    print("<end>", flush=True)  # noqa: T201  # read by whoever traces it
+        print(f"<{name}>", flush=True)  # noqa: T201  # read by the tracing process
+        case.act(folder_of(name, Path(sys.argv[1])), lambda word: print(word, flush=True))  # noqa: T201  # read by the tracing process
+    print("<end>", flush=True)  # noqa: T201  # read by the tracing process

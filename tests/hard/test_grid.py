@@ -1,4 +1,4 @@
-"""A reduced grid of hard cases through the ladder as shipped; and the judge, which must find each kind of violation.
+"""Reduced grid of hard cases through the default schedule, and the rules that must detect each kind of violation.
 
 The whole grid is `make test-hard`.
 """
@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.instrument.hard_cases.cases import CASES, CLEAN, NAMED
-from services.instrument.hard_cases.cells import LADDER, Cell, Grid
-from services.instrument.hard_cases.frames import Eye
-from services.instrument.hard_cases.grid import run
-from services.instrument.hard_cases.judgement import KINDS, covered, kind, violations
-from services.instrument.once import reconstruct_file
+from services.lab.hard_cases.cases import CASES, CLEAN, NAMED
+from services.lab.hard_cases.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
+from services.lab.hard_cases.frames import Eye
+from services.lab.hard_cases.grid import run
+from services.lab.hard_cases.judgement import KINDS, covered, kind, violations
+from services.lab.reconstruct_file import reconstruct_file
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
 REDUCED = (
@@ -25,27 +25,27 @@ REDUCED = (
 
 
 @pytest.fixture(scope="module")
-def grid(tmp_path_factory: pytest.TempPathFactory) -> Grid:
-    return Grid(EYE, tmp_path_factory.mktemp("grid"), (LADDER,))
+def grid(tmp_path_factory: pytest.TempPathFactory) -> CaseRunner:
+    return CaseRunner(EYE, tmp_path_factory.mktemp("grid"), (DEFAULT_SCHEDULE,))
 
 
 @pytest.fixture(scope="module")
-def clean(grid: Grid) -> list[Cell]:
+def clean(grid: CaseRunner) -> list[Cell]:
     return grid.cells(CLEAN)
 
 
 @pytest.mark.parametrize("key", REDUCED)
-def test_a_hard_case_is_held_or_reported(
-    key: str, grid: Grid, clean: list[Cell], record_property: Callable[[str, object], None]
+def test_a_hard_case_keeps_its_bound_or_is_reported(
+    key: str, grid: CaseRunner, clean: list[Cell], record_property: Callable[[str, object], None]
 ) -> None:
     cells = clean + grid.cells(NAMED[key])
     record_property("lost", str(cells[-1].lost))
     assert not [f"{one.rule}: {one.words}" for one in violations(cells) if one.rule != "coverage"]
 
 
-def test_the_clean_frame_is_as_good_as_the_command_makes_it(grid: Grid, clean: list[Cell]) -> None:
-    """The grid keeps planned solvers; the command plans each time: both give the same picture and words."""
-    order, _ = grid.files(EYE.clean, LADDER)
+def test_the_grid_and_the_command_give_the_same_picture(grid: CaseRunner, clean: list[Cell]) -> None:
+    """The grid keeps planned solvers, the command plans each time: both give the same picture and warnings."""
+    order, _ = grid.files(EYE.clean, DEFAULT_SCHEDULE)
     made = reconstruct_file(order)
     assert clean[0].pcc == pytest.approx(_pcc(np.load(order.output)), abs=1e-4)
     assert made.report.warnings == clean[0].warnings
@@ -53,11 +53,13 @@ def test_the_clean_frame_is_as_good_as_the_command_makes_it(grid: Grid, clean: l
 
 
 def _pcc(picture: np.ndarray) -> float:
-    take = EYE.clean.take
-    return take.likeness(take.sampled(picture))
+    take = EYE.clean.simulated
+    return take.pcc(take.sampled(picture))
 
 
-GOOD = Cell("eye", CLEAN.key, LADDER, 0.95, 0.0, "", (), -1.0, 0.1, -1.0, {"coverage": 0.9, "resolution_um": 150.0})
+GOOD = Cell(
+    "eye", CLEAN.key, DEFAULT_SCHEDULE, 0.95, 0.0, "", (), -1.0, 0.1, -1.0, {"coverage": 0.9, "resolution_um": 150.0}
+)
 OTHER = replace(GOOD, case="motion 0.5 deg")
 
 
@@ -75,27 +77,27 @@ OTHER = replace(GOOD, case="motion 0.5 deg")
         ("coverage", replace(OTHER, sphere_dpt=-1.25)),
     ],
 )
-def test_the_judge_finds_each_violation(rule: str, cell: Cell) -> None:
+def test_each_kind_of_violation_is_detected(rule: str, cell: Cell) -> None:
     assert not violations([GOOD, OTHER])
     assert rule in [one.rule for one in violations([GOOD, cell])]
 
 
-def test_a_refusal_and_an_explained_loss_are_no_violations() -> None:
+def test_a_refusal_and_a_reported_loss_are_no_violations() -> None:
     refused = replace(OTHER, pcc=None, lost=None, refused="Too bright", sphere_dpt=None, sd_dpt=None)
     explained = replace(OTHER, lost=0.2, quality={})
     assert not violations([GOOD, refused, explained])
     assert covered([GOOD, refused, explained]) == (1.0, 2)
 
 
-def test_every_case_says_what_it_is_with_kinds_that_exist() -> None:
+def test_every_case_has_known_kinds_of_warnings() -> None:
     kinds = {name for name, _ in KINDS}
     assert len(NAMED) == len(CASES)
     assert all(case.true <= kinds for case in CASES)
     assert kind("The refraction of +1.0 dpt (sd 0.9) is uncertain.") == "refraction"
 
 
-@pytest.mark.parametrize(("keys", "columns"), [(("no such case",), (LADDER,)), ((), ("no such method",))])
-def test_what_does_not_exist_is_refused_with_what_does(keys: tuple[str, ...], columns: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("keys", "columns"), [(("no such case",), (DEFAULT_SCHEDULE,)), ((), ("no such method",))])
+def test_unknown_cases_and_methods_are_refused(keys: tuple[str, ...], columns: tuple[str, ...]) -> None:
     from device.errors import SettingError
 
     with pytest.raises(SettingError, match="no such"):

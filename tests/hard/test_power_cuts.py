@@ -1,4 +1,4 @@
-"""The power goes after any call of a program, and the disk forgets what was not synced: old or new, and whole."""
+"""Power cuts after any system call, with loss of unsynced data: the result is the old or the new state, complete."""
 
 import random
 import shutil
@@ -11,16 +11,16 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from tests.hard.power import Disk, noted, written
+from tests.hard.power import Disk, record_calls, write_tree
 from tests.hard.power_cases import CASES, folder_of
-from tests.house import ROOT
+from tests.project_files import ROOT
 
 MEMORY = Path("/dev/shm")
 
 
 @dataclass(frozen=True)
 class Recording:
-    """All cases, done once: the folder of each as it was before, and every call that was made."""
+    """All cases, run once: the folder of each before the run, and every system call."""
 
     folder: Path
     calls: list[str]
@@ -35,36 +35,36 @@ def recording() -> Iterator[Recording]:
             case.prepare(folder_of(name, folder))
         shutil.copytree(folder, folder / "before")
         words = [sys.executable, "-m", "tests.hard.power_cases", str(folder)]
-        yield Recording(folder, noted(words, folder, ROOT))
+        yield Recording(folder, record_calls(words, folder, ROOT))
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_power_cut_at_any_moment_leaves_the_old_or_the_new_one_whole(name: str, recording: Recording) -> None:
-    case, draw, folder = CASES[name], random.Random(name), folder_of(name, recording.folder)
+def test_a_power_cut_at_any_call_leaves_the_old_or_the_new_state_complete(name: str, recording: Recording) -> None:
+    case, random_source, folder = CASES[name], random.Random(name), folder_of(name, recording.folder)
     disk = Disk(folder, folder_of(name, recording.folder / "before"), case.fat)
     disks, contents, outcomes = set[int](), set[int](), set[str]()
     for call in ["", *recording.calls]:
         if call and not disk.follow(call):
             continue
-        said = [word for word in disk.said.partition(f"<{name}>\n")[2].partition("<")[0].split("\n") if word]
-        for left in disk.cuts(draw):
-            if (one := hash((tuple(left.items()), len(said)))) in disks:
+        acknowledged = [word for word in disk.output.partition(f"<{name}>\n")[2].partition("<")[0].split("\n") if word]
+        for left in disk.cuts(random_source):
+            if (one := hash((tuple(left.items()), len(acknowledged)))) in disks:
                 continue
             disks.add(one)
             with TemporaryDirectory(dir=recording.folder) as place:
-                found = (content(written(left, Path(place) / "looked-at")), len(said))
+                found = (content(write_tree(left, Path(place) / "looked-at")), len(acknowledged))
                 if hash(found) not in contents:
-                    outcomes.add(case.judge(written(left, Path(place) / "left"), said))
+                    outcomes.add(case.judge(write_tree(left, Path(place) / "left"), acknowledged))
                     contents.add(hash(found))
-    print(f"{name}: {len(disks)} disks, {len(contents)} contents")  # noqa: T201  # the figures that README quotes
+    print(f"{name}: {len(disks)} disks, {len(contents)} contents")  # noqa: T201  # figures of the README
     assert outcomes == case.outcomes
     real = {str(path.relative_to(folder)): path.is_file() and path.read_bytes() for path in folder.rglob("*")}
     seen = {path.lstrip("/"): left is not None and left for path, left in disk.as_seen().items() if path}
-    assert seen == real  # the disk in memory followed the real one, byte by byte
+    assert seen == real  # the simulated disk equals the real one, byte by byte
 
 
 def content(folder: Path) -> tuple[object, ...]:
-    """What is in a folder, and in its tables after SQLite has recovered them: the same rows may lie in other pages."""
+    """Return the files of a folder and the rows of its databases after recovery, for comparison across page layouts."""
     rows: list[object] = []
     for path in sorted(folder.rglob("shelf.sqlite")):
         connection = sqlite3.connect(path)

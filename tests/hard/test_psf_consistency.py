@@ -1,4 +1,4 @@
-"""PSF consistency: no warning for the right PSF of a hard frame, one for each wrong PSF, with the right remedy."""
+"""PSF consistency check: no warning for the right PSF of a hard frame, the right warning for each wrong PSF."""
 
 from functools import cache
 from pathlib import Path
@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from device.recon.psf_consistency import Consistency, Match, PsfConsistency
-from device.recon.quality import MISMATCHES
-from device.sim.staged import Staged, staged
-from device.spec import load_head
+from device.config.head_file import load_head
+from device.recon.assessment.image_quality import MISMATCHES
+from device.recon.assessment.psf_consistency import Consistency, Match, PsfConsistency
+from device.sim.scene_files import SimulatedExposure, simulate_exposure
 from device.values import Calibration, Counts, Image, Psf
-from services.instrument.once import Order, reconstruct_file
+from services.lab.reconstruct_file import reconstruct_file
+from services.lab.reconstruct_inputs import ReconstructOptions
 from tests import scenes
-from tests.simulated import coarse, having
+from tests.simulated import coarse, with_keys
 from tests.wrong_psfs import orientations, shuffled
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
@@ -21,12 +22,12 @@ SPEC = coarse(load_head(HEAD), 2)
 
 
 @cache
-def shot(m_dpt: float = 0.0, light: float = 1.0, seed: int = 1) -> Staged:
+def shot(m_dpt: float = 0.0, light: float = 1.0, seed: int = 1) -> SimulatedExposure:
     assert SPEC.sim is not None
-    return staged(having(SPEC, eye={"m_dpt": m_dpt}, peak_e=SPEC.sim.peak_e * light, seed=seed))
+    return simulate_exposure(with_keys(SPEC, eye={"m_dpt": m_dpt}, peak_e=SPEC.sim.peak_e * light, seed=seed))
 
 
-def asked(counts: Counts, psf: Image | None = None, calibration: Calibration | None = None) -> Consistency:
+def checked(counts: Counts, psf: Image | None = None, calibration: Calibration | None = None) -> Consistency:
     known = calibration or shot().calibration
     psfs = (known.psfs[0] if psf is None else Psf(psf),)
     of = Calibration(psfs, known.sensor, bad=known.bad)
@@ -37,54 +38,54 @@ def asked(counts: Counts, psf: Image | None = None, calibration: Calibration | N
 
 @pytest.mark.parametrize("m_dpt", [-8.0, -3.0, 0.0, 3.0, 8.0])
 def test_an_eye_of_any_refraction_is_consistent_with_the_stored_psf(m_dpt: float) -> None:
-    found = asked(shot(m_dpt).counts)
+    found = checked(shot(m_dpt).counts)
     assert found.match is Match.CONSISTENT
     assert found.orientation > 8
 
 
-def test_dim_light_and_gaps_are_no_mismatch() -> None:
+def test_dim_light_and_gaps_give_no_mismatch() -> None:
     counts, rng = shot().counts, np.random.default_rng(3)
     dead, warm, glare = counts.copy(), counts.copy(), counts.copy()
     dead[:, rng.choice(counts.shape[1], 12, replace=False)] = 0
     warm[rng.random(counts.shape) < 1e-3] += 1500
     glare[240:270, 430:460] = int(shot().calibration.sensor.white_dn)
     for frame in (shot(light=1 / 30).counts, dead, warm, glare):
-        assert asked(frame).match in (Match.CONSISTENT, Match.UNKNOWN)
+        assert checked(frame).match in (Match.CONSISTENT, Match.UNKNOWN)
 
 
-def test_wrong_psfs_are_told_apart() -> None:
+def test_wrong_psfs_are_distinguished() -> None:
     counts, right = shot().counts, shot().calibration.psfs[0].pixels
-    found = {kind: asked(counts, psf).match for kind, psf in orientations(right).items()}
+    found = {kind: checked(counts, psf).match for kind, psf in orientations(right).items()}
     assert found == {
         "mirrored left-right": Match.MIRRORED_LEFT_RIGHT, "mirrored up-down": Match.MIRRORED_UP_DOWN,
         "rotated by 180": Match.ROTATED,
     }  # fmt: skip
-    assert asked(counts, shuffled(right)).match is Match.FOREIGN
+    assert checked(counts, shuffled(right)).match is Match.FOREIGN
     another = scenes.speckle(counts.shape[:2], 5)
-    assert asked(counts, another).match is Match.FOREIGN
-    assert asked(counts, shot(seed=77).calibration.psfs[0].pixels).match is Match.FOREIGN
+    assert checked(counts, another).match is Match.FOREIGN
+    assert checked(counts, shot(seed=77).calibration.psfs[0].pixels).match is Match.FOREIGN
 
 
-def test_where_nothing_can_be_known_nothing_is_said() -> None:
+def test_frames_without_information_give_no_result() -> None:
     noise = np.random.default_rng(0).poisson(600, shot().counts.shape).astype(np.uint16)
     for frame in (noise, np.full_like(noise, 600), np.zeros_like(noise)):
         known = shot().calibration
         found = PsfConsistency(Calibration(known.psfs, known.sensor), frame.shape)(frame)
         assert found is None or found.match is Match.UNKNOWN
-    even = Calibration((Psf(scenes.delta(noise.shape)),), shot().calibration.sensor)  # equals its own rotation
+    even = Calibration((Psf(scenes.delta(noise.shape)),), shot().calibration.sensor)  # a point equals its own rotation
     assert PsfConsistency(even, noise.shape)(shot().counts) is None
 
 
-def test_the_command_tells_a_rotated_psf_from_the_right_one(tmp_path: Path) -> None:
+def test_the_command_warns_of_a_rotated_and_a_mirrored_psf(tmp_path: Path) -> None:
     right = shot().calibration.psfs[0].pixels
     np.save(tmp_path / "raw.npy", shot().counts)
-    said = {}
+    warnings = {}
     for name, psf in {"right": right, "rotated": right[::-1, ::-1], "mirrored": right[:, ::-1]}.items():
         np.save(tmp_path / f"{name}.npy", psf)
-        order = Order(
+        order = ReconstructOptions(
             tmp_path / "raw.npy", (tmp_path / f"{name}.npy",), tmp_path / "out.npy",
             "gradient", None, None, None, None, None, False, tmp_path,
         )  # fmt: skip
-        said[name] = tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)
+        warnings[name] = tuple(words for words in reconstruct_file(order).report.warnings if "PSF" in words)
     mirrored = (MISMATCHES[Match.MIRRORED_LEFT_RIGHT],)
-    assert said == {"right": (), "rotated": (MISMATCHES[Match.ROTATED],), "mirrored": mirrored}
+    assert warnings == {"right": (), "rotated": (MISMATCHES[Match.ROTATED],), "mirrored": mirrored}

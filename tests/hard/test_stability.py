@@ -1,11 +1,11 @@
-"""Small change in, small change out: the gain of the default ladder, |change of picture| over |change of frame|.
+"""Stability of the default schedule: the gain |change of the picture| / |change of the frame|.
 
-What is proven: the closed form's gain is at most 1 / (2 sqrt mu) (optics.md 5.4, 1), for every frame and every change.
-The search that is used here finds that gain to a tenth. What is only measured: the ladder's parameters (noise, prior,
-shading, the eye's refraction) follow the frame, and twelve ADMM rounds of a total variation have no known constant in
-this norm (each of their proximal steps expands nothing in the norm of the splitting; the data step's inverse does). So
-the limits here are three times what was seen (22 to 35, 45, 15, and .0024), and a change that was never tried may do
-more. All norms are over the sensor's pixels, in DN.
+Proven: the gain of the closed form is at most 1 / (2 sqrt mu) (NUMERICS.md 3.5, item 1), for every frame and every
+change. The search of this module finds that gain to a tenth. Measured only: the parameters of the default schedule
+(noise, prior, shading, refraction) depend on the frame, and twelve ADMM rounds of a total variation have no known
+constant in this norm (each of their proximal steps is nonexpansive in the norm of the splitting; the inverse of the
+data step is not). The limits are therefore three times the measured gains (22 to 35, 45, 15, and .0024), and an
+untested change may have a larger one. All norms are over the sensor's pixels, in DN.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ import pytest
 from device.clock import VirtualClock
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.values import Image
-from services.instrument.hard_cases.defects import blob
-from services.instrument.hard_cases.frames import Eye
+from services.lab.hard_cases.defects import blob
+from services.lab.hard_cases.frames import Eye
 from tests import scenes
 
 EYE = Eye("relaxed eye, merged", "sim", {"sim.seed": 1}, merged=4)
@@ -33,18 +33,18 @@ def frame() -> Image:
 
 
 @pytest.fixture(scope="module")
-def ladder() -> Reconstructor:
-    return Reconstructor(EYE.clean.take.calibration, EYE.clean.take.shape, scenes.PLANNER, VirtualClock())
+def reconstructor() -> Reconstructor:
+    return Reconstructor(EYE.clean.simulated.calibration, EYE.clean.simulated.shape, scenes.PLANNER, VirtualClock())
 
 
 @pytest.fixture(scope="module")
-def solve(ladder: Reconstructor) -> Solve:
-    return lambda y: ladder(y).picture.astype(np.float64)
+def solve(reconstructor: Reconstructor) -> Solve:
+    return lambda y: reconstructor(y).picture.astype(np.float64)
 
 
 @pytest.fixture(scope="module")
 def noise_dn(frame: Image) -> Image:
-    """The standard deviation of each pixel's shot noise."""
+    """Return the standard deviation of the shot noise of each pixel."""
     camera = EYE.spec.camera
     return np.sqrt(np.maximum(frame - camera.black_dn, 1) / camera.gain_e_per_dn)
 
@@ -54,15 +54,18 @@ def gain(solve: Solve, y: Image, change: Image) -> float:
 
 
 def worst_direction(solve: Solve, y: Image, size: float, rounds: int = 6) -> Image:
-    """Power iteration with finite differences: J is nearly a convolution, so its adjoint is J between two flips."""
+    """Return the change of norm `size` with the largest gain, by power iteration with finite differences.
+
+    J is nearly a convolution, so its adjoint is J between two flips.
+    """
     here = solve(y)
 
-    def pushed(direction: Image) -> Image:
+    def change_of_picture(direction: Image) -> Image:
         return solve((y + size / np.linalg.norm(direction) * direction).astype(np.float32)) - here
 
     direction = np.random.default_rng(5).standard_normal(y.shape)
     for _ in range(rounds):
-        direction = pushed(pushed(direction)[::-1, ::-1])[::-1, ::-1]
+        direction = change_of_picture(change_of_picture(direction)[::-1, ::-1])[::-1, ::-1]
     return (size / np.linalg.norm(direction) * direction).astype(np.float32)
 
 
@@ -95,11 +98,11 @@ def test_one_pixel(more_dn: float, solve: Solve, frame: Image, within: Within) -
 
 @pytest.mark.parametrize("radius_px", [0, 1, 4, 9, 15])
 def test_a_gap_that_grows_by_one_pixel(radius_px: int, solve: Solve, frame: Image, within: Within) -> None:
-    """The change of the picture, as a share of it: no radius is a cliff."""
+    """The change of the picture as a share of it is small for every radius."""
 
     def with_gap(radius: float) -> Image:
         y = frame.copy()
-        y[blob(EYE.clean.take.shape, radius / frame.shape[0])] = np.nan
+        y[blob(EYE.clean.simulated.shape, radius / frame.shape[0])] = np.nan
         return y
 
     before, after = solve(with_gap(radius_px)), solve(with_gap(radius_px + 1))
@@ -107,19 +110,19 @@ def test_a_gap_that_grows_by_one_pixel(radius_px: int, solve: Solve, frame: Imag
 
 
 @pytest.mark.parametrize("share", [0.03, 1.0])
-def test_the_papers_form_keeps_its_bound_in_its_worst_direction(
+def test_tikhonov_keeps_its_bound_in_its_worst_direction(
     share: float, frame: Image, noise_dn: Image, within: Within
 ) -> None:
-    """Periodic and unfaded, as the theorem has it; mu fixed, because cross-validation follows the frame."""
-    from device.recon.closed import TIKHONOV, ClosedForm
+    """Periodic and without a taper, as in the theorem; mu is fixed, because cross-validation depends on the frame."""
+    from device.recon.solvers.wiener import TIKHONOV, ClosedForm
 
     mu = 1e-4
-    calibration = replace(EYE.clean.take.calibration, field_deg=None)
+    calibration = replace(EYE.clean.simulated.calibration, field_deg=None)
     make = Reconstructor(
-        calibration, EYE.clean.take.shape, scenes.PLANNER, VirtualClock(), (Recipe("tikhonov", 1),), refract=False
+        calibration, EYE.clean.simulated.shape, scenes.PLANNER, VirtualClock(), (Recipe("tikhonov", 1),), refract=False
     )
-    make.rungs[0].model.fade = None
-    make.rungs[0].solver = ClosedForm(make.rungs[0].model, TIKHONOV, mu)
+    make.stages[0].model.fade = None
+    make.stages[0].solver = ClosedForm(make.stages[0].model, TIKHONOV, mu)
 
     def solved(y: Image) -> Image:
         return make(y).picture.astype(np.float64)
@@ -127,4 +130,4 @@ def test_the_papers_form_keeps_its_bound_in_its_worst_direction(
     size = share * float(np.linalg.norm(noise_dn))
     seen = gain(solved, frame, worst_direction(solved, frame, size)) * 2 * np.sqrt(mu)
     within(seen, 1 + 1e-3)
-    assert seen > 0.9  # the search finds the worst direction where the answer is known
+    assert seen > 0.9  # the search finds the known worst direction

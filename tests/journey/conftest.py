@@ -1,4 +1,4 @@
-"""A small simulated instrument, built from its real parts by constructor arguments, and ways to talk to it."""
+"""Fixtures: a small simulated instrument built by constructor arguments, an HTTP client and the command."""
 
 import asyncio
 import json
@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -21,110 +21,93 @@ from fastapi import FastAPI
 
 from device.calibration.archive import Archive
 from device.clock import VirtualClock
-from device.guard import GuardedLight
+from device.config.head_file import InstrumentSpec, load_head
 from device.head import Head, hazard_of, open_bench
+from device.light_safety.guard import GuardedLight
 from device.ports import Camera
-from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
-from device.sim.render import fitted
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.spec import InstrumentSpec, load_head
 from device.values import Calibration, Colour, Psf
-from services.instrument.api import create_app
-from services.instrument.bulletin import Bulletin
-from services.instrument.carrier import Carrier
-from services.instrument.exam import Exam
-from services.instrument.exporting import Sticks
-from services.instrument.owner import House, Owner
-from services.instrument.technician import Door
+from services.delivery.uploader import Uploader
+from services.delivery.usb_drives import UsbDrives
+from services.http.app import Application, create_app
+from services.http.authentication import PinAuthenticator
+from services.instrument.events import EventBus
+from services.instrument.exam import ExamService
+from services.instrument.head_arbiter import AppContext, HeadArbiter
 from services.instrument.watchdog import Watchdog
-from services.records.light_book import LightBook
-from services.records.store import Store
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.protocol import Protocol
+from tests.simulated import small_head_toml
 
 ROOT = Path(__file__).parents[2]
 DAY_S = 86400.0
 COMMAND = str(Path(sys.executable).parent / "diffuscope")
-SMALL_HEAD = """\
-name = "Small simulated head"
-
-[camera]
-backend = "sim"
-rows = 270
-cols = 480
-pitch_um = 20.16
-full_well_e = 23000
-read_noise_e = 1.03
-
-[light]
-backend = "sim"
-
-[optics]
-iris_um = 3200
-diffuser_to_sensor_um = 6000
-angular_magnification = 0.75
-field_deg = 33.4
-
-[sim]
-
-[sim.object]
-haemorrhages = 3
-"""
+SMALL_HEAD = small_head_toml("Small simulated head")
 
 
 class GateClock(VirtualClock):
-    """Virtual time that passes only while its gate is open: what sleeps hangs until then."""
+    """Virtual clock whose `sleep` blocks while the gate is closed."""
 
     def __init__(self) -> None:
         super().__init__()
         self.gate = Event()
         self.gate.set()
-        self.someone_sleeps = Event()
+        self.is_sleeping = Event()
 
     def sleep(self, duration_s: float) -> None:
-        self.someone_sleeps.set()
+        self.is_sleeping.set()
         assert self.gate.wait(30)
         super().sleep(duration_s)
 
 
 @dataclass
 class Rig:
-    """An instrument with everything a test may want to look at."""
+    """Simulated instrument with references to its parts."""
 
     world: World
     clock: GateClock
-    store: Store
-    bulletin: Bulletin
-    exam: Exam
-    owner: Owner
-    door: Door
-    app: FastAPI
+    store: CaptureStore
+    event_bus: EventBus
+    exam: ExamService
+    arbiter: HeadArbiter
+    authenticator: PinAuthenticator
+    application: Application
     died: Event = field(default_factory=Event)
 
-    def told(self) -> list[tuple[str, dict[str, Any]]]:
-        """Every event so far."""
-        return [(event.kind, event.data) for event in self.bulletin._events]
+    @property
+    def app(self) -> FastAPI:
+        """The ASGI application."""
+        return self.application.http
 
-    def hang(self) -> None:
-        """From now on every exposure hangs until the gate is opened."""
+    def published_events(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Return kind and data of every event in the buffer."""
+        return [(event.kind, event.data) for event in self.event_bus.history]
+
+    def block_exposures(self) -> None:
+        """Block every following exposure until the gate is opened."""
         self.clock.gate.clear()
-        self.clock.someone_sleeps.clear()
+        self.clock.is_sleeping.clear()
 
-    def wait_for_hanging(self) -> None:
-        assert self.clock.someone_sleeps.wait(10)
+    def wait_for_blocked_exposure(self) -> None:
+        assert self.clock.is_sleeping.wait(10)
 
-    def ask(self, story: Callable[[httpx.AsyncClient], Coroutine[Any, Any, Any]], **options: Any) -> Any:
-        """Run a story told by a client of the application in this process."""
+    def ask(self, use_client: Callable[[httpx.AsyncClient], Coroutine[Any, Any, Any]], **options: Any) -> Any:
+        """Run a coroutine with an HTTP client of the application in this process; return its result."""
 
-        async def told() -> Any:
+        async def run() -> Any:
             transport = httpx.ASGITransport(app=self.app, **options)
-            own = {"Sec-Fetch-Site": "same-origin"}  # as a browser says of the instrument's own page
+            own = {"Sec-Fetch-Site": "same-origin"}  # header of a same-origin page
             async with httpx.AsyncClient(
                 transport=transport, base_url="http://eye.local", timeout=30, headers=own
             ) as client:
-                return await story(client)
+                return await use_client(client)
 
-        return asyncio.run(told())
+        return asyncio.run(run())
 
     def request(self, method: str, path: str, **options: Any) -> httpx.Response:
         answer: httpx.Response = self.ask(lambda client: client.request(method, path, **options))
@@ -154,13 +137,13 @@ def template(spec: InstrumentSpec) -> tuple[World, Calibration]:
 
 
 def coarsened(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """The small head, half as fine again."""
+    """Return the traced world and calibration of the small head with binned pixels (2 x 2)."""
     coarse = {"rows": 135, "cols": 240, "pitch_um": 2 * spec.camera.pitch_um}
-    return traced(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}))
+    return traced_world(spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)}))
 
 
-def traced(spec: InstrumentSpec) -> tuple[World, Calibration]:
-    """A world whose light is already traced, and its calibration: the same for every test."""
+def traced_world(spec: InstrumentSpec) -> tuple[World, Calibration]:
+    """Return a world with precomputed illumination, and its calibration; shared by all tests."""
     world = World(spec, VirtualClock())
     for colour in (spec.light.colour, spec.light.preview_colour):
         world.electrons_per_s(colour)
@@ -172,53 +155,60 @@ MakeRig = Callable[..., Rig]
 
 @pytest.fixture(scope="session")
 def build(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
-    return builder(template, plans)
+    return rig_builder(template, plans)
 
 
-def builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
-    """Build an instrument: `camera` wraps the simulated one, `max_on_s` is the guard's, `head` changes it."""
+def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..., Rig]:
+    """Return a factory of rigs: `camera` wraps the camera, `head` changes the head, `max_on_s` limits the lamp."""
     dark_world, calibration = template
 
-    def built(
+    def build_rig(
         folder: Path,
         undo: ExitStack,
         camera: Callable[[Camera], Camera] = lambda camera: camera,
         max_on_s: float = 30.0,
         store: dict[str, Any] | None = None,
-        bulletin: Bulletin | None = None,
+        event_bus: EventBus | None = None,
         wait: bool = True,
         psfs: int = 1,
         tinted: tuple[Colour, ...] = (),
         watchdog: str | None = None,
         head: Callable[[Head], Head] = lambda head: head,
         clock: GateClock | None = None,
-        carrier: Carrier | None = None,
-        sticks: Sticks | None = None,
+        carrier: Uploader | None = None,
+        sticks: UsbDrives | None = None,
+        protocol: Protocol | None = None,
     ) -> Rig:
         clock, died = clock or GateClock(), Event()
         scene = copy(dark_world)
         scene.clock, scene.faults = clock, set()
-        shelf = undo.enter_context(Store(folder / "shelf", **{"reserve_bytes": 0, **(store or {})}))
+        records = undo.enter_context(CaptureStore(folder / "store", **{"reserve_bytes": 0, **(store or {})}))
         light = GuardedLight(
-            SimLight(scene), clock, max_on_s, hazard_of(scene.spec), LightBook(shelf.engine, clock, DAY_S, boot="once")
+            SimLight(scene),
+            clock,
+            max_on_s,
+            hazard_of(scene.spec),
+            DoseLedgerStore(records.engine, clock, DAY_S, boot="once"),
         )
         stack = replace(calibration, psfs=calibration.psfs * psfs)
         if tinted:
-            own = tuple(Psf(fitted(scene.psf(colour), scene.shape), colour, colour) for colour in tinted)
+            own = tuple(Psf(crop_or_pad(scene.psf(colour), scene.shape), colour, colour) for colour in tinted)
             stack = replace(calibration, psfs=own)
-        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack, facing=scene.meet))
-        bulletin = bulletin or Bulletin()
-        exam = Exam(opened, shelf, bulletin, clock, plans, died.set, Watchdog(watchdog))
+        opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack, present_eye=scene.present_eye))
+        event_bus = event_bus or EventBus()
+        exam = ExamService(opened, records, event_bus, clock, plans, died.set, Watchdog(watchdog))
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)
-        house = House(scene.spec, Archive(folder / "archive"), shelf, bulletin, clock, Watchdog(watchdog), died.set)
-        owner = Owner(house, lambda: exam, lambda: open_bench(scene.spec, clock))
-        door = Door(folder / "technician.json", clock)
-        app = create_app(owner, door, carrier=carrier, sticks=sticks)
-        return Rig(scene, clock, shelf, bulletin, exam, owner, door, app, died)
+        context = AppContext(
+            opened.spec, Archive(folder / "archive"), records, event_bus, clock, Watchdog(watchdog), died.set
+        )
+        owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
+        door = PinAuthenticator(folder / "technician.json", clock)
+        app = create_app(owner, door, protocol, uploader=carrier, usb_drives=sticks)
+        return Rig(scene, clock, records, event_bus, exam, owner, door, app, died)
 
-    return built
+    return build_rig
 
 
 @pytest.fixture
@@ -240,19 +230,19 @@ def lasting_rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture
 def old_rig(lasting_rig: Rig) -> Iterator[Rig]:
-    """An instrument that has been used before: planning a new one takes a second. It is well and dark afterwards."""
+    """A rig shared by a module, because planning takes a second; afterwards it has no fault and its lamp is off."""
     yield lasting_rig
     lasting_rig.world.faults.clear()
     lasting_rig.clock.gate.set()
-    until(lambda: lasting_rig.world.glow is None)
+    until(lambda: lasting_rig.world.illumination is None)
     assert not lasting_rig.died.is_set()
 
 
 def until(holds: Callable[[], bool], patience_s: float = 15.0) -> None:
-    """Wait for another thread; real time, because threads need it."""
+    """Wait in real time for a condition set by another thread."""
     end = time.monotonic() + patience_s
     while not holds():
-        assert time.monotonic() < end, "it never happened"
+        assert time.monotonic() < end, "timeout"
         time.sleep(0.005)
 
 
@@ -261,15 +251,15 @@ def wait_until() -> Callable[..., None]:
     return until
 
 
-async def follow(
+async def read_event_stream(
     app: FastAPI,
     enough: Callable[[list[tuple[int | None, str, dict[str, Any]]]], bool],
     headers: dict[str, str] | None = None,
     begin: Callable[[], None] = lambda: None,
 ) -> list[tuple[int | None, str, dict[str, Any]]]:
-    """Read the event stream as a browser would, until there is enough, then go away; calls `begin` once it is open."""
+    """Read the event stream like a browser until `enough` holds, then disconnect; `begin` is called once it is open."""
     done, text = asyncio.Event(), ""
-    heard: list[tuple[int | None, str, dict[str, Any]]] = []
+    received: list[tuple[int | None, str, dict[str, Any]]] = []
 
     async def receive() -> dict[str, Any]:
         await done.wait()
@@ -280,12 +270,12 @@ async def follow(
         if message["type"] == "http.response.start":
             assert message["status"] == 200
             return
-        if not heard and message["body"]:
+        if not received and message["body"]:
             begin()
         text += message["body"].decode()
         *whole, text = text.split("\n\n")
-        heard.extend(parsed(block) for block in whole)
-        if enough(heard):
+        received.extend(parsed(block) for block in whole)
+        if enough(received):
             done.set()
 
     scope = {
@@ -295,7 +285,7 @@ async def follow(
         "server": ("eye", 80), "client": ("page", 1),
     }  # fmt: skip
     await asyncio.wait_for(app(scope, receive, send), 20)
-    return heard
+    return received
 
 
 def parsed(block: str) -> tuple[int | None, str, dict[str, Any]]:
@@ -305,12 +295,12 @@ def parsed(block: str) -> tuple[int | None, str, dict[str, Any]]:
 
 @pytest.fixture
 def read_events() -> Callable[..., Any]:
-    return lambda *args, **options: asyncio.run(follow(*args, **options))
+    return lambda *args, **options: asyncio.run(read_event_stream(*args, **options))
 
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The processes' own: caches and captures of a test do not go to the home of whoever runs it."""
+    """Environment of test processes, with temporary cache and data folders."""
     home = tmp_path_factory.mktemp("home")
     return os.environ | {"XDG_CACHE_HOME": str(home / "cache"), "XDG_DATA_HOME": str(home / "data")}
 
@@ -320,7 +310,7 @@ Diffuscope = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture(scope="module")
 def diffuscope(environment: dict[str, str]) -> Diffuscope:
-    """Run one command as a process."""
+    """Run the command `diffuscope` as a process."""
 
     def run(*words: object) -> subprocess.CompletedProcess[str]:
         command = [COMMAND, *map(str, words)]

@@ -1,4 +1,4 @@
-"""The instrument over HTTP, in this process: what DESIGN.md fixes, and one shape for everything that is refused."""
+"""HTTP API in one process: endpoints, status codes, problem responses, security headers, live pictures and events."""
 
 import asyncio
 import json
@@ -13,18 +13,17 @@ import httpx
 import pytest
 from PIL import Image
 
-from device import errors
 from device.errors import DiffuscopeError
-from services.instrument.api import STATUS, refusal
+from services.http.problem_responses import HTTP_STATUS, problem_response
 
-CHOSEN = {  # every leaf has a status that somebody chose
+CHOSEN = {  # expected HTTP status of each error class
     "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
-    "CameraMissing": 503, "CameraStalled": 503, "CameraWrong": 503, "CameraPacked": 503, "LightFault": 423,
-    "LightDay": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
+    "CameraMissing": 503, "CameraStalled": 503, "CameraMismatch": 503, "CameraPacked": 503, "LightFault": 423,
+    "DailyLightLimit": 423, "MemoryDamaged": 503, "HeadMismatch": 423, "TooHot": 423, "PowerLow": 423,
     "CalibrationMissing": 423, "CalibrationDamaged": 423, "CalibrationRefused": 423, "CalibrationFormat": 423,
-    "CalibrationUntrusted": 423, "CalibrationOld": 423, "CalibrationStale": 423, "CalibrationOtherMode": 423,
-    "CalibrationStopped": 423, "TechnicianLocked": 401, "PinWrong": 403, "PinTooSoon": 429,
-    "Busy": 409, "StoreFull": 507, "StoreDamaged": 500, "NotKept": 404,
+    "CalibrationUntrusted": 423, "CalibrationExpired": 423, "CalibrationStale": 423, "CalibrationModeMismatch": 423,
+    "CalibrationStopped": 423, "LoginRequired": 401, "PinWrong": 403, "PinLockedOut": 429,
+    "Busy": 409, "StoreFull": 507, "StoreDamaged": 500, "RecordNotFound": 404,
 }  # fmt: skip
 OD = {"eye": "OD"}
 
@@ -38,30 +37,30 @@ def leaves(kind: type[DiffuscopeError]) -> Iterator[type[DiffuscopeError]]:
 
 
 def refused(answer: httpx.Response, status: int, code: str) -> dict[str, str]:
-    """The words of a refusal, after a look at its status, shape and code."""
+    """Check status, shape and code of a problem response; return its body."""
     assert answer.status_code == status, answer.text
-    words: dict[str, str] = answer.json()
-    assert set(words) == {"code", "message", "remedy"}
-    assert words["code"] == code
-    assert all(words.values())
-    return words
+    problem: dict[str, str] = answer.json()
+    assert set(problem) == {"code", "message", "remedy"}
+    assert problem["code"] == code
+    assert all(problem.values())
+    return problem
 
 
-def test_every_leaf_of_the_error_tree_has_its_status_and_its_words() -> None:
-    ours = [leaf for leaf in leaves(DiffuscopeError) if leaf.__module__ == errors.__name__]
+def test_each_error_class_has_its_status_code_and_remedy() -> None:
+    ours = [leaf for leaf in leaves(DiffuscopeError) if leaf.__module__ in ("device.errors", "services.errors")]
     assert {leaf.__name__ for leaf in ours} >= set(CHOSEN)
     for leaf in ours:
-        answer = refusal(leaf("what happened"))
-        words = json.loads(bytes(answer.body))
-        assert words == {"code": leaf.code, "message": "what happened", "remedy": leaf.default_remedy}
+        answer = problem_response(leaf("what happened"))
+        problem = json.loads(bytes(answer.body))
+        assert problem == {"code": leaf.code, "message": "what happened", "remedy": leaf.default_remedy}
         assert answer.status_code == CHOSEN.get(leaf.__name__, answer.status_code)
         assert 400 <= answer.status_code < 600
     assert len({leaf.code for leaf in ours}) == len(ours)
-    assert DiffuscopeError in STATUS  # whatever is added has at least this one
+    assert DiffuscopeError in HTTP_STATUS  # fallback for new classes
 
 
-def test_a_press_answers_201_with_the_capture_and_links_that_work(old_rig: Any) -> None:
-    async def story(client: httpx.AsyncClient) -> None:
+def test_capture_request_answers_201_with_working_links(old_rig: Any) -> None:
+    async def scenario(client: httpx.AsyncClient) -> None:
         answer = await client.post("/api/captures", json=OD)
         assert answer.status_code == 201
         made = answer.json()
@@ -77,14 +76,14 @@ def test_a_press_answers_201_with_the_capture_and_links_that_work(old_rig: Any) 
             assert file.content == old_rig.store.read(made["id"], link.rsplit("/", 1)[1])
         assert (await client.get(made["links"]["report"])).json() == made["report"] | {"simulated": True}
 
-    old_rig.ask(story)
+    old_rig.ask(scenario)
 
 
-def test_a_second_press_while_busy_is_409_with_a_remedy(rig: Any) -> None:
-    async def story(client: httpx.AsyncClient) -> None:
-        rig.hang()
+def test_capture_request_while_busy_is_409_with_a_remedy(rig: Any) -> None:
+    async def scenario(client: httpx.AsyncClient) -> None:
+        rig.block_exposures()
         first = asyncio.create_task(client.post("/api/captures", json=OD))
-        await asyncio.to_thread(rig.wait_for_hanging)
+        await asyncio.to_thread(rig.wait_for_blocked_exposure)
         assert (await client.get("/api/status")).json()["state"] == "busy"
         words = refused(await client.post("/api/captures", json={"eye": "OS"}), 409, "busy")
         assert "Wait" in words["remedy"]
@@ -92,15 +91,15 @@ def test_a_second_press_while_busy_is_409_with_a_remedy(rig: Any) -> None:
         assert (await first).status_code == 201
         assert len((await client.get("/api/captures")).json()["captures"]) == 1
 
-    rig.ask(story)
+    rig.ask(scenario)
 
 
-def test_a_request_that_the_network_doubles_makes_one_picture(rig: Any) -> None:
-    async def story(client: httpx.AsyncClient) -> None:
+def test_repeated_idempotency_key_makes_one_capture(rig: Any) -> None:
+    async def scenario(client: httpx.AsyncClient) -> None:
         press = OD | {"key": "0123456789abcdef"}
-        rig.hang()
+        rig.block_exposures()
         first = asyncio.create_task(client.post("/api/captures", json=press))
-        await asyncio.to_thread(rig.wait_for_hanging)
+        await asyncio.to_thread(rig.wait_for_blocked_exposure)
         second = asyncio.create_task(client.post("/api/captures", json=press))
         await asyncio.sleep(0.05)
         rig.clock.gate.set()
@@ -109,27 +108,27 @@ def test_a_request_that_the_network_doubles_makes_one_picture(rig: Any) -> None:
         assert len({answer.json()["id"] for answer in answers}) == 1
         assert len((await client.get("/api/captures")).json()["captures"]) == 1
 
-    rig.ask(story)
+    rig.ask(scenario)
 
 
 @pytest.mark.parametrize(("fault", "status"), [("camera.missing", 503), ("camera.stalled", 503), ("light.fault", 423)])
-def test_a_broken_part_is_answered_with_its_own_words(old_rig: Any, fault: str, status: int) -> None:
+def test_hardware_fault_is_answered_with_its_code(old_rig: Any, fault: str, status: int) -> None:
     old_rig.world.faults.add(fault)
     refused(old_rig.request("POST", "/api/captures", json=OD), status, fault)
-    assert old_rig.world.glow is None
+    assert old_rig.world.illumination is None
 
 
-def test_a_full_shelf_is_507_and_nothing_is_listed(make_rig: Any) -> None:
+def test_full_disk_is_507_and_no_capture_is_listed(make_rig: Any) -> None:
     rig = make_rig(store={"free_bytes": lambda _: 0})
     words = refused(rig.request("POST", "/api/captures", json=OD), 507, "store.full")
     assert "Nothing that was kept is lost" in words["remedy"]
     assert rig.request("GET", "/api/captures").json() == {"captures": []}
 
 
-def test_the_list_is_newest_first_and_can_be_read_in_parts(rig: Any) -> None:
+def test_captures_are_listed_newest_first_in_pages(rig: Any) -> None:
     ids = [rig.exam.press("OD").result(30).id for _ in range(3)][::-1]
 
-    async def story(client: httpx.AsyncClient) -> None:
+    async def scenario(client: httpx.AsyncClient) -> None:
         async def listed(query: str) -> list[str]:
             answer = await client.get(f"/api/captures{query}")
             assert answer.status_code == 200
@@ -141,46 +140,46 @@ def test_the_list_is_newest_first_and_can_be_read_in_parts(rig: Any) -> None:
         assert await listed(f"?before={ids[2]}") == []
         refused(await client.get("/api/captures?limit=0"), 422, "input")
         refused(await client.get("/api/captures?limit=501"), 422, "input")
-        refused(await client.get("/api/captures?before=nobody"), 404, "store.unknown")
+        refused(await client.get("/api/captures?before=unknown"), 404, "store.unknown")
 
-    rig.ask(story)
+    rig.ask(scenario)
 
 
 @pytest.mark.parametrize(
     "path",
-    ["/api/captures/nobody", "/api/captures/nobody/picture.png", "/api/captures/..%2f..%2fetc", "/api/captures/%00"],
+    ["/api/captures/unknown", "/api/captures/unknown/picture.png", "/api/captures/..%2f..%2fetc", "/api/captures/%00"],
 )
-def test_what_was_never_kept_is_404(old_rig: Any, path: str) -> None:
+def test_unknown_capture_is_404(old_rig: Any, path: str) -> None:
     answer = old_rig.request("GET", path)
     assert answer.status_code == 404
     assert set(answer.json()) == {"code", "message", "remedy"}
 
 
-def test_a_file_that_no_capture_has_is_404_and_a_strange_name_422(old_rig: Any) -> None:
-    kept = old_rig.exam.press("OD").result(30)
-    refused(old_rig.request("GET", f"/api/captures/{kept.id}/other.png"), 404, "store.unknown")
+def test_unknown_file_is_404_and_invalid_file_name_is_422(old_rig: Any) -> None:
+    stored = old_rig.exam.press("OD").result(30)
+    refused(old_rig.request("GET", f"/api/captures/{stored.id}/other.png"), 404, "store.unknown")
     for name in ("shelf.sqlite", "..%5c..%5cpasswd", "RAW.TIFF", "raw.tiff.bak"):
-        refused(old_rig.request("GET", f"/api/captures/{kept.id}/{name}"), 422, "input")
+        refused(old_rig.request("GET", f"/api/captures/{stored.id}/{name}"), 422, "input")
 
 
-def test_a_damaged_file_is_said_and_its_neighbours_still_come(old_rig: Any) -> None:
-    kept = old_rig.exam.press("OD").result(30)
-    (old_rig.store.folder / "captures" / kept.id / "picture.png").write_bytes(b"not what was kept")
-    refused(old_rig.request("GET", f"/api/captures/{kept.id}/picture.png"), 500, "store.damaged")
-    assert old_rig.request("GET", f"/api/captures/{kept.id}/raw.tiff").status_code == 200
+def test_damaged_file_is_500_and_the_other_files_are_served(old_rig: Any) -> None:
+    stored = old_rig.exam.press("OD").result(30)
+    (old_rig.store.folder / "captures" / stored.id / "picture.png").write_bytes(b"not what was kept")
+    refused(old_rig.request("GET", f"/api/captures/{stored.id}/picture.png"), 500, "store.damaged")
+    assert old_rig.request("GET", f"/api/captures/{stored.id}/raw.tiff").status_code == 200
 
 
 @pytest.mark.parametrize(
     "body", [{}, {"eye": "left"}, {"eye": None}, {"eye": "OD", "lamp": 1}, {"eye": "OD", "key": "short"}, [], "OD"]
 )
-def test_a_press_that_no_button_sends_is_422_with_the_place_of_the_mistake(old_rig: Any, body: Any) -> None:
+def test_invalid_capture_request_is_422_and_names_the_field(old_rig: Any, body: Any) -> None:
     before = old_rig.store.captures()
     words = refused(old_rig.request("POST", "/api/captures", json=body), 422, "input")
     assert words["message"].startswith("body")
     assert old_rig.store.captures() == before
 
 
-def test_a_wrong_eye_is_told_which_eyes_there_are(old_rig: Any) -> None:
+def test_invalid_eye_is_422_and_lists_the_valid_ones(old_rig: Any) -> None:
     words = refused(old_rig.request("POST", "/api/captures", json={"eye": "left"}), 422, "input")
     assert "body.eye" in words["message"]
     assert "OD" in words["message"]
@@ -188,14 +187,14 @@ def test_a_wrong_eye_is_told_which_eyes_there_are(old_rig: Any) -> None:
     refused(old_rig.request("POST", "/api/captures", content=b"{not json"), 422, "input")
 
 
-def test_a_body_too_large_or_of_unknown_length_is_refused_before_it_is_read(old_rig: Any) -> None:
+def test_body_too_large_or_of_unknown_length_is_refused_unread(old_rig: Any) -> None:
     before = old_rig.store.captures()
     words = refused(old_rig.request("POST", "/api/captures", content=b" " * 20_000 + b'{"eye": "OD"}'), 422, "input")
     assert "too large" in words["message"]
 
     async def drip() -> Any:
         yield b'{"eye": '
-        raise AssertionError("nobody should read this")
+        raise AssertionError("the body must not be read")
 
     refused(old_rig.request("POST", "/api/captures", content=drip()), 422, "input")
     refused(old_rig.request("POST", "/api/captures", content=b"{}", headers={"Content-Length": "-1"}), 422, "input")
@@ -207,30 +206,28 @@ UNKNOWN = [("GET", "/nowhere", 404), ("GET", "/api/nowhere", 404), ("GET", "/web
 
 
 @pytest.mark.parametrize(("method", "path", "status"), UNKNOWN)
-def test_an_address_that_does_not_exist_is_refused_in_the_same_shape(
-    old_rig: Any, method: str, path: str, status: int
-) -> None:
+def test_unknown_path_or_method_gives_a_problem_response(old_rig: Any, method: str, path: str, status: int) -> None:
     answer = old_rig.request(method, path)
     refused(answer, status, f"http.{status}")
     assert ("allow" in answer.headers) == (status == 405)
 
 
-def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
+def test_every_kind_of_answer_has_the_security_headers(rig: Any) -> None:
+    stored = rig.exam.press("OD").result(30)
 
     def broken(_: Any) -> None:
         raise ZeroDivisionError
 
-    rig.app.get("/api/broken")(broken)  # a mistake in a page of our own
+    rig.app.get("/api/broken")(broken)  # an unexpected exception in an endpoint
     quiet = {"raise_app_exceptions": False}
     answers = {
         "page": rig.request("GET", "/"),
         "script": rig.request("GET", script_of(rig)),
         "json": rig.request("GET", "/api/status"),
-        "file": rig.request("GET", f"/api/captures/{kept.id}/picture.png"),
+        "file": rig.request("GET", f"/api/captures/{stored.id}/picture.png"),
         "preview": rig.request("GET", "/api/preview"),
         "unknown": rig.request("GET", "/nowhere"),
-        "not kept": rig.request("GET", "/api/captures/nobody"),
+        "not kept": rig.request("GET", "/api/captures/unknown"),
         "wrong": rig.request("POST", "/api/captures", json={}),
         "too large": rig.request("POST", "/api/captures", content=b" " * 20_000),
         "unforeseen": rig.ask(lambda client: client.get("/api/broken?_=1"), **quiet),
@@ -249,32 +246,34 @@ def test_every_kind_of_answer_carries_the_rules_for_the_browser(rig: Any) -> Non
 
 
 def script_of(rig: Any) -> str:
-    """The address of the page's module, which is another one for other files."""
+    """Return the cache-busting URL of the page's module."""
     return re.findall(r'src="(/web/[0-9a-f]{12}/app/app[.]js)"', rig.request("GET", "/").text)[0]
 
 
-def test_the_page_and_its_scripts_are_served(old_rig: Any) -> None:
+def test_page_and_scripts_are_served_with_gzip(old_rig: Any) -> None:
     page = old_rig.request("GET", "/")
     assert page.headers["content-type"].startswith("text/html")
     at = script_of(old_rig)
-    pressed = old_rig.request("GET", at, headers={"Accept-Encoding": "gzip"})
+    compressed = old_rig.request("GET", at, headers={"Accept-Encoding": "gzip"})
     plain = old_rig.request("GET", at, headers={"Accept-Encoding": "identity"})
     assert "javascript" in plain.headers["content-type"]
-    assert pressed.headers["content-encoding"] == "gzip"
+    assert compressed.headers["content-encoding"] == "gzip"
     assert "content-encoding" not in plain.headers
-    assert pressed.text == plain.text
-    assert int(pressed.headers["content-length"]) < 0.5 * int(plain.headers["content-length"])
+    assert compressed.text == plain.text
+    assert int(compressed.headers["content-length"]) < 0.5 * int(plain.headers["content-length"])
     assert "technician.js" in old_rig.request("GET", "/technician").text
 
 
-def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wait_until: Callable[..., None]) -> None:
+def test_status_and_health_follow_a_camera_fault(old_rig: Any, wait_until: Callable[..., None]) -> None:
     status = old_rig.request("GET", "/api/status").json()
     assert status["kind"] == "simulated"
     assert status["state"] == "aim"
     assert status["shape"] == [135, 240]
     assert status["problem"] is None
     assert status["field_px"] == pytest.approx(33.4 * 1.9478, rel=0.01)
-    assert old_rig.request("POST", "/api/captures", json=OD).status_code == 201  # others of this rig were damaged
+    assert (
+        old_rig.request("POST", "/api/captures", json=OD).status_code == 201
+    )  # captures of earlier tests were damaged
     health = old_rig.request("GET", "/api/health").json()
     assert not [check for check in health["checks"] if not check["ok"]]
     assert health["ok"] is True
@@ -288,9 +287,9 @@ def test_status_and_health_say_what_it_is_and_whether_it_works(old_rig: Any, wai
     assert old_rig.request("GET", "/api/health").json()["ok"] is True
 
 
-def test_openapi_describes_what_is_served(old_rig: Any) -> None:
-    book = old_rig.request("GET", "/api/openapi.json").json()
-    assert book["openapi"].startswith("3.")
+def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
+    document = old_rig.request("GET", "/api/openapi.json").json()
+    assert document["openapi"].startswith("3.")
     fixed = {
         "/api/captures": {"get", "post"}, "/api/captures/{id}": {"get"}, "/api/captures/{id}/{name}": {"get"},
         "/api/events": {"get"}, "/api/preview": {"get"}, "/api/health": {"get"}, "/api/status": {"get"},
@@ -301,21 +300,27 @@ def test_openapi_describes_what_is_served(old_rig: Any) -> None:
         "/api/outbox": {"get"}, "/api/outbox/try": {"post"},
         "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
     }  # fmt: skip
-    served = {path: set(verbs) for path, verbs in book["paths"].items()}
-    behind_the_pin = ("/api/technician", "/api/calibration")
-    assert {path: verbs for path, verbs in served.items() if not path.startswith(behind_the_pin)} == fixed
-    press = book["paths"]["/api/captures"]["post"]["responses"]
+    served = {path: set(verbs) for path, verbs in document["paths"].items()}
+    login_required = ("/api/technician", "/api/calibration")
+    assert {path: verbs for path, verbs in served.items() if not path.startswith(login_required)} == fixed
+    press = document["paths"]["/api/captures"]["post"]["responses"]
     assert "201" in press
-    assert press["4XX"]["content"]["application/json"]["schema"]["$ref"].endswith("/Refusal")
-    assert set(book["components"]["schemas"]["Refusal"]["properties"]) == {"code", "message", "remedy", "n", "wait_s"}
-    assert "HTTPValidationError" not in book["components"]["schemas"]  # a shape that is never answered
+    assert press["4XX"]["content"]["application/json"]["schema"]["$ref"].endswith("/ProblemResponse")
+    assert set(document["components"]["schemas"]["ProblemResponse"]["properties"]) == {
+        "code",
+        "message",
+        "remedy",
+        "n",
+        "wait_s",
+    }
+    assert "HTTPValidationError" not in document["components"]["schemas"]  # never answered
 
 
-# Live
+# Live pictures and events
 
 
-def test_previews_come_with_rising_numbers_and_their_age(old_rig: Any) -> None:
-    async def story(client: httpx.AsyncClient) -> None:
+def test_preview_frames_have_rising_numbers_and_an_age(old_rig: Any) -> None:
+    async def scenario(client: httpx.AsyncClient) -> None:
         number = 0
         for _ in range(3):
             answer = await client.get(f"/api/preview?after={number}")
@@ -327,11 +332,11 @@ def test_previews_come_with_rising_numbers_and_their_age(old_rig: Any) -> None:
                 assert picture.format == "JPEG"
         refused(await client.get("/api/preview?after=-1"), 422, "input")
 
-    old_rig.ask(story)
+    old_rig.ask(scenario)
 
 
-def test_a_preview_that_does_not_come_is_204_after_two_seconds(rig: Any) -> None:
-    rig.hang()
+def test_preview_without_a_frame_is_204_after_two_seconds(rig: Any) -> None:
+    rig.block_exposures()
     before = time.monotonic()
     answer = rig.request("GET", "/api/preview?after=0")
     assert answer.status_code == 204
@@ -339,15 +344,15 @@ def test_a_preview_that_does_not_come_is_204_after_two_seconds(rig: Any) -> None
     assert 1.9 < time.monotonic() - before < 6
 
 
-def test_a_press_is_told_in_order_and_its_links_lead_to_it(old_rig: Any, read_events: Any) -> None:
-    def enough(heard: list[Any]) -> bool:
-        return bool(heard[-1][1:] == ("state", {"state": "aim"}))
+def test_events_of_a_capture_are_ordered_and_their_links_work(old_rig: Any, read_events: Any) -> None:
+    def enough(events: list[Any]) -> bool:
+        return bool(events[-1][1:] == ("state", {"state": "aim"}))
 
-    heard = read_events(old_rig.app, enough, begin=lambda: old_rig.exam.press("OS"))
-    assert heard[0][:2] == (None, "beat")
-    news = [event for event in heard if event[1] != "beat"]
-    told = [(kind, data.get("state") or data.get("stage") or data.get("word")) for _, kind, data in news]
-    assert told == [
+    events = read_events(old_rig.app, enough, begin=lambda: old_rig.exam.press("OS"))
+    assert events[0][:2] == (None, "beat")
+    news = [event for event in events if event[1] != "beat"]
+    sequence = [(kind, data.get("state") or data.get("stage") or data.get("word")) for _, kind, data in news]
+    assert sequence == [
         ("state", "busy"), ("stage", "expose"), ("verdict", "good"), ("state", "making"), ("stage", "quick"),
         ("stage", "keep"), ("kept", None), ("state", "aim"),
     ]  # fmt: skip
@@ -355,48 +360,48 @@ def test_a_press_is_told_in_order_and_its_links_lead_to_it(old_rig: Any, read_ev
     assert numbers == list(range(numbers[0], numbers[0] + 8))
     fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
     assert fractions == sorted(fractions)
-    kept = news[6][2]
-    assert kept == old_rig.request("GET", f"/api/captures/{kept['id']}").json()
-    assert {data["id"] for _, kind, data in news if kind == "stage"} == {kept["id"]}
-    first, last = news[2][2], kept["verdict"]
-    assert (first["id"], first["word"], first["code"]) == (kept["id"], last["word"], last["code"])
-    assert first["numbers"].items() < last["numbers"].items()  # what only the picture tells came later
+    stored = news[6][2]
+    assert stored == old_rig.request("GET", f"/api/captures/{stored['id']}").json()
+    assert {data["id"] for _, kind, data in news if kind == "stage"} == {stored["id"]}
+    first, last = news[2][2], stored["verdict"]
+    assert (first["id"], first["word"], first["code"]) == (stored["id"], last["word"], last["code"])
+    assert first["numbers"].items() < last["numbers"].items()  # figures of the reconstructed picture are added later
     assert old_rig.request("GET", news[4][2]["url"]).status_code == 200
 
 
-def test_a_page_that_was_away_hears_what_it_missed_and_nothing_twice(rig: Any, read_events: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda heard: len(heard) == 10, {"Last-Event-ID": "0"})[1:]
+def test_reconnected_stream_resumes_after_the_last_event_id(rig: Any, read_events: Any) -> None:
+    stored = rig.exam.press("OD").result(30)
+    news = read_events(rig.app, lambda events: len(events) == 10, {"Last-Event-ID": "0"})[1:]
     assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
-    assert news[7][2]["id"] == kept.id
-    later = read_events(rig.app, lambda heard: len(heard) == 3, {"Last-Event-ID": "7"})[1:]
+    assert news[7][2]["id"] == stored.id
+    later = read_events(rig.app, lambda events: len(events) == 3, {"Last-Event-ID": "7"})[1:]
     assert [number for number, _, _ in later] == [8, 9]
-    fresh = read_events(rig.app, lambda heard: len(heard) == 1)
+    fresh = read_events(rig.app, lambda events: len(events) == 1)
     assert fresh[0][1:] == ("beat", {"number": 9})
     refused(rig.request("GET", "/api/events", headers={"Last-Event-ID": "yesterday"}), 422, "input")
 
 
-def test_a_page_that_remembers_more_than_was_told_was_here_before_a_restart(rig: Any, read_events: Any) -> None:
+def test_event_id_of_an_earlier_process_replays_all_events(rig: Any, read_events: Any) -> None:
     rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda heard: len(heard) == 10, {"Last-Event-ID": "500"})[1:]
+    news = read_events(rig.app, lambda events: len(events) == 10, {"Last-Event-ID": "500"})[1:]
     assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
 
 
-def test_a_capture_that_was_damaged_does_not_stop_the_news_after_it(rig: Any, read_events: Any) -> None:
-    kept = rig.exam.press("OD").result(30)
-    (rig.store.folder / "captures" / kept.id).rename(rig.store.folder / "gone")
-    news = read_events(rig.app, lambda heard: heard[-1][0] == 9, {"Last-Event-ID": "0"})[1:]
+def test_damaged_capture_does_not_stop_the_event_stream(rig: Any, read_events: Any) -> None:
+    stored = rig.exam.press("OD").result(30)
+    (rig.store.folder / "captures" / stored.id).rename(rig.store.folder / "gone")
+    news = read_events(rig.app, lambda events: events[-1][0] == 9, {"Last-Event-ID": "0"})[1:]
     assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 9]
 
 
-def test_the_heart_beats_every_second_while_nothing_happens(old_rig: Any, read_events: Any) -> None:
+def test_event_stream_has_a_heartbeat_every_second(old_rig: Any, read_events: Any) -> None:
     before = time.monotonic()
-    heard = read_events(old_rig.app, lambda heard: len(heard) == 3)
-    assert [(number, kind) for number, kind, _ in heard] == [(None, "beat")] * 3
+    events = read_events(old_rig.app, lambda events: len(events) == 3)
+    assert [(number, kind) for number, kind, _ in events] == [(None, "beat")] * 3
     assert 1.9 < time.monotonic() - before < 6
 
 
-def test_a_stream_ends_when_the_bulletin_closes(rig: Any, read_events: Any) -> None:
+def test_event_stream_ends_when_the_event_bus_closes(rig: Any, read_events: Any) -> None:
     never = Event()
-    heard = read_events(rig.app, lambda _: never.is_set(), begin=rig.bulletin.close)
-    assert [kind for _, kind, _ in heard] == ["beat"]
+    events = read_events(rig.app, lambda _: never.is_set(), begin=rig.event_bus.close)
+    assert [kind for _, kind, _ in events] == ["beat"]

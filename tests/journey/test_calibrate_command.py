@@ -1,4 +1,4 @@
-"""`diffuscope calibrate` as a process that is killed between its steps, and goes on where it was."""
+"""`diffuscope calibrate` as a process that is killed between its steps and resumes."""
 
 import signal
 import subprocess
@@ -8,14 +8,14 @@ import pytest
 
 from device.calibration.archive import Archive
 from device.errors import CalibrationMissing
-from tests.house import ROOT
 from tests.journey.conftest import COMMAND, Diffuscope
+from tests.project_files import ROOT
 
 
-def test_a_killed_calibration_goes_on_where_it_was(
+def test_killed_calibration_resumes(
     diffuscope: Diffuscope, environment: dict[str, str], head_file: Path, tmp_path: Path
 ) -> None:
-    quick = tmp_path / "head.toml"  # a tenth of the exposure: time is real here
+    quick = tmp_path / "head.toml"  # a tenth of the exposure, because this test runs in real time
     quick.write_text(
         head_file.read_text().replace("[camera]", "[camera]\nexposure_s = 0.01\npreview_exposure_s = 0.01")
     )
@@ -26,7 +26,7 @@ def test_a_killed_calibration_goes_on_where_it_was(
         assert killed.stdout.readline() == "darks: done\n"
         killed.send_signal(signal.SIGKILL)
     with pytest.raises(CalibrationMissing):
-        archive.current()
+        archive.active_id()
     done = diffuscope(*words)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("darks: measured before, taken up again\nflats: done\n")

@@ -1,4 +1,4 @@
-"""`diffuscope calibrations`: listed, put in force, sent and received; and a PSF from others that makes pictures."""
+"""`diffuscope calibrations`: list, activation, signed export and import, and an imported PSF."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,12 +10,12 @@ import tifffile
 
 from device.calibration.archive import Archive
 from device.clock import VirtualClock
+from device.config.head_file import CalibrationTable, InstrumentSpec, load_head
 from device.errors import HeadMismatch
-from device.head import Opening
-from device.spec import CalibrationTable, InstrumentSpec, load_head
+from device.head import HeadOpener
 from services.cli import main
-from tests.house import ROOT
 from tests.journey.conftest import Diffuscope
+from tests.project_files import ROOT
 from tests.scenes import speckle
 from tests.unit.test_archive import WHO, calibration
 
@@ -24,39 +24,39 @@ SHAPE = (96, 128)
 
 
 @pytest.fixture
-def say(capsys: pytest.CaptureFixture[str]) -> Say:
-    """What the command answers when all is well."""
+def run_command(capsys: pytest.CaptureFixture[str]) -> Say:
+    """Return a function that runs a command and returns its output."""
 
     def run(*words: object) -> str:
         with pytest.raises(SystemExit) as ended:
             main(["calibrations", *map(str, words)])
-        said = capsys.readouterr()
-        assert not ended.value.code, said.err
-        return said.out
+        printed = capsys.readouterr()
+        assert not ended.value.code, printed.err
+        return printed.out
 
     return run
 
 
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Say:
-    """The one sentence and the one remedy of a refusal."""
+    """Return a function that runs a command and returns its refusal: one sentence and one remedy."""
 
     def run(*words: object) -> str:
         with pytest.raises(SystemExit) as ended:
             main([*(["calibrations"] * (words[0] != "reconstruct")), *map(str, words)])
-        said = capsys.readouterr()
-        assert (ended.value.code, said.out, said.err.count("\n")) == (2, "", 2), said.err
-        return said.err
+        printed = capsys.readouterr()
+        assert (ended.value.code, printed.out, printed.err.count("\n")) == (2, "", 2), printed.err
+        return printed.err
 
     return run
 
 
 @pytest.fixture
 def archive(tmp_path: Path) -> Archive:
-    """Two of one head, the second in force."""
+    """Two calibrations of one head, the second active."""
     made = Archive(tmp_path / "archive")
-    made.keep(calibration(), WHO)
-    made.keep(calibration(65.0), WHO)
+    made.add_and_activate(calibration(), WHO)
+    made.add_and_activate(calibration(65.0), WHO)
     return made
 
 
@@ -64,9 +64,9 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_the_list_says_which_are_kept_and_which_is_in_force(archive, say):
+def test_list_marks_the_active_calibration(archive, run_command):
     first, second = archive.ids()
-    lines = say("list", "--archive", archive.root).splitlines()
+    lines = run_command("list", "--archive", archive.root).splitlines()
     assert lines[0].startswith(f"  {first}  2026-11-21 09:30  DS-0042")
     assert "24.5 C  by Ana" in lines[0]
     assert "black 64.25 DN, white 4095 DN, gain 5.700 e-/DN, read noise 1.03 e-, 17 x 19 pixels, 2 PSFs" in lines[1]
@@ -75,85 +75,85 @@ def test_the_list_says_which_are_kept_and_which_is_in_force(archive, say):
     assert len(lines) == 6
 
 
-def test_to_go_back_is_one_word(archive, say, refused):
+def test_earlier_calibration_is_reactivated(archive, run_command, refused):
     first, second = archive.ids()
-    assert f"{first} is in force" in say("use", first, "--archive", archive.root)
-    assert archive.current() == first
-    assert f"{second} is in force" in say("use", second, "--archive", archive.root)
+    assert f"{first} is in force" in run_command("use", first, "--archive", archive.root)
+    assert archive.active_id() == first
+    assert f"{second} is in force" in run_command("use", second, "--archive", archive.root)
     assert "calibrations list" in refused("use", "0" * 16, "--archive", archive.root)
     assert "calibrations list" in refused("use", "../archive", "--archive", archive.root)
-    assert archive.current() == second
+    assert archive.active_id() == second
 
 
-def test_a_damaged_one_is_listed_as_damaged_and_the_others_still_are(archive, say, refused):
+def test_list_marks_a_damaged_calibration_and_keeps_the_others(archive, run_command, refused):
     first, second = archive.ids()
     (archive.root / second / "flat.npy").unlink()
-    said = say("list", "--archive", archive.root)
-    assert f"* {second}  DAMAGED: calibration {second}: flat.npy is missing\n    This calibration is damaged." in said
-    assert f"  {first}  2026" in said
+    output = run_command("list", "--archive", archive.root)
+    assert f"* {second}  DAMAGED: calibration {second}: flat.npy is missing\n    This calibration is damaged." in output
+    assert f"  {first}  2026" in output
     assert "flat.npy is missing" in refused("show", second, "--archive", archive.root)
     (archive.root / second / "manifest.toml").unlink()
     (archive.root / "current").write_bytes(b"\xff" * 16)
-    said = say("list", "--archive", archive.root)
-    assert "manifest.toml is missing" in said
-    assert "does not hold the name of a calibration\nChoose one with `diffuscope calibrations use`." in said
-    say("use", first, "--archive", archive.root)
-    assert archive.current() == first
+    output = run_command("list", "--archive", archive.root)
+    assert "manifest.toml is missing" in output
+    assert "does not hold the name of a calibration\nChoose one with `diffuscope calibrations use`." in output
+    run_command("use", first, "--archive", archive.root)
+    assert archive.active_id() == first
 
 
-def test_what_a_manifest_says_does_not_command_the_terminal(archive, say):
+def test_control_characters_of_a_manifest_are_escaped(archive, run_command):
     id = archive.add(calibration(66.0), replace(WHO, made_by="Eve\x1b[2J\n* forged", serial="\x1b]0;owned\x07"))
     for words in (("list",), ("show", id)):
-        said = say(*words, "--archive", archive.root)
-        assert not [letter for letter in said if letter != "\n" and not letter.isprintable()]
-        assert "\n* forged" not in said
+        output = run_command(*words, "--archive", archive.root)
+        assert not [letter for letter in output if letter != "\n" and not letter.isprintable()]
+        assert "\n* forged" not in output
 
 
-def test_an_archive_without_any_says_so(say, tmp_path):
-    assert "no calibration is kept" in say("list", "--archive", tmp_path / "nowhere")
+def test_empty_archive_is_reported(run_command, tmp_path):
+    assert "no calibration is kept" in run_command("list", "--archive", tmp_path / "nowhere")
 
 
-def test_a_calibration_travels_as_one_signed_file(archive, say, refused, tmp_path):
+def test_calibration_is_exported_and_imported_as_a_signed_file(archive, run_command, refused, tmp_path):
     first, second = archive.ids()
     key, there = tmp_path / "key", Archive(tmp_path / "there")
-    assert "is secret" in say("new-key", key, "--name", "Service centre")
-    assert second in say("export", tmp_path / "one", "--archive", archive.root, "--key", key)
-    assert first in say("export", first, tmp_path / "other", "--archive", archive.root, "--key", key)
+    assert "is secret" in run_command("new-key", key, "--name", "Service centre")
+    assert second in run_command("export", tmp_path / "one", "--archive", archive.root, "--key", key)
+    assert first in run_command("export", first, tmp_path / "other", "--archive", archive.root, "--key", key)
     trusted = ("--archive", there.root, "--trust", f"{key}.pub")
-    assert "signed by Service centre" in say("import", tmp_path / "one", *trusted)
-    assert "no calibration is in force" in say("list", "--archive", there.root)
-    assert f"{first} is in force" in say("import", tmp_path / "other", *trusted, "--use")
+    assert "signed by Service centre" in run_command("import", tmp_path / "one", *trusted)
+    assert "no calibration is in force" in run_command("list", "--archive", there.root)
+    assert f"{first} is in force" in run_command("import", tmp_path / "other", *trusted, "--use")
     assert there.load(second).provenance == WHO
-    assert there.current() == first
+    assert there.active_id() == first
     before = tree(there.root)
     whole = (tmp_path / "one").read_bytes()
     (tmp_path / "one").write_bytes(whole[:-1] + b"\1")
     (tmp_path / "two").write_bytes(whole)
     assert "damaged or changed" in refused("import", tmp_path / "one", *trusted)
-    say("new-key", tmp_path / "stranger", "--name", "Service centre")
+    run_command("new-key", tmp_path / "stranger", "--name", "Service centre")
     stranger = ("--archive", there.root, "--trust", tmp_path / "stranger.pub")
     assert "nobody who is trusted" in refused("import", tmp_path / "two", *stranger)
     assert tree(there.root) == before
 
 
-def test_a_calibration_of_another_shape_than_the_head_is_not_even_kept(archive, say, refused, tmp_path):
+def test_import_of_a_calibration_of_another_shape_is_refused(archive, run_command, refused, tmp_path):
     key, there = tmp_path / "key", tmp_path / "there"
-    say("new-key", key, "--name", "Service centre")
-    say("export", tmp_path / "one", "--archive", archive.root, "--key", key)
+    run_command("new-key", key, "--name", "Service centre")
+    run_command("export", tmp_path / "one", "--archive", archive.root, "--key", key)
     head = ("--head", ROOT / "hardware/heads/sim.toml")
-    said = refused("import", tmp_path / "one", "--archive", there, "--trust", f"{key}.pub", *head)
-    assert "has 17 x 19 pixels, the head's file 1080 x 1920" in said
+    output = refused("import", tmp_path / "one", "--archive", there, "--trust", f"{key}.pub", *head)
+    assert "has 17 x 19 pixels, the head's file 1080 x 1920" in output
     assert not there.exists()
     assert "has 17 x 19 pixels" in refused("use", archive.ids()[0], "--archive", archive.root, *head)
-    assert archive.current() == archive.ids()[1]
+    assert archive.active_id() == archive.ids()[1]
 
 
-# A PSF from others
+# Imported PSF
 
 
 @pytest.fixture
 def theirs(tmp_path: Path) -> Path:
-    """A recording as others leave it: 12-bit counts on a pedestal, a PSF and a frame that it made."""
+    """A recording of others: 12-bit counts with a black level, a PSF, and a frame with it."""
     folder = tmp_path / "theirs"
     folder.mkdir()
     psf, scene = speckle(SHAPE, 5), np.zeros(SHAPE)
@@ -166,14 +166,14 @@ def theirs(tmp_path: Path) -> Path:
     return folder
 
 
-def imported(say: Say, archive: Archive, *words: object) -> str:
-    said = say("import-psf", *words, "--archive", archive.root, "--by", "Ana", "--source", "DiffuserCam, 2018")
-    return said.split()[0]
+def imported(run: Say, archive: Archive, *words: object) -> str:
+    listing = run("import-psf", *words, "--archive", archive.root, "--by", "Ana", "--source", "DiffuserCam, 2018")
+    return listing.split()[0]
 
 
-def test_a_psf_from_others_says_what_nobody_knows_of_it(say, theirs, tmp_path):
+def test_imported_psf_lists_its_unknown_values(run_command, theirs, tmp_path):
     archive = Archive(tmp_path / "archive")
-    id = imported(say, archive, theirs / "psf.tiff", "--pitch-um", 6.5)
+    id = imported(run_command, archive, theirs / "psf.tiff", "--pitch-um", 6.5)
     kept = archive.load(id)
     assert kept.provenance.origin == "imported"
     assert kept.provenance.unknown == (
@@ -181,20 +181,20 @@ def test_a_psf_from_others_says_what_nobody_knows_of_it(say, theirs, tmp_path):
         "white_dn",
     )  # fmt: skip
     assert dict(kept.provenance.figures)["pitch_um"] == 6.5
-    said = say("show", id, "--archive", archive.root)
-    assert "black unknown, white unknown, gain unknown, read noise unknown, 96 x 128 pixels" in said
-    assert "IMPORTED from DiffuserCam, 2018, 10 things unknown" in said
-    assert "geometry       unknown" in said
+    output = run_command("show", id, "--archive", archive.root)
+    assert "black unknown, white unknown, gain unknown, read noise unknown, 96 x 128 pixels" in output
+    assert "IMPORTED from DiffuserCam, 2018, 10 things unknown" in output
+    assert "geometry       unknown" in output
     border = np.median(kept.calibration.psfs[0].pixels[:2])
-    assert abs(border) < 1e-9  # the pedestal of 100 counts would be a third of the light
-    assert "no calibration is in force" in say("list", "--archive", archive.root)
+    assert abs(border) < 1e-9  # the black level of 100 counts would be a third of the light
+    assert "no calibration is in force" in run_command("list", "--archive", archive.root)
 
 
-def test_pictures_by_an_imported_psf_are_those_by_the_psf_itself(
-    diffuscope: Diffuscope, environment: dict[str, str], say, theirs, tmp_path
+def test_imported_psf_gives_the_same_picture_as_its_file(
+    diffuscope: Diffuscope, environment: dict[str, str], run_command, theirs, tmp_path
 ):
     archive = Archive(tmp_path / "archive")
-    id = imported(say, archive, theirs / "psf.tiff")
+    id = imported(run_command, archive, theirs / "psf.tiff")
     before = tree(archive.root)
     for name, words in {
         "by_psf": ("--psf", theirs / "psf.tiff"),
@@ -204,40 +204,40 @@ def test_pictures_by_an_imported_psf_are_those_by_the_psf_itself(
         assert done.returncode == 0, done.stderr
     made, expected = np.load(tmp_path / "by_id.npy"), np.load(tmp_path / "by_psf.npy")
     assert np.array_equal(made, expected)
-    assert made[42:58, 52:78].mean() > 5 * np.abs(made[:30]).mean()  # the bright rectangle is where it was
-    assert tree(archive.root) == before  # what FFTW learned of this machine is elsewhere, never inside
+    assert made[42:58, 52:78].mean() > 5 * np.abs(made[:30]).mean()  # the bright rectangle keeps its position
+    assert tree(archive.root) == before  # the FFT plans of this machine are stored elsewhere
     assert list(Path(environment["XDG_CACHE_HOME"]).rglob("fftw-*.wisdom"))
 
 
-def test_the_one_in_force_makes_pictures_and_no_words_are_guessed(
-    diffuscope: Diffuscope, say, refused, theirs, tmp_path
+def test_active_calibration_is_used_and_invalid_names_are_refused(
+    diffuscope: Diffuscope, run_command, refused, theirs, tmp_path
 ):
     archive = Archive(tmp_path / "a:b")
-    say("use", imported(say, archive, theirs / "psf.tiff"), "--archive", archive.root)
+    run_command("use", imported(run_command, archive, theirs / "psf.tiff"), "--archive", archive.root)
     picture = tmp_path / "picture.png"
     raw = ("reconstruct", theirs / "raw.tiff", "-o", picture)
     assert diffuscope(*raw, "--calibration", archive.root).returncode == 0
     assert picture.stat().st_size > 500
-    for words, told in {
+    for words, expected in {
         (): "either PSFs or a calibration",
         ("--calibration", archive.root, "--psf", theirs / "psf.tiff"): "either PSFs or a calibration",
         ("--calibration", archive.root, "--head", "x.toml"): "says itself what it knows",
         ("--calibration", f"{archive.root}:0123456789abcdef"): "there is no calibration 0123456789abcdef",
         ("--calibration", tmp_path / "nowhere"): "no calibration is in force",
     }.items():
-        assert told in refused(*raw, *words)
+        assert expected in refused(*raw, *words)
 
 
-def test_a_stack_is_one_calibration_and_a_dark_frame_is_taken_off(say, refused, theirs, tmp_path):
+def test_stack_is_imported_as_one_calibration_with_its_dark_frame(run_command, refused, theirs, tmp_path):
     archive = Archive(tmp_path / "archive")
     counts = tifffile.imread(theirs / "psf.tiff")
     slope = np.linspace(0, 400, SHAPE[1])
     tifffile.imwrite(theirs / "tilted.tiff", (counts + slope).astype(np.uint16))
     tifffile.imwrite(theirs / "dark.tiff", np.broadcast_to(100 + slope, SHAPE).astype(np.uint16))
     tifffile.imwrite(theirs / "small.tiff", counts[:50])
-    both = archive.load(imported(say, archive, theirs / "psf.tiff", theirs / "psf.tiff")).calibration
+    both = archive.load(imported(run_command, archive, theirs / "psf.tiff", theirs / "psf.tiff")).calibration
     assert len(both.psfs) == 2
-    cleaned = imported(say, archive, theirs / "tilted.tiff", "--dark", theirs / "dark.tiff")
+    cleaned = imported(run_command, archive, theirs / "tilted.tiff", "--dark", theirs / "dark.tiff")
     found = archive.load(cleaned).calibration.psfs[0].pixels
     assert np.corrcoef(found.ravel(), both.psfs[0].pixels.ravel())[0, 1] > 0.999
     words = ("--archive", archive.root, "--by", "Ana", "--source", "x")
@@ -246,23 +246,23 @@ def test_a_stack_is_one_calibration_and_a_dark_frame_is_taken_off(say, refused, 
     assert "cannot be read" in refused("import-psf", theirs / "absent.tiff", *words)
 
 
-def test_a_saturated_psf_is_refused_with_how_much_is_lost(say, refused, theirs, tmp_path):
+def test_saturated_psf_is_refused_with_the_lost_share(run_command, refused, theirs, tmp_path):
     counts = tifffile.imread(theirs / "psf.tiff")
     words = ("--archive", tmp_path / "archive", "--by", "Ana", "--source", "x")
     tifffile.imwrite(theirs / "clipped.tiff", np.minimum(3 * counts, 4095).astype(np.uint16))
     np.save(theirs / "clipped.npy", np.minimum(counts / 3100, 0.4).astype(np.float32))
     for name in ("clipped.tiff", "clipped.npy"):
-        said = refused("import-psf", theirs / name, *words)
-        assert f"{name} is saturated" in said
-        assert "% of its light" in said
+        output = refused("import-psf", theirs / name, *words)
+        assert f"{name} is saturated" in output
+        assert "% of its light" in output
     assert "is saturated" in refused("import-psf", theirs / "psf.tiff", "--white-dn", 1000, *words)
     assert not (tmp_path / "archive").exists()
 
 
-def test_a_head_takes_a_psf_from_others_only_if_its_file_says_so(say, theirs, tmp_path):
+def test_head_accepts_an_imported_psf_only_if_its_file_allows(run_command, theirs, tmp_path):
     archive = Archive(tmp_path / "archive")
-    bare = imported(say, archive, theirs / "psf.tiff")
-    full = imported(say, archive, theirs / "psf.tiff", "--black-dn", 100, "--white-dn", 4095)
+    bare = imported(run_command, archive, theirs / "psf.tiff")
+    full = imported(run_command, archive, theirs / "psf.tiff", "--black-dn", 100, "--white-dn", 4095)
     head = load_head(ROOT / "hardware/heads/imx296.toml")
     camera = head.camera.model_copy(update={"rows": SHAPE[0], "cols": SHAPE[1]})
 
@@ -270,16 +270,16 @@ def test_a_head_takes_a_psf_from_others_only_if_its_file_says_so(say, theirs, tm
         table = CalibrationTable(archive=archive.root, imported=imported)
         return head.model_copy(update={"camera": camera, "sim": None, "calibration": table})
 
-    for id, allowed, told in ((full, False, "not measured on this head"), (bare, True, "black_dn and white_dn")):
-        archive.use(id)
-        with Opening(opening(allowed), VirtualClock()) as opened, pytest.raises(HeadMismatch, match=told):
+    for id, allowed, expected in ((full, False, "not measured on this head"), (bare, True, "black_dn and white_dn")):
+        archive.activate(id)
+        with HeadOpener(opening(allowed), VirtualClock()) as opened, pytest.raises(HeadMismatch, match=expected):
             opened.calibration()
-    archive.use(full)
-    with Opening(opening(True), VirtualClock()) as opened:
+    archive.activate(full)
+    with HeadOpener(opening(True), VirtualClock()) as opened:
         assert opened.calibration().sensor.white_dn == 4095
 
 
-def test_an_id_and_a_file_are_all_that_export_takes(archive, tmp_path, capsys):
+def test_export_takes_an_id_and_a_file_only(archive, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["calibrations", "export", "a", "b", "c", "--archive", str(archive.root), "--key", "k"])
     assert ended.value.code == 2

@@ -1,4 +1,4 @@
-"""The words of `diffuscope`: real processes where they matter, the same `main` in this process where only words do."""
+"""Commands `methods`, `simulate`, `reconstruct` and `run`, in real processes where needed, else in this process."""
 
 import json
 from collections.abc import Callable
@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from device.config.image_files import read_image
 from device.errors import InputError
-from device.images import read_image
 from services.cli import main
-from services.instrument.once import Order, reconstruct_file
-from services.instrument.serve import bound
+from services.http.server import bind_socket
+from services.lab.reconstruct_file import reconstruct_file
+from services.lab.reconstruct_inputs import ReconstructOptions
 from tests.journey.conftest import Diffuscope
 
-REPORT_KEYS = {  # DESIGN.md, "Fixed interfaces"
+REPORT_KEYS = {  # the public interface
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
-    "noise_dn", "residual", "quality", "warnings",
+    "noise_dn", "residual", "quality", "warnings", "solved", "given", "psf_channels", "bayer",
 }  # fmt: skip
 
 
@@ -36,23 +37,23 @@ Refused = Callable[..., str]
 
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
-    """What the command says when it refuses its words: a sentence and a remedy, and nothing else."""
+    """Return a function that runs a command and returns its refusal: one sentence and one remedy on stderr."""
 
     def run(*words: object) -> str:
         with pytest.raises(SystemExit) as ended:
             main([str(word) for word in words])
-        said = capsys.readouterr()
+        printed = capsys.readouterr()
         assert ended.value.code == 2
-        assert said.out == ""
-        lines = said.err.strip().splitlines()
-        assert lines[0].startswith("error: "), said.err
-        assert len(lines) == 2, said.err
-        return said.err
+        assert printed.out == ""
+        lines = printed.err.strip().splitlines()
+        assert lines[0].startswith("error: "), printed.err
+        assert len(lines) == 2, printed.err
+        return printed.err
 
     return run
 
 
-def test_methods_are_listed_with_their_cost(diffuscope: Diffuscope) -> None:
+def test_methods_are_listed_with_cost(diffuscope: Diffuscope) -> None:
     done = diffuscope("methods", "--rows", 270, "--cols", 480)
     assert done.returncode == 0
     assert "270 x 480" in done.stdout
@@ -61,7 +62,7 @@ def test_methods_are_listed_with_their_cost(diffuscope: Diffuscope) -> None:
     assert done.stderr == ""
 
 
-def test_what_simulate_writes_is_the_simulated_frame(scene: Path) -> None:
+def test_simulate_writes_the_simulated_frame(scene: Path) -> None:
     assert {path.name for path in scene.iterdir()} >= {"raw.tiff", "truth.npy", "psf.tiff", "plan.json"}
     for name in ("raw.tiff", "truth.npy", "psf.tiff"):
         assert read_image(scene / name).shape == (270, 480)
@@ -70,7 +71,7 @@ def test_what_simulate_writes_is_the_simulated_frame(scene: Path) -> None:
     assert plan["shot"]["simulated"] is True
 
 
-def test_a_frame_becomes_a_picture_and_a_report(
+def test_reconstruct_writes_picture_and_report(
     diffuscope: Diffuscope, scene: Path, head_file: Path, tmp_path: Path
 ) -> None:
     out, report = tmp_path / "x.npy", tmp_path / "r.json"
@@ -91,45 +92,41 @@ def test_a_frame_becomes_a_picture_and_a_report(
     assert all(seconds >= 0 for seconds in facts["seconds"].values())
 
 
-def order(scene: Path, plans: Path, output: Path, **changes: Any) -> Order:
+def make_options(scene: Path, plans: Path, output: Path, **changes: Any) -> ReconstructOptions:
     asked: dict[str, Any] = {
         "raw": scene / "raw.tiff", "psfs": (scene / "psf.tiff",), "output": output, "method": "gradient",
         "budget_s": None, "dark": None, "flat": None, "head": None, "field_deg": None, "even": False, "plans": plans,
     }  # fmt: skip
-    return Order(**asked | changes)
+    return ReconstructOptions(**asked | changes)
 
 
-def test_a_tiff_holds_what_an_npy_holds_and_a_png_the_same_picture_for_eyes(
-    scene: Path, plans: Path, tmp_path: Path
-) -> None:
+def test_tiff_npy_and_png_hold_the_same_picture(scene: Path, plans: Path, tmp_path: Path) -> None:
     for ending in ("npy", "tiff", "png"):
-        reconstruct_file(order(scene, plans, tmp_path / f"x.{ending}"))
+        reconstruct_file(make_options(scene, plans, tmp_path / f"x.{ending}"))
     exact, tiff = read_image(tmp_path / "x.npy"), read_image(tmp_path / "x.tiff")
     assert tiff.dtype == np.float32
     assert np.allclose(tiff, exact, rtol=1e-5, atol=1e-5 * np.abs(exact).max())
     eyes = read_image(tmp_path / "x.png").astype(float)
     assert eyes.shape == exact.shape == (270, 480)
-    above = slice(0, 200)  # below is the band that says SIMULATED, as the raw does
+    above = slice(0, 200)  # the band SIMULATED lies below, as in the raw
     assert np.corrcoef(eyes[above].ravel(), exact[above].ravel())[0, 1] > 0.9
 
 
 @pytest.mark.parametrize("ending", ["npy", "tiff"])
-def test_three_channels_stay_three(scene: Path, plans: Path, tmp_path: Path, ending: str) -> None:
+def test_three_channels_are_kept(scene: Path, plans: Path, tmp_path: Path, ending: str) -> None:
     grey = read_image(scene / "raw.tiff")
     colour = np.stack([grey, grey // 2 + 32, grey // 4 + 48], axis=2)
     np.save(tmp_path / "raw.npy", colour)
     out = tmp_path / f"x.{ending}"
-    reconstruct_file(order(scene, plans, out, raw=tmp_path / "raw.npy"))
+    reconstruct_file(make_options(scene, plans, out, raw=tmp_path / "raw.npy"))
     picture = read_image(out)
     assert picture.shape == (270, 480, 3)
     means = picture.reshape(-1, 3).mean(axis=0)
     assert means[0] > means[1] > means[2]
 
 
-def test_a_budget_is_kept_and_what_is_not_a_time_refused(
-    scene: Path, plans: Path, tmp_path: Path, refused: Refused
-) -> None:
-    made = reconstruct_file(order(scene, plans, tmp_path / "x.npy", budget_s=1e-6))
+def test_budget_is_kept_and_an_invalid_one_refused(scene: Path, plans: Path, tmp_path: Path, refused: Refused) -> None:
+    made = reconstruct_file(make_options(scene, plans, tmp_path / "x.npy", budget_s=1e-6))
     assert made.report.stopped == "deadline"
     assert made.report.bin > 1
     assert read_image(tmp_path / "x.npy").shape == (270, 480)
@@ -139,10 +136,8 @@ def test_a_budget_is_kept_and_what_is_not_a_time_refused(
         assert "positive" in words
 
 
-def test_that_a_frame_was_simulated_is_not_lost_on_the_way(
-    scene: Path, head_file: Path, plans: Path, tmp_path: Path
-) -> None:
-    made = reconstruct_file(order(scene, plans, tmp_path / "x.png", head=head_file))
+def test_simulated_mark_is_kept(scene: Path, head_file: Path, plans: Path, tmp_path: Path) -> None:
+    made = reconstruct_file(make_options(scene, plans, tmp_path / "x.png", head=head_file))
     assert made.simulated is True
     with Image.open(tmp_path / "x.png") as picture:
         assert picture.text["simulated"] == "true"  # type: ignore[attr-defined]
@@ -154,7 +149,7 @@ def reconstruct(scene: Path, tmp_path: Path) -> list[object]:
 
 @pytest.fixture(scope="module")
 def broken(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of files that are not what their names say."""
+    """A folder of files whose content does not fit their names."""
     folder = tmp_path_factory.mktemp("broken")
     psf = read_image(scene / "psf.tiff").astype(np.float64)
     raw = read_image(scene / "raw.tiff")
@@ -183,13 +178,11 @@ BAD_RAWS = {
 
 
 @pytest.mark.parametrize("name", BAD_RAWS)
-def test_a_raw_that_cannot_be_used_is_refused(
-    scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str
-) -> None:
+def test_unusable_raw_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
     words = reconstruct(scene, tmp_path)
     words[1] = broken / name
-    said = refused(*words)
-    assert any(part in said for part in BAD_RAWS[name].split("|")), said
+    refusal = refused(*words)
+    assert any(part in refusal for part in BAD_RAWS[name].split("|")), refusal
     assert not (tmp_path / "out.npy").exists()
 
 
@@ -202,23 +195,21 @@ BAD_PSFS = {
 
 
 @pytest.mark.parametrize("name", BAD_PSFS)
-def test_a_psf_that_cannot_be_one_is_refused(
-    scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str
-) -> None:
+def test_unusable_psf_is_refused(scene: Path, broken: Path, tmp_path: Path, refused: Refused, name: str) -> None:
     words = reconstruct(scene, tmp_path)
     words[3] = broken / name
     assert BAD_PSFS[name] in refused(*words)
     words[3] = scene / "psf.tiff"
-    assert BAD_PSFS[name] in refused(*words, "--psf", broken / name)  # also as one of a stack
+    assert BAD_PSFS[name] in refused(*words, "--psf", broken / name)  # also within a stack
 
 
 @pytest.mark.parametrize("option", ["--dark", "--flat"])
-def test_a_companion_of_another_size_is_refused(
+def test_dark_or_flat_of_another_size_is_refused(
     scene: Path, broken: Path, tmp_path: Path, refused: Refused, option: str
 ) -> None:
-    said = refused(*reconstruct(scene, tmp_path), option, broken / "half.npy")
-    assert "half.npy has 135 x 480 pixels, the raw 270 x 480" in said
-    assert "same camera mode" in said
+    refusal = refused(*reconstruct(scene, tmp_path), option, broken / "half.npy")
+    assert "half.npy has 135 x 480 pixels, the raw 270 x 480" in refusal
+    assert "same camera mode" in refusal
 
 
 WRONG_OPTIONS: dict[str, tuple[list[str], str]] = {
@@ -233,7 +224,7 @@ WRONG_OPTIONS: dict[str, tuple[list[str], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG_OPTIONS)
-def test_an_option_that_cannot_be_is_refused_with_what_can(
+def test_invalid_option_is_refused_with_the_valid_ones(
     scene: Path, tmp_path: Path, refused: Refused, what: str
 ) -> None:
     options, words = WRONG_OPTIONS[what]
@@ -241,14 +232,14 @@ def test_an_option_that_cannot_be_is_refused_with_what_can(
 
 
 @pytest.mark.parametrize("field_deg", ["0", "-5", "nan", "180"])
-def test_a_field_that_cannot_be_lit_is_refused(
+def test_impossible_field_is_refused(
     scene: Path, head_file: Path, tmp_path: Path, refused: Refused, field_deg: str
 ) -> None:
     words = refused(*reconstruct(scene, tmp_path), "--head", head_file, "--field-deg", field_deg)
     assert "cannot be lit" in words
 
 
-def test_a_typo_in_a_head_names_key_and_line_and_what_was_meant(
+def test_typo_in_a_head_file_is_reported_with_key_line_and_suggestion(
     head_file: Path, tmp_path: Path, refused: Refused
 ) -> None:
     text = head_file.read_text().replace("pitch_um", "pich_um")
@@ -256,33 +247,29 @@ def test_a_typo_in_a_head_names_key_and_line_and_what_was_meant(
     typo.write_text(text)
     line = 1 + text.splitlines().index("pich_um = 20.16")
     for words in (["run", "--head"], ["simulate", "-o", tmp_path / "out"]):
-        said = refused(*words, typo)
-        assert f"line {line}" in said
-        assert "'camera.pich_um' is not a known key; did you mean 'pitch_um'?" in said
+        refusal = refused(*words, typo)
+        assert f"line {line}" in refusal
+        assert "'camera.pich_um' is not a known key; did you mean 'pitch_um'?" in refusal
 
 
-def test_a_refusal_in_a_process_of_its_own_is_two_lines_and_code_2(
-    diffuscope: Diffuscope, scene: Path, tmp_path: Path
-) -> None:
+def test_refusal_of_a_process_is_two_lines_and_exit_code_2(diffuscope: Diffuscope, scene: Path, tmp_path: Path) -> None:
     done = diffuscope(*reconstruct(scene, tmp_path), "--method", "magic")
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == "error: there is no method 'magic'\nChoose one of: " + done.stderr.split(": ", 2)[2]
 
 
-def test_a_port_that_somebody_has_is_said_before_anything_is_opened(
-    head_file: Path, refused: Refused, tmp_path: Path
-) -> None:
-    with bound("127.0.0.1", 0) as taken:  # like another one of us that is still getting ready
+def test_occupied_port_is_reported_before_the_head_is_opened(head_file: Path, refused: Refused, tmp_path: Path) -> None:
+    with bind_socket("127.0.0.1", 0) as taken:  # like another instance during its start
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match="cannot be served") as error:
-            bound("127.0.0.1", port)
+            bind_socket("127.0.0.1", port)
     assert f"--port {port + 1}" in error.value.remedy
 
 
-def test_an_address_that_is_not_ours_has_another_remedy() -> None:
+def test_foreign_address_has_another_remedy() -> None:
     for host in ("192.0.2.1", "no.such.host.invalid"):
         with pytest.raises(InputError, match="cannot be served") as error:
-            bound(host, 8000)
+            bind_socket(host, 8000)
         assert "--host" in error.value.remedy
         assert "Another program" not in error.value.remedy

@@ -1,4 +1,4 @@
-"""`diffuscope run` as a process of its own: killed in the middle, started again, ended when told."""
+"""`diffuscope run` as a process: killed during a capture, restarted, ended by a signal."""
 
 import http.client
 import json
@@ -20,7 +20,7 @@ from tests.journey.conftest import COMMAND, ROOT, Diffuscope
 
 
 class Server:
-    """`diffuscope run` on the small head, and ways to talk to it."""
+    """`diffuscope run` with the small head, and requests to it."""
 
     def __init__(self, head: Path, data: Path, environment: dict[str, str], *more: str) -> None:
         with socket.socket() as probe:
@@ -42,19 +42,19 @@ class Server:
             process.kill()
             process.wait()
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self._log.read_text()
 
     def _wait(self, process: subprocess.Popen[bytes]) -> None:
         end = time.monotonic() + 90
         while time.monotonic() < end:
-            assert process.poll() is None, self.said()
+            assert process.poll() is None, self.output()
             try:
                 self.ask("GET", "/api/status")
                 return
             except OSError:
                 time.sleep(0.05)
-        raise AssertionError(f"no answer in 90 s: {self.said()}")
+        raise AssertionError(f"no answer in 90 s: {self.output()}")
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
@@ -80,7 +80,7 @@ class Server:
 ANSWERS = {"age": 54, "consent": "agreed"}
 
 
-def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_told(
+def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
     head_file: Path, environment: dict[str, str], tmp_path: Path, diffuscope: Diffuscope
 ) -> None:
     server = Server(head_file, tmp_path / "data", environment)
@@ -110,11 +110,11 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
     with server.running() as process:
         listed = server.listed()
         assert listed[-2:] == kept[::-1]
-        (unfinished,) = server.ask("GET", "/api/visits?open=true")["visits"]  # where it was, to go on
+        (unfinished,) = server.ask("GET", "/api/visits?open=true")["visits"]  # the visit open before the kill
         assert (unfinished["id"], unfinished["fields"], unfinished["next_slot"]) == (visit, ANSWERS, "R-nerve")
         assert unfinished["slots"]["R-centre"]["capture"] == kept[0]
         assert server.ask("POST", "/api/captures", {"eye": "OD", "slot": "R-centre", **where})["id"] == kept[0]
-        for id in listed:  # also a third, if it was killed after it had been kept
+        for id in listed:  # includes a third capture if the kill came after its storage
             for name in ("raw.tiff", "picture.png", "quick.jpg", "report.json"):
                 assert server.ask("GET", f"/api/captures/{id}/{name}")
             assert tifffile.imread(BytesIO(server.ask("GET", f"/api/captures/{id}/raw.tiff"))).shape == (270, 480)
@@ -126,6 +126,6 @@ def test_killed_in_the_middle_it_comes_back_with_what_was_kept_and_ends_when_tol
             process.wait(10)
             assert time.monotonic() - before < 3
             for stream in streams:
-                stream.read()  # ended, not cut off: a chunked body that was cut off raises
-    assert "Traceback" not in server.said()
-    assert "Cancel" not in server.said()
+                stream.read()  # a truncated chunked body would raise
+    assert "Traceback" not in server.output()
+    assert "Cancel" not in server.output()

@@ -1,4 +1,4 @@
-"""Light for a visit needs consent that is recorded and not withdrawn; a picture without a visit is a test picture."""
+"""Consent: no light for a visit without a recorded consent; a capture without a visit is a test picture."""
 
 import asyncio
 import json
@@ -10,15 +10,16 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.journey.asking import agreed_visit, answered
+from services.records.capture_report import read_report, report_as_json
+from tests.journey.asking import record_answer, visit_with_consent
 from tests.journey.conftest import MakeRig, Rig, until
-from tests.journey.faults import rest
+from tests.journey.faults import wait_until_idle
 
-ENOUGH_S = 1.0  # of real time: in virtual time, three seconds of aiming take a tenth of it
+ENOUGH_S = 1.0  # real time; three seconds of aiming in virtual time take a tenth of it
 ANSWERS = {"consent.missing": None, "consent.declined": "declined"}
 
 
-def press_of(visit: str) -> dict[str, str]:
+def capture_request(visit: str) -> dict[str, str]:
     return {"key": secrets.token_hex(8), "eye": "OD", "visit": visit, "slot": "R-centre"}
 
 
@@ -29,90 +30,90 @@ def refused(answer: httpx.Response, code: str) -> None:
 
 @pytest.mark.parametrize("code", ANSWERS)
 @pytest.mark.parametrize("before", [None, "agreed"])
-def test_without_consent_no_light_is_spent_for_a_visit(old_rig: Rig, code: str, before: str | None) -> None:
-    rest(old_rig)
+def test_lamp_stays_off_for_a_visit_without_consent(old_rig: Rig, code: str, before: str | None) -> None:
+    wait_until_idle(old_rig)
     visit = old_rig.request("POST", "/api/visits", json={"key": secrets.token_hex(8)}).json()["id"]
     for value in (before, ANSWERS[code]):
         if value is not None or before is not None:
-            answered(old_rig, visit, "consent", value)
-    frames, kept = old_rig.world.frames, len(old_rig.store.captures())
-    refused(old_rig.request("POST", "/api/captures", json=press_of(visit)), code)
+            record_answer(old_rig, visit, "consent", value)
+    frames, captures = old_rig.world.frames, len(old_rig.store.captures())
+    refused(old_rig.request("POST", "/api/captures", json=capture_request(visit)), code)
     for eye in ("", "&eye=OD"):
         refused(old_rig.request("GET", f"/api/preview?after=0&visit={visit}{eye}"), code)
     time.sleep(ENOUGH_S / 10)
-    assert (old_rig.world.frames, old_rig.world.glow) == (frames, None)
-    assert len(old_rig.store.captures()) == kept
-    answered(old_rig, visit, "consent", "agreed")
-    assert old_rig.request("POST", "/api/captures", json=press_of(visit)).status_code == 201
+    assert (old_rig.world.frames, old_rig.world.illumination) == (frames, None)
+    assert len(old_rig.store.captures()) == captures
+    record_answer(old_rig, visit, "consent", "agreed")
+    assert old_rig.request("POST", "/api/captures", json=capture_request(visit)).status_code == 201
     assert old_rig.request("GET", f"/api/preview?after=0&visit={visit}").status_code == 200
 
 
-def test_a_live_picture_for_a_visit_that_does_not_exist_is_refused(old_rig: Rig) -> None:
-    answer = old_rig.request("GET", "/api/preview?visit=nobody")
+def test_preview_for_an_unknown_visit_is_404(old_rig: Rig) -> None:
+    answer = old_rig.request("GET", "/api/preview?visit=unknown")
     assert (answer.status_code, answer.json()["code"]) == (404, "store.unknown")
 
 
-def while_aiming(rig: Rig, visit: str, value: str | None, ask: Any) -> tuple[httpx.Response, int]:
-    """The answer to a request that waits while the consent is withdrawn; frames exposed until the withdrawal."""
+def while_aiming(rig: Rig, visit: str, value: str | None, send: Any) -> tuple[httpx.Response, int]:
+    """Withdraw the consent while a request waits; return its answer, and the frames exposed until the withdrawal."""
     order = {"key": secrets.token_hex(8), "field": "consent", "value": value}
 
-    async def story(client: httpx.AsyncClient) -> tuple[httpx.Response, int]:
+    async def scenario(client: httpx.AsyncClient) -> tuple[httpx.Response, int]:
         assert (await client.get(f"/api/preview?after=0&visit={visit}&eye=OD")).status_code in (200, 204)
-        rig.hang()
-        await asyncio.to_thread(rig.wait_for_hanging)
-        request: Awaitable[httpx.Response] = asyncio.create_task(ask(client))
+        rig.block_exposures()
+        await asyncio.to_thread(rig.wait_for_blocked_exposure)
+        request: Awaitable[httpx.Response] = asyncio.create_task(send(client))
         await asyncio.sleep(0.2)
         assert (await client.patch(f"/api/visits/{visit}", json=order)).status_code == 200
         frames = rig.world.frames
         rig.clock.gate.set()
         return await request, frames
 
-    answer: tuple[httpx.Response, int] = rig.ask(story)
+    answer: tuple[httpx.Response, int] = rig.ask(scenario)
     return answer
 
 
 @pytest.mark.parametrize("code", ANSWERS)
-def test_consent_that_is_withdrawn_while_aiming_turns_the_lamp_off(make_rig: MakeRig, code: str) -> None:
+def test_withdrawing_consent_while_aiming_turns_the_lamp_off(make_rig: MakeRig, code: str) -> None:
     rig = make_rig()
-    visit = agreed_visit(rig)["id"]
+    visit = visit_with_consent(rig)["id"]
     answer, frames = while_aiming(
         rig, visit, ANSWERS[code], lambda client: client.get(f"/api/preview?after=100000&visit={visit}&eye=OD")
     )
     time.sleep(ENOUGH_S)
     assert rig.world.frames <= frames + 1, "only the frame that was being exposed"
-    assert rig.world.glow is None
+    assert rig.world.illumination is None
     assert answer.status_code == 204
     refused(rig.request("GET", f"/api/preview?after=100000&visit={visit}&eye=OD"), code)
     assert rig.request("GET", "/api/status").json()["problem"] is None
 
 
-def test_a_press_that_waits_while_consent_is_withdrawn_gets_no_light(make_rig: MakeRig) -> None:
+def test_pending_capture_gets_no_light_after_consent_is_withdrawn(make_rig: MakeRig) -> None:
     rig = make_rig()
-    visit = agreed_visit(rig)["id"]
-    press = press_of(visit)
+    visit = visit_with_consent(rig)["id"]
+    press = capture_request(visit)
     answer, frames = while_aiming(rig, visit, "declined", lambda client: client.post("/api/captures", json=press))
     refused(answer, "consent.declined")
     assert rig.world.frames <= frames + 1, "only the live frame that was being exposed"
     until(lambda: rig.exam.state == "aim")
     assert rig.store.captures() == []
-    assert rig.world.glow is None
-    assert [data["stage"] for kind, data in rig.told() if kind == "stage"] == []
-    assert rig.exam.underway.lost == ()
+    assert rig.world.illumination is None
+    assert [data["stage"] for kind, data in rig.published_events() if kind == "stage"] == []
+    assert rig.exam.capture_journal.interrupted == ()
 
 
-def test_another_visit_is_aimed_at_while_the_consent_of_the_first_is_withdrawn(make_rig: MakeRig) -> None:
+def test_preview_of_another_visit_continues_when_consent_is_withdrawn(make_rig: MakeRig) -> None:
     rig = make_rig()
-    first, second = (agreed_visit(rig)["id"] for _ in range(2))
+    first, second = (visit_with_consent(rig)["id"] for _ in range(2))
     answer, _ = while_aiming(
         rig, first, "declined", lambda client: client.get(f"/api/preview?after=0&visit={second}&eye=OS")
     )
     assert answer.status_code == 200
 
 
-def test_a_press_without_a_visit_is_a_test_picture_and_stays_one(old_rig: Rig) -> None:
-    visit = agreed_visit(old_rig)["id"]
+def test_capture_without_a_visit_stays_a_test_picture(old_rig: Rig) -> None:
+    visit = visit_with_consent(old_rig)["id"]
     made = old_rig.request("POST", "/api/captures", json={"eye": "OD"}).json()
-    of_visit = old_rig.request("POST", "/api/captures", json=press_of(visit)).json()
+    of_visit = old_rig.request("POST", "/api/captures", json=capture_request(visit)).json()
     assert (made["test"], of_visit["test"]) == (True, False)
     assert (made["report"]["test"], of_visit["report"]["test"]) == (True, False)
     assert json.loads(old_rig.store.read(made["id"], "report.json"))["test"] is True
@@ -134,9 +135,10 @@ def test_a_press_without_a_visit_is_a_test_picture_and_stays_one(old_rig: Rig) -
     assert listed == {made["id"]: True, of_visit["id"]: False}
 
 
-def test_a_picture_of_an_earlier_release_without_a_visit_is_a_test_picture_too(old_rig: Rig) -> None:
+def test_capture_of_an_earlier_release_without_a_visit_is_a_test_picture(old_rig: Rig) -> None:
     made = old_rig.store.get(old_rig.request("POST", "/api/captures", json={"eye": "OD"}).json()["id"])
-    earlier = {key: value for key, value in made.report.items() if key not in ("visit", "slot", "test")}
+    stored = report_as_json(made.report)
+    earlier = read_report({key: value for key, value in stored.items() if key not in ("visit", "slot", "test")})
     capture = type(made)(f"{made.id}-e", made.eye, made.taken_at, made.simulated, made.calibration_id, earlier, {})
-    old_rig.store.keep(capture, {"report.json": b"{}"})
+    old_rig.store.save(capture, {"report.json": b"{}"})
     assert old_rig.request("GET", f"/api/captures/{capture.id}").json()["test"] is True

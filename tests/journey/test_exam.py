@@ -1,10 +1,11 @@
-"""From one press to a kept picture, and every way in which that can fail: the lamp is dark after all of them."""
+"""State machine of the exam: capture, storage and every failure; the lamp is off afterwards in all cases."""
 
 import json
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from io import BytesIO
+from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -12,13 +13,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from device.errors import Busy, CameraMissing, CameraStalled, DiffuscopeError, LightFault, StoreFull
+from device.errors import CameraMissing, CameraStalled, DiffuscopeError, LightFault, StoreFull
 from device.errors import LightLimit as Limit
 from device.ports import Camera
-from device.values import Frame, Shot
-from services.instrument.bulletin import Bulletin
-from services.instrument.exposing import eye_in
-from services.records.picture import read_raw_tiff, to_png
+from device.recon.reconstructor import Reconstructor
+from device.values import ExposureSettings, Frame, Illumination
+from services.errors import Busy
+from services.imaging.picture_files import read_raw_tiff, to_png
+from services.instrument.capture_pipeline import CapturePipeline, crop_to_field, plan_pipeline
+from services.instrument.events import EventBus
+from services.records.capture_report import report_as_json
 
 FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
@@ -26,22 +30,22 @@ KEY = "0123456789abcdef"
 
 def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> None:
     kept = old_rig.exam.press("OS").result(30)
-    assert old_rig.world.glow is None
+    assert old_rig.world.illumination is None
     assert old_rig.store.captures(1) == [kept]
     assert set(kept.files) == FILES
-    raw, facts = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
-    dark, dark_facts = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
+    raw, metadata = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
+    dark, dark_metadata = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
     assert raw.shape == dark.shape == (135, 240)
     assert raw.max() > dark.max() + 500
-    assert facts["glow"] == {"colour": "green", "level": 1.0}
-    assert dark_facts["glow"] is None
-    assert facts["eye"] == kept.eye == "OS"
+    assert metadata.illumination == Illumination("green")
+    assert dark_metadata.illumination is None
+    assert metadata.eye == kept.eye == "OS"
     report = json.loads(old_rig.store.read(kept.id, "report.json"))
-    assert report == kept.report | {"simulated": True}
+    assert report == report_as_json(kept.report) | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
-    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 0.1, rel=1e-3)  # unmeasured green, for one exposure
-    day = report["dose_24h_j_per_cm2"]  # the reservation is given back but for rounding
+    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 0.1, rel=1e-3)  # default radiometry, one exposure
+    day = report["dose_24h_j_per_cm2"]  # the reservation is settled, up to rounding
     assert report["dose_j_per_cm2"] <= day["OS"] * (1 + 1e-9) < report["dose_stop_j_per_cm2"]
     assert report["seconds"]["expose"] == pytest.approx(0.2)
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
@@ -52,33 +56,32 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
         assert max(quick.size) <= 640
 
 
-def test_that_it_was_simulated_is_in_the_record_the_report_and_the_picture(old_rig: Any) -> None:
+def test_record_report_and_picture_are_marked_as_simulated(old_rig: Any) -> None:
     kept = old_rig.exam.press("OD").result(30)
     assert old_rig.store.get(kept.id).simulated is True
     assert json.loads(old_rig.store.read(kept.id, "report.json"))["simulated"] is True
-    assert read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))[1]["simulated"] is True
+    assert read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))[1].simulated is True
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         assert picture.text["simulated"] == "true"
         corner = np.asarray(picture)[-12:, :40]
-    assert corner.max() > 200  # the letters of the mark, on its black band
+    assert corner.max() > 200  # letters of the mark on its black band
     assert (corner < 10).mean() > 0.3
 
 
-def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any, wait_until: Callable[..., None]) -> None:
+def test_the_picture_shows_the_retina_that_was_looked_at(old_rig: Any, plans: Path) -> None:
     kept = old_rig.exam.press("OD").result(30)
-    wait_until(lambda: not old_rig.exam.fitness.due)  # which has the same workspace
     raw, _ = read_raw_tiff(old_rig.store.read(kept.id, "raw.tiff"))
     dark, _ = read_raw_tiff(old_rig.store.read(kept.id, "dark.tiff"))
-    picture = old_rig.exam._reconstructor(raw, dark, simulated=True).picture
+    picture = planned(old_rig, plans).reconstructor(raw, dark, simulated=True).picture
     truth = old_rig.world.truth("green")
     seen = truth > 0
     assert np.corrcoef(picture[seen], truth[seen])[0, 1] > 0.8
 
 
 def test_a_second_press_while_one_is_under_way_is_refused_and_the_first_is_kept(rig: Any) -> None:
-    rig.hang()
+    rig.block_exposures()
     first = rig.exam.press("OD")
-    rig.wait_for_hanging()
+    rig.wait_for_blocked_exposure()
     assert rig.exam.state == "busy"
     with pytest.raises(Busy):
         rig.exam.press("OD")
@@ -88,11 +91,11 @@ def test_a_second_press_while_one_is_under_way_is_refused_and_the_first_is_kept(
     kept = first.result(30)
     assert rig.store.captures() == [kept]
     assert rig.exam.state == "aim"
-    assert rig.exam.press("OS", KEY).result(30).eye == "OS"  # a refused key was not used up
+    assert rig.exam.press("OS", KEY).result(30).eye == "OS"  # a refused press does not consume its key
 
 
 def test_the_same_key_is_the_same_picture_while_it_is_made_and_afterwards(rig: Any) -> None:
-    rig.hang()
+    rig.block_exposures()
     first, again = rig.exam.press("OD", KEY), rig.exam.press("OD", KEY)
     rig.clock.gate.set()
     kept = first.result(30)
@@ -102,32 +105,32 @@ def test_the_same_key_is_the_same_picture_while_it_is_made_and_afterwards(rig: A
     assert rig.store.captures() == [other, kept]
 
 
-def test_many_hands_on_the_button_make_one_picture_at_a_time(rig: Any) -> None:
+def test_concurrent_presses_give_one_capture_at_a_time(rig: Any) -> None:
     def press(_: int) -> str | None:
         try:
             return str(rig.exam.press("OD").result(30).id)
         except Busy:
             return None
 
-    with ThreadPoolExecutor(8) as hands:
-        made = [id for id in hands.map(press, range(16)) if id]
-    assert 1 <= len(made) <= 16
-    assert {capture.id for capture in rig.store.captures()} == set(made)
+    with ThreadPoolExecutor(8) as executor:
+        ids = [id for id in executor.map(press, range(16)) if id]
+    assert 1 <= len(ids) <= 16
+    assert {capture.id for capture in rig.store.captures()} == set(ids)
 
 
-class Astonishing:
-    """A camera with a mistake in its driver that nobody foresaw, or that is pulled out."""
+class FailingCamera:
+    """Camera that raises an unexpected exception, or `error`, while the event is set."""
 
-    def __init__(self, camera: Camera, wrong: Event, error: Exception | None = None) -> None:
-        self._camera, self._wrong = camera, wrong
-        self._error = error or ZeroDivisionError("nobody foresaw this")
+    def __init__(self, camera: Camera, is_failing: Event, error: Exception | None = None) -> None:
+        self._camera, self._is_failing = camera, is_failing
+        self._error = error or ZeroDivisionError("unexpected")
         self.shape = camera.shape
 
-    def prepare(self, shot: Shot) -> None:
-        """Nothing to prepare."""
+    def prepare(self, shot: ExposureSettings) -> None:
+        """Do nothing."""
 
-    def expose(self, shot: Shot, into: Any = None) -> Frame:
-        if self._wrong.is_set():
+    def expose(self, shot: ExposureSettings, into: Any = None) -> Frame:
+        if self._is_failing.is_set():
             raise self._error
         return self._camera.expose(shot, into)
 
@@ -135,91 +138,95 @@ class Astonishing:
         self._camera.close()
 
 
-class Eager(Bulletin):
-    """News that make somebody press: once, as soon as the quick look of the first picture is told."""
+class PressAtQuickLook(EventBus):
+    """Event bus that calls `press` once, at the first event with stage `quick`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.press: Callable[[], Any] | None = None
         self.pressed: list[Any] = []
 
-    def tell(self, kind: str, **data: Any) -> None:
-        super().tell(kind, **data)
+    def publish(self, kind: str, **data: Any) -> None:
+        super().publish(kind, **data)
         if data.get("stage") == "quick" and self.press is not None:
             press, self.press = self.press, None
             self.pressed.append(press())
 
 
-def test_a_press_pauses_a_refinement_which_then_goes_on_to_the_same_picture(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
-    eager.press = lambda: rig.exam.press("OS")
+def planned(rig: Any, plans: Path) -> CapturePipeline:
+    """Return another pipeline of the same head, with the same plans."""
+    return plan_pipeline(rig.exam.head, rig.clock, plans)
+
+
+def test_a_press_suspends_a_refinement_which_resumes_to_the_same_picture(make_rig: Any, plans: Path) -> None:
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
+    event_bus.press = lambda: rig.exam.press("OS")
     first = rig.exam.press("OD").result(30)
-    (second,) = [pressed.result(30) for pressed in eager.pressed]
+    (second,) = [pressed.result(30) for pressed in event_bus.pressed]
     assert rig.store.captures() == [second, first]
-    stages = [data for kind, data in rig.told() if kind == "stage" and data["stage"] != "refine"]
+    stages = [data for kind, data in rig.published_events() if kind == "stage" and data["stage"] != "refine"]
     order = [(data["id"], data["stage"]) for data in stages]
     a, b = first.id, second.id
     assert order[:5] == [(a, "expose"), (a, "quick"), (b, "expose"), (b, "quick"), (a, "keep")]
-    assert first.report["rounds"] == second.report["rounds"] > 5
+    assert first.report.reconstruction.rounds == second.report.reconstruction.rounds > 5
     raw, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in ("raw.tiff", "dark.tiff"))
-    rig.exam.close()  # or it would look, with the same workspace, whether the calibration still fits
-    alone = eye_in(rig.exam._reconstructor(raw, dark, simulated=True).picture, rig.exam.head)
+    alone = crop_to_field(planned(rig, plans).reconstructor(raw, dark, simulated=True).picture, rig.exam.head)
     kept = rig.store.read(a, "picture.png")
-    assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # to the last bit
+    assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # bitwise equal
 
 
-def test_while_a_picture_is_refined_pages_hear_how_far_it_is_and_who_aims_sees_a_live_picture(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
+def test_progress_and_live_pictures_continue_during_a_refinement(make_rig: Any) -> None:
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
 
-    def aim_on() -> int:
+    def request_preview() -> int:
         rig.clock.sleep(1.0)
-        seen: int = rig.exam._preview.number
+        seen: int = rig.exam.snapshot.output.preview.number
         assert rig.exam.preview(seen, wait_s=0.0) is None
         return seen
 
-    eager.press = aim_on
+    event_bus.press = request_preview
     rig.exam.press("OD").result(30)
-    stages = [data for kind, data in rig.told() if kind == "stage"]
+    stages = [data for kind, data in rig.published_events() if kind == "stage"]
     assert [data["stage"] for data in stages[:3]] == ["expose", "quick", "refine"]
     assert stages[-1]["stage"] == "keep"
     fractions = [data["fraction"] for data in stages]
     assert fractions == sorted(fractions)
     assert stages[2]["left_s"] > 0
-    assert rig.exam._preview.number > eager.pressed[0], "made before the picture was done"
+    assert rig.exam.snapshot.output.preview.number > event_bus.pressed[0], "taken before the capture was stored"
 
 
-def test_nobody_aims_nobody_is_lit_while_a_picture_is_refined(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
+def test_the_lamp_is_off_during_a_refinement_without_requests_for_live_pictures(make_rig: Any) -> None:
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
     live = rig.exam.preview(0)
-    eager.press = lambda: rig.clock.sleep(1.0)  # within the three seconds for which a live picture would be wanted
+    event_bus.press = lambda: rig.clock.sleep(1.0)  # less than WANTED_S after the last request
     rig.exam.press("OD").result(30)
     assert live is not None
-    assert rig.exam._preview.number <= live.number + 1, "one may have been under way"
+    assert rig.exam.snapshot.output.preview.number <= live.number + 1, "one may have been in progress"
 
 
-def test_a_press_that_fails_in_the_pause_leaves_the_refinement_alone(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
+def test_a_failed_press_during_a_refinement_does_not_affect_the_refinement(make_rig: Any) -> None:
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
 
     def press_without_a_lamp() -> Any:
         rig.world.faults.add("light.fault")
         return rig.exam.press("OS")
 
-    eager.press = press_without_a_lamp
+    event_bus.press = press_without_a_lamp
     first = rig.exam.press("OD").result(30)
     with pytest.raises(LightFault):
-        eager.pressed[0].result(30)
+        event_bus.pressed[0].result(30)
     assert rig.store.captures() == [first]
     assert rig.exam.state == "aim"
-    assert rig.world.glow is None
+    assert rig.world.illumination is None
 
 
 def test_a_third_press_is_refused_while_two_pictures_are_made(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
 
     def press_twice() -> Any:
         pressed = rig.exam.press("OS")
@@ -228,18 +235,18 @@ def test_a_third_press_is_refused_while_two_pictures_are_made(make_rig: Any) -> 
             rig.exam.press("OD")
         return pressed
 
-    eager.press = press_twice
+    event_bus.press = press_twice
     first = rig.exam.press("OD").result(30)
-    second = eager.pressed[0].result(30)
+    second = event_bus.pressed[0].result(30)
     assert rig.store.captures() == [second, first]
 
 
 def test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made(make_rig: Any) -> None:
-    eager = Eager()
-    rig = make_rig(bulletin=eager)
+    event_bus = PressAtQuickLook()
+    rig = make_rig(event_bus=event_bus)
 
     def press_a_second_time() -> Any:
-        eager.press = press_a_third_time  # at the second picture's quick look: both exposures are done
+        event_bus.press = press_a_third_time  # at the second quick look both exposures are done
         return rig.exam.press("OS")
 
     def press_a_third_time() -> str:
@@ -247,22 +254,24 @@ def test_a_press_is_refused_while_two_exposed_pictures_wait_to_be_made(make_rig:
             rig.exam.press("OD")
         return str(rig.exam.state)
 
-    eager.press = press_a_second_time
+    event_bus.press = press_a_second_time
     first = rig.exam.press("OD").result(30)
-    pressed, state = eager.pressed
+    pressed, state = event_bus.pressed
     second = pressed.result(30)
     assert rig.store.captures() == [second, first]
     assert state == "busy"
 
 
-def test_plans_that_cannot_be_made_are_told_and_nobody_waits(make_rig: Any) -> None:
-    pulled = Event()
-    pulled.set()
-    rig = make_rig(camera=lambda camera: Astonishing(camera, pulled, CameraMissing("no camera")), psfs=2, wait=False)
+def test_a_failure_during_planning_is_reported_and_presses_are_refused(make_rig: Any) -> None:
+    unplugged = Event()
+    unplugged.set()
+    rig = make_rig(
+        camera=lambda camera: FailingCamera(camera, unplugged, CameraMissing("no camera")), psfs=2, wait=False
+    )
     assert rig.died.wait(60)
     assert isinstance(rig.exam.failure, CameraMissing)
     assert rig.exam.state == "starting"
-    assert rig.world.glow is None
+    assert rig.world.illumination is None
     with pytest.raises(Busy):
         rig.exam.press("OD")
 
@@ -271,19 +280,19 @@ FAULTS = {"camera.missing": CameraMissing, "camera.stalled": CameraStalled, "lig
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_broken_part_fails_the_press_dark_and_a_mended_one_works(rig: Any, fault: str) -> None:
+def test_a_hardware_fault_fails_the_press_with_the_lamp_off_until_repaired(rig: Any, fault: str) -> None:
     rig.world.faults.add(fault)
     with pytest.raises(FAULTS[fault]):
         rig.exam.press("OD").result(30)
     assert_dark_and_empty(rig)
-    assert ("failed", fault) in [(kind, data.get("code")) for kind, data in rig.told()]
+    assert ("failed", fault) in [(kind, data.get("code")) for kind, data in rig.published_events()]
     rig.world.faults.clear()
     kept = rig.exam.press("OD").result(30)
     assert rig.store.captures() == [kept]
 
 
 def test_a_lamp_that_cannot_be_darkened_ends_the_process(make_rig: Any) -> None:
-    """What nobody can switch off is for the guardian and for systemd: both act when this process is gone."""
+    """The end of the process makes the guardian process and systemd turn the lamp off."""
     rig = make_rig()
     rig.world.faults.add("light.silent")
     with pytest.raises(LightFault):
@@ -296,15 +305,15 @@ def test_a_lamp_that_cannot_be_darkened_ends_the_process(make_rig: Any) -> None:
 
 
 def assert_dark_and_empty(rig: Any) -> None:
-    assert rig.world.glow is None
+    assert rig.world.illumination is None
     assert rig.exam.state == "aim"
     assert rig.store.captures() == []
     assert list((rig.store.folder / "captures").iterdir()) == []
-    assert rig.told()[-1] == ("state", {"state": "aim"})
+    assert rig.published_events()[-1] == ("state", {"state": "aim"})
     assert not rig.died.is_set()
 
 
-def test_a_full_shelf_keeps_nothing_half_and_works_again_with_room(make_rig: Any) -> None:
+def test_a_full_disk_leaves_no_partial_capture_and_recovers(make_rig: Any) -> None:
     free = [0]
     rig = make_rig(store={"free_bytes": lambda _: free[0]})
     with pytest.raises(StoreFull):
@@ -315,27 +324,27 @@ def test_a_full_shelf_keeps_nothing_half_and_works_again_with_room(make_rig: Any
     assert rig.store.captures() == [kept]
 
 
-def test_a_shot_of_which_no_picture_can_be_made_is_kept_as_it_is(rig: Any) -> None:
-    rig.world.ambient_e_per_s = 1e7  # daylight: every pixel is full
+def test_a_capture_without_reconstruction_is_stored(rig: Any) -> None:
+    rig.world.ambient_e_per_s = 1e7  # daylight saturates every pixel
     bright = rig.exam.press("OD").result(30)
-    assert bright.report["verdict"]["code"] == "shot.saturated"
-    assert (bright.report["method"], bright.report["stopped"]) == ("none", "input.frame")
-    assert "cannot be used" in bright.report["warnings"][0]
-    raw, facts = read_raw_tiff(rig.store.read(bright.id, "raw.tiff"))
+    assert bright.report.verdict.code == "shot.saturated"
+    assert (bright.report.reconstruction.method, bright.report.reconstruction.stopped) == ("none", "input.frame")
+    assert "cannot be used" in bright.report.reconstruction.warnings[0]
+    raw, metadata = read_raw_tiff(rig.store.read(bright.id, "raw.tiff"))
     assert raw.min() == raw.max() > 4000
-    assert facts["glow"] == {"colour": "green", "level": 1.0}
+    assert metadata.illumination == Illumination("green")
     rig.world.ambient_e_per_s = 0.0
     kept = rig.exam.press("OD").result(30)
     assert rig.store.captures() == [kept, bright]
-    assert kept.report["verdict"]["word"] == "good"
+    assert kept.report.verdict.word == "good"
 
 
 def test_a_camera_that_hangs_does_not_keep_the_lamp_on(make_rig: Any, wait_until: Callable[..., None]) -> None:
     rig = make_rig(max_on_s=0.15)
-    rig.hang()
+    rig.block_exposures()
     pressed = rig.exam.press("OD")
-    wait_until(lambda: rig.world.glow is not None)
-    wait_until(lambda: rig.world.glow is None)  # the guard's own timer: the exposure still hangs
+    wait_until(lambda: rig.world.illumination is not None)
+    wait_until(lambda: rig.world.illumination is None)  # by the timer of the guard; the exposure still blocks
     assert not pressed.done()
     rig.clock.gate.set()
     with pytest.raises(Limit, match="went out"):
@@ -343,46 +352,46 @@ def test_a_camera_that_hangs_does_not_keep_the_lamp_on(make_rig: Any, wait_until
     assert_dark_and_empty(rig)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # it ends the thread: on purpose
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # it ends the thread on purpose
 @pytest.mark.parametrize("by", ["press", "preview"])
-def test_what_nobody_foresaw_ends_dark_and_calls_for_a_restart(make_rig: Any, by: str) -> None:
-    wrong = Event()
-    rig = make_rig(camera=lambda camera: Astonishing(camera, wrong))
+def test_an_unexpected_exception_ends_the_exam_with_the_lamp_off(make_rig: Any, by: str) -> None:
+    is_failing = Event()
+    rig = make_rig(camera=lambda camera: FailingCamera(camera, is_failing))
     rig.exam.press("OD").result(30)
-    wrong.set()
+    is_failing.set()
     if by == "press":
         with pytest.raises(DiffuscopeError, match="unexpectedly"):
             rig.exam.press("OD").result(30)
     else:
         assert rig.exam.preview(0, wait_s=0.2) is None
     assert rig.died.wait(10)
-    assert rig.world.glow is None
+    assert rig.world.illumination is None
     assert rig.exam.problem is not None
     with pytest.raises(Busy, match="switched off"):
         rig.exam.press("OD")
     assert len(rig.store.captures()) == 1
 
 
-def test_closing_answers_a_press_that_waits_and_refuses_the_next(rig: Any) -> None:
-    rig.hang()
+def test_close_completes_a_waiting_press_and_refuses_the_next(rig: Any) -> None:
+    rig.block_exposures()
     pressed = rig.exam.press("OD")
-    rig.wait_for_hanging()
-    with ThreadPoolExecutor(1) as aside:
-        closed = aside.submit(rig.exam.close)
+    rig.wait_for_blocked_exposure()
+    with ThreadPoolExecutor(1) as executor:
+        closed = executor.submit(rig.exam.close)
         time.sleep(0.05)
         with pytest.raises(Busy):
             rig.exam.press("OS")
         rig.clock.gate.set()
         closed.result(30)
-    assert rig.store.captures() == [pressed.result(0)]  # what was under way is finished and kept
-    assert rig.world.glow is None
+    assert rig.store.captures() == [pressed.result(0)]  # a capture in progress is completed and stored
+    assert rig.world.illumination is None
     assert not rig.died.is_set()
     with pytest.raises(Busy):
         rig.exam.press("OS")
 
 
-def test_a_press_cannot_be_cancelled_by_a_page_that_goes_away(rig: Any) -> None:
-    rig.hang()
+def test_a_press_cannot_be_cancelled_by_a_disconnected_client(rig: Any) -> None:
+    rig.block_exposures()
     pressed = rig.exam.press("OD")
     assert not pressed.cancel()
     rig.clock.gate.set()
@@ -390,7 +399,7 @@ def test_a_press_cannot_be_cancelled_by_a_page_that_goes_away(rig: Any) -> None:
     assert rig.store.captures() == [kept]
 
 
-# The live preview
+# Live pictures
 
 
 def test_live_pictures_are_numbered_upwards_small_and_lit_in_red(rig: Any) -> None:
@@ -407,24 +416,24 @@ def test_live_pictures_are_numbered_upwards_small_and_lit_in_red(rig: Any) -> No
     assert rig.store.captures() == []
 
 
-def test_the_lamp_rests_when_nobody_asks(rig: Any, wait_until: Callable[..., None]) -> None:
+def test_the_lamp_stays_off_without_requests_for_live_pictures(rig: Any, wait_until: Callable[..., None]) -> None:
     assert rig.world.frames == 0
     assert rig.exam.preview(0) is not None
     wait_until(lambda: rig.clock.elapsed_s >= 3.0)
-    wait_until(lambda: rig.world.glow is None)
+    wait_until(lambda: rig.world.illumination is None)
     time.sleep(0.1)
     frames = rig.world.frames
     assert frames > 5
     time.sleep(0.3)
     assert rig.world.frames == frames
-    assert rig.exam.preview(0, wait_s=0.0) is not None  # and wakes up again
+    assert rig.exam.preview(0, wait_s=0.0) is not None  # a new request starts it again
     wait_until(lambda: rig.world.frames > frames)
 
 
-def test_aiming_leaves_the_eye_as_much_darkness_as_light(make_rig: Any) -> None:
+def test_the_duty_cycle_of_the_aiming_light_is_at_most_one_half(make_rig: Any) -> None:
     rig = make_rig(max_on_s=1.0)
     number = 0
-    while rig.clock.elapsed_s < 6:  # the guard would refuse after one second of debt
+    while rig.clock.elapsed_s < 6:  # with a higher duty cycle the guard would refuse
         live = rig.exam.preview(number)
         assert live is not None
         number = live.number
@@ -433,7 +442,7 @@ def test_aiming_leaves_the_eye_as_much_darkness_as_light(make_rig: Any) -> None:
     assert rig.store.captures() == [kept]
 
 
-def test_a_press_goes_before_the_preview_which_comes_back(rig: Any) -> None:
+def test_a_press_has_priority_over_the_live_pictures_which_resume(rig: Any) -> None:
     before = rig.exam.preview(0)
     assert before is not None
     kept = rig.exam.press("OD").result(30)
@@ -443,28 +452,30 @@ def test_a_press_goes_before_the_preview_which_comes_back(rig: Any) -> None:
     assert after.number > before.number
 
 
-def test_a_problem_of_the_preview_is_told_once_and_forgotten_when_it_is_over(
-    rig: Any, wait_until: Callable[..., None]
-) -> None:
+def test_an_error_of_the_live_pictures_is_published_once_and_cleared(rig: Any, wait_until: Callable[..., None]) -> None:
     rig.world.faults.add("camera.stalled")
     assert rig.exam.preview(0, wait_s=0.1) is None
     wait_until(lambda: rig.exam.problem is not None)
-    wait_until(lambda: rig.clock.elapsed_s >= 3.0)  # several tries in virtual time
+    wait_until(lambda: rig.clock.elapsed_s >= 3.0)  # several attempts in virtual time
     assert rig.exam.problem.code == "camera.stalled"
-    assert [kind for kind, _ in rig.told()] == ["state", "failed"]
-    assert rig.world.glow is None
+    assert [kind for kind, _ in rig.published_events()] == ["state", "failed"]
+    assert rig.world.illumination is None
     rig.world.faults.clear()
     assert rig.exam.preview(0) is not None
     wait_until(lambda: rig.exam.problem is None)
 
 
-def test_aiming_in_red_and_the_picture_in_green_each_have_their_own_psf(make_rig: Any) -> None:
+def test_aiming_in_red_and_the_picture_in_green_each_have_their_own_psf(make_rig: Any, plans: Path) -> None:
     rig = make_rig(tinted=("green", "red"))
-    assert rig.exam._reconstructor.calibration.psfs[0].colour == "green"
-    assert rig.exam._live.calibration.psfs[0].colour == "red"
+    pipeline = planned(rig, plans)
+    assert isinstance(pipeline.reconstructor, Reconstructor)
+    assert isinstance(pipeline.live, Reconstructor)
+    assert pipeline.reconstructor.calibration.psfs[0].colour == "green"
+    assert pipeline.live.calibration.psfs[0].colour == "red"
     assert rig.exam.preview(0) is not None
     assert rig.exam.press("OD").result(30).calibration_id == rig.exam.head.calibration.id
 
 
-def test_one_psf_for_every_colour_needs_one_reconstructor(old_rig: Any) -> None:
-    assert old_rig.exam._live is old_rig.exam._reconstructor
+def test_one_psf_for_every_colour_needs_one_reconstructor(old_rig: Any, plans: Path) -> None:
+    pipeline = planned(old_rig, plans)
+    assert pipeline.live is pipeline.reconstructor

@@ -1,4 +1,4 @@
-"""`diffuscope frontier` as a process: a small scene in, points and a plot out; what cannot be measured is said."""
+"""`diffuscope frontier` as a process: points and plot of a small scene, and refusals."""
 
 import json
 import os
@@ -39,17 +39,17 @@ def diffuscope(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The diabetic scene on pixels that are twelve times as wide."""
+    """The diabetic scene with pixels of twelve times the width."""
     text = DIABETIC.read_text()
-    said = 'sensor = "quantalux"\n'
-    assert said in text
-    text = text.replace(said, said + "rows = 90\ncols = 160\npitch_um = 60.48\n")
+    sensor_line = 'sensor = "quantalux"\n'
+    assert sensor_line in text
+    text = text.replace(sensor_line, sensor_line + "rows = 90\ncols = 160\npitch_um = 60.48\n")
     path = tmp_path_factory.mktemp("scene") / "tiny.toml"
     path.write_text(text)
     return path
 
 
-def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
+def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
     found, plot = tmp_path / "f.json", tmp_path / "f.svg"
     done = diffuscope(
         "frontier", "--scene", tiny, "--json", found, "--plot", plot, "--repeats", 5, "--budget-s", 5
@@ -64,7 +64,7 @@ def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: P
     assert {point["method"] for point in facts["points"]} == set(METHODS)
     validated = {point["bin"]: point for point in facts["points"] if point["method"] == "tikhonov"}
     assert {one["bin"] for one in facts["best_mu"]} == set(validated)
-    for one in facts["best_mu"]:  # the best of eight weights, against the one that the frame alone suggests
+    for one in facts["best_mu"]:  # best of eight weights, compared with the estimate from the frame alone
         assert 1e-6 <= one["mu"] <= 3.2e-3
         assert one["pcc"] > validated[one["bin"]]["pcc"] - 0.01
     assert done.stdout.count("tikhonov with the best mu") == len(validated)
@@ -80,8 +80,8 @@ def test_a_small_scene_gives_points_a_choice_and_a_plot(diffuscope: Run, tiny: P
     assert len([line for line in done.stderr.splitlines() if " dB, PCC " in line]) == len(facts["points"])
 
 
-def test_files_are_measured_as_a_scene_is(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
-    """With the head's geometry the same; the PSF file has no noise, so the figures may only be better."""
+def test_files_give_the_same_scores_as_a_scene(diffuscope: Run, tiny: Path, tmp_path: Path) -> None:
+    """With the head's geometry the scores are equal; the PSF file has no noise, so they may only be better."""
     assert diffuscope("simulate", tiny, "-o", tmp_path).returncode == 0
     files = ("--raw", tmp_path / "raw.tiff", "--psf", tmp_path / "psf.tiff", "--truth", tmp_path / "truth.npy")
     out = ("--json", tmp_path / "f.json", "--plot", tmp_path / "f.svg", "--repeats", 1)
@@ -108,7 +108,7 @@ def test_files_are_measured_as_a_scene_is(diffuscope: Run, tiny: Path, tmp_path:
         (("--scene", DIABETIC, "--plot", "nowhere/f.svg"), "a folder that does not exist"),
     ],
 )
-def test_what_cannot_be_measured_is_said(
+def test_impossible_measurement_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[object, ...], says: str
 ) -> None:
     rng = np.random.default_rng(0)
@@ -123,6 +123,6 @@ def test_what_cannot_be_measured_is_said(
     with pytest.raises(SystemExit) as stop:
         main(["frontier", *map(str, asked), "--json", str(tmp_path / "f.json")])
     assert stop.value.code == 2
-    said = capsys.readouterr().err
-    assert says in said
+    printed = capsys.readouterr().err
+    assert says in printed
     assert not (tmp_path / "f.json").exists()

@@ -1,14 +1,14 @@
-"""`diffuscope health` against a real server over real HTTP: well, not there, and a server that says nothing."""
+"""Health checks against a real server over HTTP: healthy, faulty, unreachable and hanging."""
 
 import json
 import socket
 from collections.abc import Callable
 from typing import Any
 
-from services.health.probe import examine
+from services.health.probe import probe_instrument
 
 
-def test_health_lists_every_check_and_driven_faults_fail_them(old_rig: Any, wait_until: Callable[..., None]) -> None:
+def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait_until: Callable[..., None]) -> None:
     old_rig.request("POST", "/api/captures", json={"eye": "OD"})
     well = old_rig.request("GET", "/api/health").json()
     assert {check["name"] for check in well["checks"]} == {
@@ -23,27 +23,27 @@ def test_health_lists_every_check_and_driven_faults_fail_them(old_rig: Any, wait
     old_rig.world.faults.clear()
 
 
-def test_a_damaged_capture_is_found(rig: Any) -> None:
-    kept = rig.request("POST", "/api/captures", json={"eye": "OD"}).json()
-    path = rig.exam.store.folder / "captures" / kept["id"] / "raw.tiff"
+def test_damaged_capture_fails_the_captures_check(rig: Any) -> None:
+    capture = rig.request("POST", "/api/captures", json={"eye": "OD"}).json()
+    path = rig.exam.store.folder / "captures" / capture["id"] / "raw.tiff"
     path.write_bytes(path.read_bytes()[:-1] + b"\x00\x01")
     checks = {check["name"]: check for check in rig.request("GET", "/api/health").json()["checks"]}
     assert not checks["captures"]["ok"]
     assert "SHA-256" in checks["captures"]["value"]
 
 
-def test_a_server_that_is_not_there_or_says_nothing_fails_one_check() -> None:
+def test_unreachable_or_hanging_server_fails_the_page_check() -> None:
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         port = silent.getsockname()[1]
-        refused = examine(f"http://127.0.0.1:{port}")
+        refused = probe_instrument(f"http://127.0.0.1:{port}")
         silent.listen()
-        hung = examine(f"http://127.0.0.1:{port}", patience_s=0.3)
+        hung = probe_instrument(f"http://127.0.0.1:{port}", timeout_s=0.3)
     for checks in (refused, hung):
         assert [(check.name, check.ok, check.of_release) for check in checks] == [("page", False, True)]
 
 
-def test_the_command_prints_and_exits_by_what_it_found(diffuscope: Callable[..., Any]) -> None:
+def test_health_command_exits_with_1_if_a_check_fails(diffuscope: Callable[..., Any]) -> None:
     done = diffuscope("health", "--at", "http://127.0.0.1:9", "--json")
     assert done.returncode == 1
     assert json.loads(done.stdout)[0]["name"] == "page"

@@ -1,4 +1,4 @@
-"""An update as the technician's page asks for it: the API on one side, the real updater on the other, files between."""
+"""Updates from the technician's page: HTTP API and the real updater, connected by files."""
 
 import asyncio
 import json
@@ -15,12 +15,12 @@ import httpx
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import UpdateDuringExam
-from services.instrument.api import create_app
-from services.instrument.updates_api import update_routes
-from services.instrument.updating import MOST_BYTES, PATIENCE_S, UpdateDesk, news
-from services.records.update_notes import TABLET, UPLOAD, WISH, Wish, leave
-from services.update import gate
+from services.errors import UpdateDuringExam
+from services.http.app import create_app
+from services.http.routes.updates import update_routes
+from services.instrument.update_requests import MOST_BYTES, PICKUP_TIMEOUT_S, UpdateRequests, release_notes
+from services.update import preconditions
+from services.update.ipc import REQUEST_FILE, TABLET, UPLOAD, UpdateRequest, write_request
 from services.update.updater import Updater
 from tests.appliance.instrument import served
 from tests.journey.conftest import Rig
@@ -29,7 +29,7 @@ from tests.updates import Board
 
 @dataclass
 class Page:
-    """The technician's page, behind the PIN, of a device that runs 1.0."""
+    """Client of the technician's page, logged in, on a device that runs version 1.0."""
 
     rig: Rig
     board: Board
@@ -40,15 +40,15 @@ class Page:
         headers = self.cookie | options.pop("headers", {})
         return self.rig.request(method, f"/api/update{path}", headers=headers, **options)
 
-    def told(self) -> dict[str, Any]:
+    def status(self) -> dict[str, Any]:
         return dict(self.ask("GET").json())
 
     def answered(self, method: str, path: str, runs: str = "1.0", **options: Any) -> dict[str, Any]:
-        """Ask for something, let the updater do it, and what the page shows then."""
+        """Send a request, run the updater, and return the status after it."""
         answer = self.ask(method, path, **options)
         assert (answer.status_code, answer.json()["state"]) == (202, "asked")
         self.board.updater(runs).answer()
-        return self.told()
+        return self.status()
 
     def looked(self) -> dict[str, Any]:
         return self.answered("POST", "/check")
@@ -66,72 +66,78 @@ def rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.fixture
 def page(rig: Rig, tmp_path: Path) -> Page:
     board, clock = Board.new(tmp_path / "board"), VirtualClock()
-    desk = UpdateDesk(board.state, board.wishes, clock, "1.0")
-    app = create_app(rig.owner, rig.door, names=("eye.local",), rooms=(update_routes(desk, rig.door),))
-    new = replace(rig, app=app)
-    door = "unlock" if rig.door.has_pin else "pin"
-    entered = new.request("POST", f"/api/technician/{door}", json={"pin": "2580"})
+    desk = UpdateRequests(board.state, board.requests, clock, "1.0")
+    application = create_app(
+        rig.arbiter,
+        rig.authenticator,
+        host_names=("eye.local",),
+        technician_routers=(update_routes(desk, rig.authenticator),),
+    )
+    new = replace(rig, application=application)
+    action = "unlock" if rig.authenticator.has_pin else "pin"
+    entered = new.request("POST", f"/api/technician/{action}", json={"pin": "2580"})
     return Page(new, board, clock, {"Cookie": f"technician={entered.cookies['technician']}"})
 
 
-def test_strangers_neither_look_nor_act(page: Page) -> None:
+def test_update_endpoints_need_the_login(page: Page) -> None:
     page.cookie = {}
     for method, path in (("GET", ""), ("POST", "/check"), ("POST", "/restart"), ("PUT", "/file")):
         assert page.ask(method, path).status_code == 401
     assert page.ask("POST", "/install", json={"id": "0" * 16}).status_code == 401
     assert page.ask("PUT", "/file", content=b"x" * 20_000).json()["code"] == "technician.locked"
-    assert list(page.board.wishes.iterdir()) == []
+    assert list(page.board.requests.iterdir()) == []
 
 
-def test_from_a_stick_to_the_next_version(page: Page) -> None:
+def test_update_from_a_usb_drive_to_the_commit(page: Page) -> None:
     page.board.bundle("two.raucb")
-    assert page.told() | {"found": []} == page.told()
+    assert page.status() | {"found": []} == page.status()
     (found,) = page.looked()["found"]
     assert (found["version"], found["where"], found["stick"], found["trouble"]) == ("2.0", "stick", "STICK", None)
-    assert str(page.board.folder) not in json.dumps(page.told())  # no path leaves the updater
+    assert str(page.board.folder) not in json.dumps(page.status())  # the status holds no path
     now = page.installed(found["id"])
     assert (now["state"], now["version"], page.board.is_off, page.board.boot()) == ("restarting", "2.0", True, "B")
     page.board.chooser.set_good("B")
     page.board.updater("2.0")._journal.write(state="committed")
-    after = UpdateDesk(page.board.state, page.board.wishes, page.clock, "2.0").told()
-    assert (after["state"], after["runs"], after["trouble"]) == ("committed", "2.0", None)
-    assert after["news"]
+    after = UpdateRequests(page.board.state, page.board.requests, page.clock, "2.0").status()
+    assert (after.state, after.runs, after.trouble) == ("committed", "2.0", None)
+    assert after.news
 
 
-def test_how_long_an_update_takes_is_what_the_last_one_took_or_an_estimate(page: Page) -> None:
-    """Timed from the copy to the restart, and from the start of the computer until it was found well."""
+def test_duration_of_an_update_is_measured_or_estimated(page: Page) -> None:
+    """Measured from the copy to the restart, and from the boot until the version is found healthy."""
     board = page.board
     board.bundle("two.raucb")
     (found,) = page.looked()["found"]
     low_s, high_s = found["takes_s"]
-    assert (0 < low_s < high_s, page.told()["took_s"]) == (True, None)
+    assert (0 < low_s < high_s, page.status()["took_s"]) == (True, None)
     page.installed(found["id"])
     board.boot()
     with served() as instrument:
         settings = board.settings(instrument=instrument.at, answer_s=2.0)
         Updater(settings, VirtualClock(elapsed_s=100.0), print, board.chooser, "2.0").settle()
-    told = UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()
-    assert told["state"] == "committed"
-    assert 100 < told["took_s"] < 160  # the install took a second or two
+    status = UpdateRequests(board.state, board.requests, page.clock, "2.0").status()
+    assert status.state == "committed"
+    assert status.took_s is not None
+    assert 100 < status.took_s < 160  # the install takes one or two seconds
     board.bundle("three.raucb", "3.0")
-    board.updater("2.0").look()
-    assert UpdateDesk(board.state, board.wishes, page.clock, "2.0").told()["took_s"] == told["took_s"]
+    board.updater("2.0").search()
+    assert UpdateRequests(board.state, board.requests, page.clock, "2.0").status().took_s == status.took_s
 
 
-def test_a_version_that_is_not_well_is_taken_back_and_says_why(page: Page) -> None:
+def test_unhealthy_version_is_rolled_back_with_the_reason(page: Page) -> None:
     page.board.bundle("two.raucb")
     page.installed(page.looked()["found"][0]["id"])
     assert page.board.boot() == "B"
-    said = page.board.run("settle", "2.0")  # its page does not answer
-    assert "UpdateFailed" in said
+    output = page.board.run("settle", "2.0")  # no server is running
+    assert "UpdateFailed" in output
     assert page.board.boot() == "A"
-    now = page.told()
+    now = page.status()
     assert (now["state"], now["version"], now["trouble"]["code"]) == ("went back", "2.0", "update.failed")
     assert "page: does not answer" in now["trouble"]["message"]
-    assert page.looked()["state"] == "none"  # it was read; now it is about the next one
+    assert page.looked()["state"] == "none"  # a new search replaces the old outcome
 
 
-def test_each_bundle_on_the_stick_says_why_it_is_none_for_this_device(page: Page) -> None:
+def test_each_unsuitable_bundle_is_listed_with_its_error(page: Page) -> None:
     board = page.board
     board.bundle("foreign.raucb", signer="a stranger")
     board.bundle("other.raucb", compatible="toaster")
@@ -145,21 +151,21 @@ def test_each_bundle_on_the_stick_says_why_it_is_none_for_this_device(page: Page
         "foreign.raucb": "update.foreign", "other.raucb": "update.device", "older.raucb": "update.older",
         "far.raucb": "update.step", "damaged.raucb": "update.damaged",
     }  # fmt: skip
-    now = page.installed(found["foreign.raucb"]["id"])  # whoever insists is refused by the updater
+    now = page.installed(found["foreign.raucb"]["id"])  # the updater itself refuses it too
     assert (now["state"], now["trouble"]["code"]) == ("refused", "update.foreign")
     assert len(now["found"]) == 5
 
 
-def test_what_is_refused_at_the_install_is_named(page: Page) -> None:
+def test_each_refused_install_has_its_code(page: Page) -> None:
     board = page.board
     small, gone = board.bundle("small.raucb", slot="small"), board.bundle("gone.raucb")
     ids = {one["name"]: one["id"] for one in page.looked()["found"]}
     assert page.installed(ids[small.name])["trouble"]["code"] == "update.room"
     gone.unlink()
     assert page.installed(ids[gone.name])["trouble"]["code"] == "update.stick"
-    gone.write_bytes(small.read_bytes())  # another file under that name is not what was chosen
+    gone.write_bytes(small.read_bytes())  # another file of that name is not the chosen one
     assert page.installed(ids[gone.name])["trouble"]["code"] == "update.stick"
-    with gate.alone(board.state):
+    with preconditions.update_lock(board.state):
         assert page.installed(ids[small.name])["trouble"]["code"] == "update.busy"
     (board.folder / "cmdline").write_text("rauc.slot=B\n")
     assert page.installed(ids[small.name])["trouble"]["code"] == "update.uncommitted"
@@ -168,59 +174,59 @@ def test_what_is_refused_at_the_install_is_named(page: Page) -> None:
     assert not board.is_off
 
 
-def test_a_forged_wish_is_told_and_changes_nothing(page: Page) -> None:
-    (page.board.wishes / WISH).write_text('{"do": "install", "id": "/media/STICK/two.raucb"}')
+def test_forged_request_is_reported_and_has_no_effect(page: Page) -> None:
+    (page.board.requests / REQUEST_FILE).write_text('{"do": "install", "id": "/media/STICK/two.raucb"}')
     page.board.updater("1.0").answer()
-    assert page.told()["trouble"]["code"] == "update.request"
-    leave(page.board.wishes, Wish(do="install", id="0123456789abcdef"))  # a name that nobody gave
+    assert page.status()["trouble"]["code"] == "update.request"
+    write_request(page.board.requests, UpdateRequest(do="install", id="0123456789abcdef"))  # an unknown id
     page.board.updater("1.0").answer()
-    assert page.told()["trouble"]["code"] == "update.stick"
-    for said in ({"id": "../../etc"}, {}, {"id": "0" * 16, "path": "/"}):
-        assert page.ask("POST", "/install", json=said).status_code == 422
+    assert page.status()["trouble"]["code"] == "update.stick"
+    for body in ({"id": "../../etc"}, {}, {"id": "0" * 16, "path": "/"}):
+        assert page.ask("POST", "/install", json=body).status_code == 422
 
 
-def test_one_wish_at_a_time_and_one_that_nobody_takes_is_taken_back(page: Page) -> None:
+def test_one_request_at_a_time_and_an_unanswered_one_expires(page: Page) -> None:
     assert page.ask("POST", "/check").status_code == 202
     again = page.ask("POST", "/restart")
     assert (again.status_code, again.json()["code"]) == (409, "update.busy")
-    page.clock.sleep(PATIENCE_S)
-    now = page.told()
+    page.clock.sleep(PICKUP_TIMEOUT_S)
+    now = page.status()
     assert (now["state"], now["trouble"]["code"]) == ("none", "update.failed")
-    assert list(page.board.wishes.iterdir()) == []
+    assert list(page.board.requests.iterdir()) == []
     assert page.looked()["trouble"] is None
 
 
-def test_an_update_that_was_killed_is_told_as_interrupted(page: Page) -> None:
+def test_killed_update_is_shown_as_interrupted(page: Page) -> None:
     page.board.updater("1.0")._journal.write(state="installing", version="2.0", share=0.4)
-    assert page.told()["state"] == "installing"
+    assert page.status()["state"] == "installing"
     assert page.ask("POST", "/check").status_code == 409
-    page.board.updater("1.0").tidy()  # as ExecStopPost calls it
-    assert page.told()["state"] == "interrupted"
+    page.board.updater("1.0").tidy()  # called by ExecStopPost=
+    assert page.status()["state"] == "interrupted"
     page.board.updater("1.0")._journal.write(state="installing", version="2.0", share=0.4)
-    after = UpdateDesk(page.board.state, page.board.wishes, page.clock, "1.0", boot="the next").told()
-    assert after["state"] == "interrupted"  # and after a power cut nobody had time to say so
+    after = UpdateRequests(page.board.state, page.board.requests, page.clock, "1.0", boot="the next").status()
+    assert after.state == "interrupted"  # after a power cut, without `tidy`
 
 
-def test_what_is_installed_can_be_tried_later(page: Page) -> None:
+def test_installed_version_can_be_tried_later(page: Page) -> None:
     page.board.updater("1.0").install(page.board.bundle("two.raucb"), restart=False)
-    assert page.told()["state"] == "installed"
+    assert page.status()["state"] == "installed"
     assert page.answered("POST", "/restart")["state"] == "restarting"
     assert page.board.boot() == "B"
 
 
-def test_a_tablet_sends_an_update_and_it_is_found(page: Page) -> None:
+def test_uploaded_update_is_found_and_installed(page: Page) -> None:
     content = page.board.bundle("two.raucb").read_bytes()
     (page.board.stick / "two.raucb").unlink()
     assert page.ask("PUT", "/file", content=content).status_code == 201
-    kept = page.board.state / TABLET / UPLOAD
-    assert (kept.read_bytes(), kept.stat().st_mode & 0o777) == (content, 0o644)
+    uploaded = page.board.state / TABLET / UPLOAD
+    assert (uploaded.read_bytes(), uploaded.stat().st_mode & 0o777) == (content, 0o644)
     (found,) = page.looked()["found"]
     assert (found["where"], found["version"]) == ("tablet", "2.0")
     assert page.installed(found["id"])["state"] == "restarting"
-    assert not kept.exists()
+    assert not uploaded.exists()
 
 
-def test_a_tablets_file_arrives_whole_or_not_at_all(page: Page) -> None:
+def test_incomplete_or_oversized_upload_is_refused_and_leaves_no_file(page: Page) -> None:
     folder = page.board.state / TABLET
     for length, code in ((0, "input"), (MOST_BYTES + 1, "input"), (10**15, "input")):
         answer = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(length)})
@@ -231,17 +237,17 @@ def test_a_tablets_file_arrives_whole_or_not_at_all(page: Page) -> None:
 
     answer = page.ask("PUT", "/file", content=halves(), headers={"Content-Length": "8"})
     assert (answer.status_code, answer.json()["message"]) == (422, "4 of 8 bytes arrived")
-    assert page.ask("PUT", "/file", content=halves()).status_code == 422  # who does not say how much
-    assert page.ask("POST", "/check", content=b"x" * 20_000).status_code == 422  # nothing else may be large
+    assert page.ask("PUT", "/file", content=halves()).status_code == 422  # without Content-Length
+    assert page.ask("POST", "/check", content=b"x" * 20_000).status_code == 422  # other endpoints have a small limit
     assert list(folder.iterdir()) == []
 
 
-def test_no_room_and_a_second_tablet_are_said(page: Page) -> None:
-    roomless = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(MOST_BYTES)})
-    if roomless.status_code != 422:  # a computer with a small disk
-        assert roomless.json()["code"] == "update.room"
+def test_full_disk_and_a_concurrent_upload_are_refused(page: Page) -> None:
+    too_large = page.ask("PUT", "/file", content=b"", headers={"Content-Length": str(MOST_BYTES)})
+    if too_large.status_code != 422:  # on a computer with a small disk
+        assert too_large.json()["code"] == "update.room"
 
-    async def story() -> list[int]:
+    async def scenario() -> list[int]:
         begun, go_on = asyncio.Event(), asyncio.Event()
 
         async def slowly() -> Any:
@@ -259,33 +265,38 @@ def test_no_room_and_a_second_tablet_are_said(page: Page) -> None:
             go_on.set()
             return [(await first).status_code, second.status_code]
 
-    assert asyncio.run(story()) == [201, 409]
+    assert asyncio.run(scenario()) == [201, 409]
     assert (page.board.state / TABLET / UPLOAD).read_bytes() == b"whole"
 
 
-def test_a_computer_without_an_updater_says_so(rig: Rig, page: Page, tmp_path: Path) -> None:
+def test_computer_without_updater_refuses_updates(rig: Rig, page: Page, tmp_path: Path) -> None:
     for desk in (
-        UpdateDesk(None, None, page.clock, "1.0"),
-        UpdateDesk(tmp_path / "no", tmp_path / "where", page.clock, "1.0"),
+        UpdateRequests(None, None, page.clock, "1.0"),
+        UpdateRequests(tmp_path / "no", tmp_path / "where", page.clock, "1.0"),
     ):
-        page.rig.app = create_app(rig.owner, rig.door, names=("eye.local",), rooms=(update_routes(desk, rig.door),))
-        assert (page.told()["here"], page.told()["state"]) == (False, "none")
+        page.rig.application = create_app(
+            rig.arbiter,
+            rig.authenticator,
+            host_names=("eye.local",),
+            technician_routers=(update_routes(desk, rig.authenticator),),
+        )
+        assert (page.status()["here"], page.status()["state"]) == (False, "none")
         answer = page.ask("POST", "/check")
         assert (answer.status_code, answer.json()["code"]) == (409, "update.device")
         assert page.ask("PUT", "/file", content=b"x").json()["code"] == "update.device"
 
 
-def test_what_is_new_is_the_versions_own_list_without_marks(tmp_path: Path) -> None:
+def test_news_is_the_changelog_list_of_the_version_as_plain_text(tmp_path: Path) -> None:
     file = tmp_path / "CHANGELOG.md"
     file.write_text("# Changes\n\n## 2.0\n\nWords.\n\n* **New:** `a`,\n  and b.\n* c\n\n## 1.0 (2026)\n\n* old\n")
-    assert news("2.0", file) == ["New: a, and b.", "c"]
-    assert news("1.0", file) == ["old"]
-    assert news("3.0", file) == ["New: a, and b.", "c"]
-    assert news("1.0", tmp_path / "none") == []
+    assert release_notes("2.0", file) == ["New: a, and b.", "c"]
+    assert release_notes("1.0", file) == ["old"]
+    assert release_notes("3.0", file) == ["New: a, and b.", "c"]
+    assert release_notes("1.0", tmp_path / "none") == []
 
 
-def test_an_open_visit_is_an_examination_which_an_update_does_not_end(rig: Rig, page: Page) -> None:
-    """Asked over HTTP of the page's own answers, as the updater asks."""
+def test_open_visit_delays_an_update(rig: Rig, page: Page) -> None:
+    """The precondition asks the page over HTTP, as the updater does."""
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -303,6 +314,6 @@ def test_an_open_visit_is_an_examination_which_an_update_does_not_end(rig: Rig, 
         begun = datetime.fromisoformat(visit["begun_at"])
         at = f"http://127.0.0.1:{server.server_port}"
         with pytest.raises(UpdateDuringExam, match=visit["number"]):
-            gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=29))
-        gate.refuse_unless_at_rest(at, 0.0, begun + timedelta(minutes=31))
+            preconditions.refuse_while_in_use(at, 0.0, begun + timedelta(minutes=29))
+        preconditions.refuse_while_in_use(at, 0.0, begun + timedelta(minutes=31))
         server.shutdown()

@@ -1,4 +1,4 @@
-"""A visit over HTTP: from a number to an outcome, with everything that a page, a network or a stranger may do to it."""
+"""Visits over HTTP: from a number to an outcome, with invalid, hostile, repeated and concurrent requests."""
 
 import asyncio
 import json
@@ -6,10 +6,11 @@ from itertools import count
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
-from device.sim import stage
+from device.sim import calibration_targets
+from services.instrument.exam_requests import WANTED_S
+from tests.journey.conftest import until
 
 SLOTS = ["R-centre", "R-nerve", "L-centre", "L-nerve"]
 EYES = {"R-centre": "OD", "R-nerve": "OD", "L-centre": "OS", "L-nerve": "OS"}
@@ -41,13 +42,15 @@ def begin(rig: Any, number: str | None = None) -> Any:
 
 
 def patch(rig: Any, visit: Any, field: str, value: Any) -> httpx.Response:
-    body = json.dumps({"key": next(keys), "field": field, "value": value})  # escaped: half a character travels so
+    body = json.dumps(
+        {"key": next(keys), "field": field, "value": value}
+    )  # escaped, so that a lone surrogate can be sent
     answer: httpx.Response = rig.request("PATCH", f"/api/visits/{visit['id']}", content=body, headers=JSON)
     return answer
 
 
 def agreed(rig: Any) -> Any:
-    """A new visit whose person agreed to pictures."""
+    """Begin a visit with consent."""
     return patch(rig, begin(rig), "consent", "agreed").json()
 
 
@@ -55,7 +58,7 @@ def shoot(rig: Any, visit: Any, slot: str) -> Any:
     return post(rig, "/api/captures", eye=EYES[slot], visit=visit["id"], slot=slot)
 
 
-def test_a_whole_visit_from_a_number_to_the_reader(old_rig: Any) -> None:
+def test_a_complete_visit_from_number_to_outcome(old_rig: Any) -> None:
     assert [slot["id"] for slot in old_rig.request("GET", "/api/protocol").json()["slots"]] == SLOTS
     visit = begin(old_rig)
     assert visit["number"].startswith("A")
@@ -78,7 +81,7 @@ def test_a_whole_visit_from_a_number_to_the_reader(old_rig: Any) -> None:
     assert listed["counts"]["done"] >= 1
 
 
-def test_a_retake_keeps_the_old_picture_and_the_operator_chooses(old_rig: Any) -> None:
+def test_a_retake_keeps_the_old_picture_and_the_user_chooses(old_rig: Any) -> None:
     visit = agreed(old_rig)
     first, second = shoot(old_rig, visit, "R-centre"), shoot(old_rig, visit, "R-centre")
     slot = old_rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
@@ -95,53 +98,58 @@ def test_a_retake_keeps_the_old_picture_and_the_operator_chooses(old_rig: Any) -
 
 
 def live(rig: Any, after: int) -> Any:
-    """The next live picture, however busy the computer is: asked again as a page does."""
+    """Return the next live picture; repeats the request as a page does."""
     while (answer := rig.request("GET", f"/api/preview?after={after}")).status_code == 204:
         pass
     return answer
 
 
-def test_a_wall_instead_of_an_eye_is_told_at_once_and_after_the_retakes_it_is_not_clear(make_rig: Any) -> None:
+def test_a_wall_instead_of_an_eye_is_reported_before_the_reconstruction(make_rig: Any) -> None:
     rig = make_rig()
     visit = agreed(rig)
+    requested_s = rig.clock.now_s()
     aim = json.loads(rig.request("GET", "/api/preview").headers["x-aim"])
     assert aim == {"code": "ready", "fill": pytest.approx(0.98, abs=0.03)}
-    rig.clock.elapsed_s += 60  # so that nobody takes the wall for the lid of the eye that was there
-    eye = rig.world._rates  # what each colour of the lamp brings back; a wall gives it back evenly
-    rig.world._rates = {colour: np.full_like(light, light.mean()) for colour, light in eye.items()}
+    until(lambda: rig.clock.now_s() >= requested_s + WANTED_S and rig.world.illumination is None)
+    rig.clock.elapsed_s += 60  # with the lamp off; so that the wall does not count as the lid of the earlier eye
+    rig.world.faults.add("eye.closed")  # a wall reflects uniformly, as a lid does
     causes = [shoot(rig, visit, "R-centre")["verdict"] for _ in range(4)]
     assert {one["word"] for one in causes} == {"again"}
     assert [one["code"] for one in causes] == ["shot.noeye"] * 2 + ["shot.poor"] * 2
     slot = rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]
-    assert (slot["state"], slot["tries"]) == ("taken", 4)  # the real, poor picture, never an empty box
+    assert (slot["state"], slot["tries"]) == ("taken", 4)  # the poor picture, never an empty slot
     assert slot["verdict"]["code"] == "shot.poor"
-    told = [(kind, data.get("word"), data.get("code")) for kind, data in rig.told() if kind in ("verdict", "stage")]
-    assert told.index(("verdict", "again", "shot.noeye")) < 3  # before anything was made of it
+    events = [
+        (kind, data.get("word"), data.get("code"))
+        for kind, data in rig.published_events()
+        if kind in ("verdict", "stage")
+    ]
+    assert events.index(("verdict", "again", "shot.noeye")) < 3  # before the reconstruction
     number = int(live(rig, 0).headers["x-frame"])
     assert json.loads(live(rig, number).headers["x-aim"]) == {"code": "noeye", "fill": 0.0}
-    rig.world._rates = eye
+    rig.world.faults.clear()
     assert shoot(rig, visit, "R-centre")["verdict"]["word"] == "good"
     assert rig.request("GET", f"/api/visits/{visit['id']}").json()["slots"]["R-centre"]["verdict"]["word"] == "good"
-    heard = [data for kind, data in rig.told() if kind == "aim"]
-    assert [one["code"] for one in heard][:2] == ["ready", "noeye"]
+    aims = [data for kind, data in rig.published_events() if kind == "aim"]
+    assert [one["code"] for one in aims][:2] == ["ready", "noeye"]
 
 
-def test_too_much_light_is_told_even_if_no_picture_can_be_made(make_rig: Any) -> None:
+def test_saturation_is_reported_without_a_reconstruction(make_rig: Any) -> None:
     rig = make_rig()
-    rig.world.stage = stage.screen(rig.world, 1e9)
+    rig.world.target = calibration_targets.screen(rig.world, 1e9)
     answer = rig.request("POST", "/api/captures", json={"eye": "OD", "key": next(keys)})
     assert answer.status_code == 201
     assert answer.json()["verdict"]["code"] == "shot.saturated"
-    told = [(kind, data.get("code")) for kind, data in rig.told() if kind in ("verdict", "failed")]
-    assert told == [("verdict", "shot.saturated")]
+    events = [(kind, data.get("code")) for kind, data in rig.published_events() if kind in ("verdict", "failed")]
+    assert events == [("verdict", "shot.saturated")]
 
 
-def test_could_not_is_a_finished_outcome(old_rig: Any) -> None:
+def test_a_visit_without_possible_pictures_can_be_finished(old_rig: Any) -> None:
     visit = begin(old_rig)
     for slot, reason in zip(SLOTS, ["pupil", "cloudy", "still", "refused"], strict=True):
-        told = post(old_rig, f"/api/visits/{visit['id']}/could-not", slot=slot, reason=reason)
-        assert told["slots"][slot]["state"] == "could_not"
-        assert told["slots"][slot]["reason"] == reason
+        answer = post(old_rig, f"/api/visits/{visit['id']}/could-not", slot=slot, reason=reason)
+        assert answer["slots"][slot]["state"] == "could_not"
+        assert answer["slots"][slot]["reason"] == reason
     ended = post(old_rig, f"/api/visits/{visit['id']}/finish")
     assert ended["outcome"] == {"code": "refer_picture", "sentence": "Refer: picture of both eyes not possible."}
     where = f"/api/visits/{visit['id']}/could-not"
@@ -165,19 +173,19 @@ def test_a_finish_can_be_undone_on_the_same_day_of_the_instruments_clock(old_rig
     refused(late, 409, "visit.finished")
 
 
-def test_a_known_number_is_the_same_person_with_or_without_the_prefix(old_rig: Any) -> None:
+def test_a_known_number_is_the_same_patient_with_or_without_the_prefix(old_rig: Any) -> None:
     first = begin(old_rig)
     assert patch(old_rig, first, "name", "Meena").json()["fields"]["name"] == "Meena"
     again = begin(old_rig, first["number"])
     assert again["id"] != first["id"]
-    assert again["fields"]["name"] == "Meena"  # of the person; what was answered belongs to the visit
+    assert again["fields"]["name"] == "Meena"  # of the patient; other answers belong to the visit
     assert begin(old_rig, first["number"][1:])["number"] == first["number"]
     assert begin(old_rig, " camp-7 ")["number"] == "CAMP-7"
     found = old_rig.request("GET", f"/api/visits?q={first['number'][1:]}").json()["visits"]
     assert len(found) == 3
     wrong = first["number"][:-1] + str((int(first["number"][-1]) + 1) % 10)
-    told = refused(old_rig.request("POST", "/api/visits", json={"key": next(keys), "number": wrong}), 422, "input")
-    assert "mistyped" in told["message"]
+    answer = refused(old_rig.request("POST", "/api/visits", json={"key": next(keys), "number": wrong}), 422, "input")
+    assert "mistyped" in answer["message"]
 
 
 def test_a_repeated_request_changes_nothing_even_after_a_restart(make_rig: Any) -> None:
@@ -188,17 +196,17 @@ def test_a_repeated_request_changes_nothing_even_after_a_restart(make_rig: Any) 
     press = {"key": pressed, "eye": "OD", "visit": visit["id"], "slot": "R-centre"}
     made = rig.request("POST", "/api/captures", json=press).json()
     rig.exam.close()
-    anew = make_rig()
-    assert anew.request("POST", "/api/visits", json={"key": key}).json()["id"] == visit["id"]
-    assert anew.request("POST", "/api/captures", json=press).json() == made
-    assert len(anew.request("GET", "/api/visits").json()["visits"]) == 1
-    assert len(anew.store.captures()) == 1
-    told = anew.request("POST", f"/api/visits/{visit['id']}/finish", json={"key": key})
-    assert "another request" in refused(told, 422, "input")["message"]
+    restarted = make_rig()
+    assert restarted.request("POST", "/api/visits", json={"key": key}).json()["id"] == visit["id"]
+    assert restarted.request("POST", "/api/captures", json=press).json() == made
+    assert len(restarted.request("GET", "/api/visits").json()["visits"]) == 1
+    assert len(restarted.store.captures()) == 1
+    answer = restarted.request("POST", f"/api/visits/{visit['id']}/finish", json={"key": key})
+    assert "another request" in refused(answer, 422, "input")["message"]
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_hostile_text_is_kept_as_text(old_rig: Any, text: str) -> None:
+def test_hostile_text_is_stored_unchanged(old_rig: Any, text: str) -> None:
     visit = begin(old_rig)
     for field in ("name", "village"):
         answer = patch(old_rig, visit, field, text[:120])
@@ -219,26 +227,26 @@ def test_hostile_text_is_kept_as_text(old_rig: Any, text: str) -> None:
         ("\ud800", 1),
     ],
 )  # fmt: skip
-def test_an_answer_that_is_none_is_422_with_a_remedy_and_nothing_changes(old_rig: Any, field: str, value: Any) -> None:
+def test_an_invalid_answer_is_422_with_a_remedy_and_changes_nothing(old_rig: Any, field: str, value: Any) -> None:
     visit = begin(old_rig)
     refused(patch(old_rig, visit, field, value), 422, "input")
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json() == visit
 
 
-def test_every_field_takes_its_answers_and_gives_them_back(old_rig: Any) -> None:
+def test_every_form_field_stores_and_returns_its_answers(old_rig: Any) -> None:
     visit = begin(old_rig)
-    said = {
+    answers = {
         "consent": "declined", "age": 0, "sex": "other", "diabetes": "unknown", "diabetes_years": "5-10",
         "vision_od": "6/60", "vision_os": "NLP", "glasses": "yes", "drops_od": "09:40",
         "drops_os": "2026-03-01T09:40:00Z", "complaints": ["flashes", "red"], "name": "N",
         "phone": "+91 1", "village": "V",
     }  # fmt: skip
-    for field, value in said.items():
+    for field, value in answers.items():
         assert patch(old_rig, visit, field, value).status_code == 200
-    assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == said
-    for field in said:
+    assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == answers
+    for field in answers:
         assert patch(old_rig, visit, field, [] if field == "complaints" else None).status_code == 200
-    left = dict.fromkeys(said.keys() - {"name", "phone", "village"})  # of who somebody is not even the question stays
+    left = dict.fromkeys(answers.keys() - {"name", "phone", "village"})  # identifying fields are removed completely
     assert old_rig.request("GET", f"/api/visits/{visit['id']}").json()["fields"] == left
     assert post(old_rig, f"/api/visits/{visit['id']}/finish")["outcome"]["code"] == "refer_picture"
     post(old_rig, f"/api/visits/{visit['id']}/reopen")
@@ -249,14 +257,14 @@ def test_every_field_takes_its_answers_and_gives_them_back(old_rig: Any) -> None
 
 
 @pytest.mark.parametrize("number", ["x" * 21, "../a", "a b", "", "\ud800", "<b>", "A00012", "٣٤"])
-def test_a_number_that_is_none_is_422(old_rig: Any, number: str) -> None:
+def test_an_invalid_number_is_422(old_rig: Any, number: str) -> None:
     before = old_rig.request("GET", "/api/visits").json()
     body = json.dumps({"key": next(keys), "number": number})
     refused(old_rig.request("POST", "/api/visits", content=body, headers=JSON), 422, "input")
     assert old_rig.request("GET", "/api/visits").json() == before
 
 
-def test_what_does_not_belong_together_is_refused(old_rig: Any) -> None:
+def test_inconsistent_requests_are_refused(old_rig: Any) -> None:
     visit, other = agreed(old_rig), begin(old_rig)
     made = shoot(old_rig, visit, "R-centre")
     alone = post(old_rig, "/api/captures", eye="OD")
@@ -268,21 +276,21 @@ def test_what_does_not_belong_together_is_refused(old_rig: Any) -> None:
     at = f"/api/visits/{visit['id']}"
     ask(422, "input", "/api/captures", eye="OS", visit=visit["id"], slot="R-centre")
     ask(422, "input", "/api/captures", eye="OD", visit=visit["id"])
-    ask(404, "store.unknown", "/api/captures", eye="OD", visit="nobody", slot="R-centre")
+    ask(404, "store.unknown", "/api/captures", eye="OD", visit="unknown", slot="R-centre")
     ask(404, "store.unknown", "/api/captures", eye="OD", visit=visit["id"], slot="R-corner")
     ask(404, "store.unknown", f"/api/captures/{alone['id']}/keep")
     ask(404, "store.unknown", f"/api/visits/{other['id']}/slots", slot="R-centre", capture=made["id"])
     ask(404, "store.unknown", f"{at}/slots", slot="R-nerve", capture=made["id"])
     ask(404, "store.unknown", f"{at}/could-not", slot="R-corner", reason="pupil")
     ask(422, "input", f"{at}/could-not", slot="R-nerve", reason="lazy")
-    ask(404, "store.unknown", "/api/visits/nobody/finish")
+    ask(404, "store.unknown", "/api/visits/unknown/finish")
     ask(404, "store.unknown", "/api/visits/%00%ff/finish")
     refused(old_rig.request("GET", "/api/visits?day=today"), 422, "input")
     refused(old_rig.request("GET", "/api/visits?q=%25"), 422, "input")
     refused(old_rig.request("GET", "/api/visits?limit=0"), 422, "input")
 
 
-def test_the_list_can_be_asked_for_a_day_for_open_ones_and_for_digits(make_rig: Any) -> None:
+def test_the_list_is_filtered_by_day_state_and_digits(make_rig: Any) -> None:
     rig = make_rig()
     first = begin(rig)
     rig.clock.elapsed_s += 1
@@ -301,7 +309,7 @@ def test_the_list_can_be_asked_for_a_day_for_open_ones_and_for_digits(make_rig: 
     assert listed("?open=false") == [first["number"]]
     assert listed(f"?q={third['number'][1:]}") == [third["number"]]
     counts = rig.request("GET", f"/api/visits?day={first['day']}").json()["counts"]
-    assert counts == {"done": 1, "to_finish": 1, "referred": 1}  # of no eye there is a picture
+    assert counts == {"done": 1, "to_finish": 1, "referred": 1}  # no picture of either eye
 
 
 def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
@@ -309,21 +317,21 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
     asked = post(old_rig, "/api/controller", key=mine["X-Controller"])
     assert asked["mine"] is True
     assert asked["lease"] == old_rig.request("GET", "/api/status").json()["controller"]
-    assert asked["lease"] not in mine.values()  # a name, not the key: everybody may see it
+    assert asked["lease"] not in mine.values()  # public name, not the key
     assert post(old_rig, "/api/controller", key=other["X-Controller"]) == {"lease": asked["lease"], "mine": False}
     for path, body in {"/api/captures": {"eye": "OD"}, "/api/visits": {}}.items():
-        told = refused(
+        answer = refused(
             old_rig.request("POST", path, json={"key": next(keys), **body}, headers=other), 409, "link.other"
         )
-        assert told["remedy"] == "Another screen is taking pictures."
+        assert answer["remedy"] == "Another screen is taking pictures."
         assert old_rig.request("POST", path, json={"key": next(keys), **body}, headers=mine).status_code == 201
-    begin(old_rig)  # without the header: a script, or the device's own button
+    begin(old_rig)  # without the header: a script, or the button of the instrument
     taken = post(old_rig, "/api/controller", key=other["X-Controller"], take=True)
     assert taken["mine"] is True
     body = {"key": next(keys)}
     refused(old_rig.request("POST", "/api/visits", json=body, headers=mine), 409, "link.other")
     old_rig.clock.elapsed_s += 9
-    old_rig.request("GET", "/api/visits", headers=other)  # its every request renews it
+    old_rig.request("GET", "/api/visits", headers=other)  # each request renews the lease
     old_rig.clock.elapsed_s += 9
     refused(old_rig.request("POST", "/api/visits", json=body, headers=mine), 409, "link.other")
     old_rig.clock.elapsed_s += 10
@@ -334,7 +342,7 @@ def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:
 @pytest.mark.parametrize(
     "origin", ["http://evil.example", "null", "http://eye.local:81", "https://[", "http://eye.localx"]
 )
-def test_a_change_that_a_foreign_page_asks_for_is_403(old_rig: Any, origin: str) -> None:
+def test_a_cross_origin_change_is_403(old_rig: Any, origin: str) -> None:
     before = old_rig.request("GET", "/api/visits").json()
     for method, path in {"POST": "/api/visits", "PATCH": "/api/visits/x", "DELETE": "/api/visits/x"}.items():
         answer = old_rig.request(method, path, json={"key": next(keys)}, headers={"Origin": origin})
@@ -345,7 +353,7 @@ def test_a_change_that_a_foreign_page_asks_for_is_403(old_rig: Any, origin: str)
     assert old_rig.request("POST", "/api/visits", json={"key": next(keys)}, headers=own).status_code == 201
 
 
-def test_only_names_of_this_camera_are_answered(old_rig: Any) -> None:
+def test_untrusted_host_names_are_refused(old_rig: Any) -> None:
     def status(host: str) -> int:
         return int(old_rig.request("GET", "/api/health", headers={"Host": host}).status_code)
 
@@ -365,21 +373,21 @@ def test_only_names_of_this_camera_are_answered(old_rig: Any) -> None:
 
 
 def test_many_tabs_at_once_get_different_numbers(old_rig: Any) -> None:
-    async def story(client: httpx.AsyncClient) -> list[httpx.Response]:
+    async def requests(client: httpx.AsyncClient) -> list[httpx.Response]:
         return await asyncio.gather(*(client.post("/api/visits", json={"key": next(keys)}) for _ in range(8)))
 
-    answers = old_rig.ask(story)
+    answers = old_rig.ask(requests)
     assert [answer.status_code for answer in answers] == [201] * 8
     assert len({answer.json()["number"] for answer in answers}) == 8
 
 
-def test_the_room_left_is_told_in_people(make_rig: Any) -> None:
+def test_the_free_space_is_given_in_visits(make_rig: Any) -> None:
     rig = make_rig(store={"free_bytes": lambda _: 40_000_000 * 12})
     assert rig.request("GET", "/api/status").json()["people_left"] == 12  # four pictures each, of ten million bytes
     visit = agreed(rig)
     used = sum(len(rig.store.read(made["id"], name)) for made in [shoot(rig, visit, slot) for slot in SLOTS[:2]]
                for name in made["files"])  # fmt: skip
     half = rig.request("GET", "/api/status").json()["people_left"]
-    assert half == 480_000_000 // (used // 2) // 4  # one who is here with two pictures will have four
+    assert half == 480_000_000 // (used // 2) // 4  # an open visit with two pictures will have four
     post(rig, f"/api/visits/{visit['id']}/finish")
     assert rig.request("GET", "/api/status").json()["people_left"] == 480_000_000 // used

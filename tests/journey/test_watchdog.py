@@ -1,4 +1,4 @@
-"""Who beats: the loop that owns the head, and nobody in its stead. Heard on a real socket, as systemd hears it."""
+"""Watchdog notifications on a real sd_notify socket: only the loop that owns the head sends heartbeats."""
 
 import os
 import socket
@@ -10,120 +10,120 @@ from typing import Any
 
 import pytest
 
-from services.instrument.serve import handed_over
+from services.http.server import inherited_socket
 from services.instrument.watchdog import BEAT_S, Watchdog
 from tests.journey.conftest import until
 
 
-class Ear:
-    """The socket that systemd would listen at, always read, as systemd does."""
+class NotifySocket:
+    """Notification socket of systemd, read by a thread."""
 
     def __init__(self, path: Path) -> None:
         self.address = str(path)
-        self.heard: list[str] = []
+        self.received: list[str] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(self.address)
         self._reader = Thread(target=self._read)
         self._reader.start()
 
     def _read(self) -> None:
-        while (word := self._socket.recv(4096)) != b"enough":
-            self.heard.append(word.decode())
+        while (datagram := self._socket.recv(4096)) != b"enough":
+            self.received.append(datagram.decode())
 
-    def all_until(self, line: str) -> list[str]:
-        """What was heard since this was asked last, once `line` has come."""
-        until(lambda: line in self.heard)
-        heard, self.heard = self.heard, []
-        return heard
+    def take_until(self, line: str) -> list[str]:
+        """Wait for `line`; return the datagrams received since the last call."""
+        until(lambda: line in self.received)
+        received, self.received = self.received, []
+        return received
 
     def close(self) -> None:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as speaker:
-            speaker.sendto(b"enough", self.address)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+            client.sendto(b"enough", self.address)
         self._reader.join()
         self._socket.close()
 
 
 @pytest.fixture
-def ear(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ear]:
-    ear = Ear(tmp_path_factory.mktemp("run") / "notify")
-    yield ear
-    ear.close()
+def notify_socket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NotifySocket]:
+    notify_socket = NotifySocket(tmp_path_factory.mktemp("run") / "notify")
+    yield notify_socket
+    notify_socket.close()
 
 
-def test_every_word_is_one_datagram_that_systemd_knows(ear: Ear) -> None:
-    watchdog = Watchdog(ear.address)
+def test_every_notification_is_one_sd_notify_datagram(notify_socket: NotifySocket) -> None:
+    watchdog = Watchdog(notify_socket.address)
     watchdog.ready()
     watchdog.beat()
-    watchdog.status("making\nplans")  # a second line would be a second word
+    watchdog.status("making\nplans")  # a second line would be a second notification
     watchdog.stopping()
-    assert ear.all_until("STOPPING=1") == ["READY=1", "WATCHDOG=1", "STATUS=making plans", "STOPPING=1"]
+    assert notify_socket.take_until("STOPPING=1") == ["READY=1", "WATCHDOG=1", "STATUS=making plans", "STOPPING=1"]
 
 
-def test_an_abstract_address_is_understood() -> None:
+def test_an_abstract_socket_address_is_supported() -> None:
     name = f"diffuscope-test-{os.getpid()}"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ear:
-        ear.bind(f"\0{name}")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify_socket:
+        notify_socket.bind(f"\0{name}")
         Watchdog(f"@{name}").beat()
-        assert ear.recv(64) == b"WATCHDOG=1"
+        assert notify_socket.recv(64) == b"WATCHDOG=1"
 
 
-def test_where_nobody_listens_nothing_happens(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_a_listener_nothing_is_raised(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     Watchdog(None).beat()
     assert not caplog.records
     Watchdog(str(tmp_path / "gone")).beat()
-    assert "does not hear WATCHDOG=1" in caplog.text
+    assert "sd_notify failed for WATCHDOG=1" in caplog.text
 
 
-def test_it_is_ready_when_its_plans_are_made_and_says_when_it_ends(make_rig: Any, ear: Ear) -> None:
-    rig = make_rig(watchdog=ear.address)
-    heard = ear.all_until("STATUS=aim")
-    assert heard[:3] == ["STATUS=making plans", "READY=1", "STATUS=aim"]  # and perhaps its first beat
+def test_ready_follows_planning_and_stopping_precedes_the_end(make_rig: Any, notify_socket: NotifySocket) -> None:
+    rig = make_rig(watchdog=notify_socket.address)
+    received = notify_socket.take_until("STATUS=aim")
+    assert received[:3] == ["STATUS=making plans", "READY=1", "STATUS=aim"]  # and perhaps the first heartbeat
     rig.exam.close()
-    ear.all_until("STOPPING=1")
+    notify_socket.take_until("STOPPING=1")
 
 
-def test_an_idle_owner_beats_all_the_same(make_rig: Any, ear: Ear) -> None:
-    make_rig(watchdog=ear.address)
-    ear.all_until("STATUS=aim")
+def test_an_idle_head_thread_sends_heartbeats(make_rig: Any, notify_socket: NotifySocket) -> None:
+    make_rig(watchdog=notify_socket.address)
+    notify_socket.take_until("STATUS=aim")
     time.sleep(2.5 * BEAT_S)
-    assert set(ear.heard) == {"WATCHDOG=1"}
-    assert 2 <= len(ear.heard) <= 4
+    assert set(notify_socket.received) == {"WATCHDOG=1"}
+    assert 2 <= len(notify_socket.received) <= 4
 
 
-def test_a_picture_in_the_making_beats_between_its_rounds(make_rig: Any, ear: Ear) -> None:
-    rig = make_rig(watchdog=ear.address)
-    ear.all_until("STATUS=aim")
+def test_a_refinement_sends_heartbeats_between_its_rounds(make_rig: Any, notify_socket: NotifySocket) -> None:
+    rig = make_rig(watchdog=notify_socket.address)
+    notify_socket.take_until("STATUS=aim")
     kept = rig.exam.press("OD").result(30)
-    heard = ear.all_until("STATUS=aim")
-    assert heard.count("WATCHDOG=1") > kept.report["rounds"]
+    received = notify_socket.take_until("STATUS=aim")
+    assert received.count("WATCHDOG=1") > kept.report.reconstruction.rounds
 
 
-def test_a_look_at_a_kept_picture_beats_while_it_lasts(make_rig: Any, ear: Ear) -> None:
-    rig = make_rig(watchdog=ear.address)
-    ear.all_until("STATUS=aim")
+def test_a_check_of_a_stored_capture_sends_heartbeats(make_rig: Any, notify_socket: NotifySocket) -> None:
+    rig = make_rig(watchdog=notify_socket.address)
+    notify_socket.take_until("STATUS=aim")
     rig.exam.press("OD").result(30)
-    until(lambda: ear.heard.count("STATUS=aim") == 1 and not rig.exam.fitness.due)
-    after = ear.heard[ear.heard.index("STATUS=aim") :]
-    assert after.count("WATCHDOG=1") > 5  # an idle owner beats once in two seconds
+    until(lambda: notify_socket.received.count("STATUS=aim") == 1 and not rig.exam.calibration_monitor.has_pending)
+    after = notify_socket.received[notify_socket.received.index("STATUS=aim") :]
+    assert after.count("WATCHDOG=1") > 5  # an idle head thread sends one in two seconds
 
 
-def test_a_hung_owner_beats_no_more_until_it_goes_on(make_rig: Any, ear: Ear) -> None:
-    """The web server lives, and so does every other thread: it does not help."""
-    rig = make_rig(watchdog=ear.address)
-    ear.all_until("STATUS=aim")
-    rig.hang()
+def test_a_blocked_head_thread_sends_no_heartbeats(make_rig: Any, notify_socket: NotifySocket) -> None:
+    """The HTTP server and all other threads run; they send no heartbeats."""
+    rig = make_rig(watchdog=notify_socket.address)
+    notify_socket.take_until("STATUS=aim")
+    rig.block_exposures()
     answer = rig.exam.press("OD")
-    rig.wait_for_hanging()
-    heard = len(ear.heard)
+    rig.wait_for_blocked_exposure()
+    received = len(notify_socket.received)
     time.sleep(2 * BEAT_S)
-    assert len(ear.heard) == heard
+    assert len(notify_socket.received) == received
     assert rig.request("GET", "/api/status").status_code == 200
     rig.clock.gate.set()
     answer.result(30)
-    assert "WATCHDOG=1" in ear.all_until("STATUS=aim")
+    assert "WATCHDOG=1" in notify_socket.take_until("STATUS=aim")
 
 
-def test_an_address_handed_over_is_taken_only_by_the_process_that_it_is_meant_for() -> None:
-    assert handed_over({}) is None
-    assert handed_over({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) is None
-    assert handed_over({"LISTEN_PID": str(os.getpid())}) is None
+def test_a_passed_socket_is_accepted_only_by_its_addressee() -> None:
+    assert inherited_socket({}) is None
+    assert inherited_socket({"LISTEN_PID": str(os.getpid() + 1), "LISTEN_FDS": "1"}) is None
+    assert inherited_socket({"LISTEN_PID": str(os.getpid())}) is None

@@ -1,4 +1,4 @@
-"""For tests of printed parts: the head and the calibration's eye as meshes, and light paths with other lines."""
+"""Fixtures of the tests of printed parts: meshes of the head and the model eye, and modified light paths."""
 
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-if find_spec("build123d") is None:  # it is in .parts-venv only: `make test-parts`
+if find_spec("build123d") is None:  # installed in .parts-venv only: `make test-parts`
     collect_ignore_glob = ["test_*.py"]
 else:
     from hardware.parts import assembly
@@ -31,7 +31,7 @@ def eye(d: "Dimensions") -> dict[str, "Manifold"]:
 
 @pytest.fixture
 def changed(tmp_path: Path) -> Callable[[str, str], "Dimensions"]:
-    """The dimensions of `optics.toml` with other lines: changed("iris_um = 3200", "iris_um = 1600")."""
+    """Return the dimensions of `optics.toml` with a line replaced: changed("iris_um = 3200", "iris_um = 1600")."""
 
     def change(was: str, becomes: str) -> "Dimensions":
         text = OPTICS.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The parts fit one another and the light: distances, screws, apertures, LEDs, and no light from the side."""
+"""Fit of the printed parts with one another and with the light: distances, screws, apertures, LEDs, stray light."""
 
 from collections.abc import Callable
 from itertools import combinations
@@ -9,6 +9,7 @@ import pytest
 from manifold3d import OpType
 from numpy.typing import NDArray
 
+from device.optics import field_extent
 from device.optics.light_path import relay_of
 from device.optics.matrix import ring
 from hardware.parts import assembly, bought
@@ -21,12 +22,12 @@ from hardware.parts.solids import Manifold, solid
 pytestmark = pytest.mark.parts
 
 Place = tuple[float, float, float]
-Rays = NDArray[np.float64]  # directions, a row each
+Rays = NDArray[np.float64]  # directions, one per row
 Solids = dict[str, Manifold]
 Change = Callable[[str, str], Dimensions]
 CUTS_ITS_THREAD = {("lever", "polariser ring")}
 FAR_MM = 300.0
-NOTHING_MM3 = 0.05  # tessellated faces that touch
+NOTHING_MM3 = 0.05  # overlap of touching tessellated faces
 
 
 def common_mm3(one: Manifold, other: Manifold) -> float:
@@ -34,21 +35,21 @@ def common_mm3(one: Manifold, other: Manifold) -> float:
 
 
 def rod(at: tuple[float, float, float], along: tuple[float, float, float], long_mm: float, wide_mm: float) -> Manifold:
-    """A cylinder from a point."""
+    """Return a cylinder from a point along a direction."""
     x, y, z = along
     turn = {(0, 0, 1): (0, 0, 0), (0, 0, -1): (180, 0, 0), (0, 1, 0): (-90, 0, 0), (1, 0, 0): (0, 90, 0)}[(x, y, z)]
     return Manifold.cylinder(long_mm, wide_mm / 2, -1, 48).rotate(turn).translate(at)
 
 
 def bundle(*discs: tuple[float, float, float, float]) -> Manifold:
-    """All straight light between discs, each (diameter, x, y, z) square to the axis."""
+    """Return the hull of all straight rays between discs, each (diameter, x, y, z) perpendicular to the axis."""
     turns = np.linspace(0, 2 * pi, 96, endpoint=False)
     places = [(x + w / 2 * cos(a), y + w / 2 * sin(a), z) for w, x, y, z in discs for a in turns]
     return Manifold.hull_points(np.array(places))
 
 
 @pytest.mark.parametrize("which", ["head", "eye"])
-def test_nothing_stands_inside_anything_else(which: str, request: pytest.FixtureRequest) -> None:
+def test_parts_do_not_overlap(which: str, request: pytest.FixtureRequest) -> None:
     parts: Solids = request.getfixturevalue(which)
     inside = {
         pair: common_mm3(parts[pair[0]], parts[pair[1]])
@@ -59,12 +60,12 @@ def test_nothing_stands_inside_anything_else(which: str, request: pytest.Fixture
     assert {pair: volume for pair, volume in inside.items() if volume > NOTHING_MM3} == {}
 
 
-def test_two_parts_in_one_place_would_be_noticed(head: Solids) -> None:
+def test_overlap_of_two_parts_is_detected(head: Solids) -> None:
     assert common_mm3(head["camera"], head["sensor spacer"].translate((0, 0, 0.1))) > NOTHING_MM3
 
 
 def in_air_mm(d: Dimensions, head: Solids) -> float:
-    """From diffuser to image plane in air, as the printed parts stack it: iris, shoulder, cell, spacer, board."""
+    """Return the distance from diffuser to image plane in air, as stacked: iris, shoulder, cell, spacer, board."""
     low, high = head["sensor spacer"].bounding_box()[2::3]
     assert low == pytest.approx(head["diffuser cell"].bounding_box()[5], abs=1e-5)
     board = d.bought.board_mm**2
@@ -76,14 +77,14 @@ def in_air_mm(d: Dimensions, head: Solids) -> float:
     return image - rough - glass - part.cover_glass_mm * (1 - 1 / part.cover_glass_index)
 
 
-def test_the_spacer_makes_the_distance_of_the_light_path(d: Dimensions, head: Solids) -> None:
+def test_spacer_gives_the_distance_of_the_light_path(d: Dimensions, head: Solids) -> None:
     assert in_air_mm(d, head) == pytest.approx(d.path.optics.diffuser_to_sensor_um / 1000, abs=1e-4)
     assert head["diffuser"].bounding_box()[2] == pytest.approx(head["iris"].bounding_box()[5], abs=1e-5)
     assert head["retaining ring"].bounding_box()[2] == pytest.approx(head["diffuser"].bounding_box()[5], abs=1e-5)
 
 
-def test_the_iris_is_as_wide_as_the_light_path_says_and_sharp(d: Dimensions, head: Solids) -> None:
-    """A hole of 3.2 mm at the diffuser, in a land of 0.2 mm, with nothing narrower before it."""
+def test_iris_has_the_diameter_of_the_light_path_and_a_sharp_edge(d: Dimensions, head: Solids) -> None:
+    """The iris is a 3.2 mm hole at the diffuser with a land of 0.2 mm, and no narrower aperture precedes it."""
     low, high = head["iris"].bounding_box()[2::3]
     widths = [hole_mm(head["iris"], z) for z in np.linspace(low + 0.01, high - 0.01, 9)]
     assert widths[-1] == pytest.approx(d.iris_mm, abs=0.01)
@@ -91,14 +92,14 @@ def test_the_iris_is_as_wide_as_the_light_path_says_and_sharp(d: Dimensions, hea
     assert widths == pytest.approx(sorted(widths, reverse=True), abs=1e-6)
 
 
-def test_the_light_of_the_field_meets_no_printed_part(d: Dimensions, head: Solids) -> None:
-    """From before the tube flange to the plate, to the iris, and on to the edge of what a sensor could see."""
+def test_light_of_the_field_meets_no_printed_part(d: Dimensions, head: Solids) -> None:
+    """The light passes from before the tube flange to the plate, the iris and the edge of the largest sensor."""
     relay, field = relay_of(d.path, d.path.optics), d.path.optics.field_deg
-    before = relay.clear_before_iris_mm(field, 9.0)
-    extent = d.iris_mm + 2 * relay.half_shift_tan_mm(field)
+    before = relay.beam_before_iris_mm(field, 9.0)
+    extent = d.iris_mm + 2 * field_extent.half_shift_tan_mm(relay, field)
     front = bundle((d.iris_mm - 0.02, 0, 0, -0.01), (before, 0, 0, -9.0))
     behind = bundle((d.iris_mm, 0, 0, 0.01), (extent, 0, 0, 5.0))
-    far = [(relay.clear_before_iris_mm(field, -z), 0, d.lens_y_mm, z) for z in (-45.0, d.plate_z_mm)]
+    far = [(relay.beam_before_iris_mm(field, -z), 0, d.lens_y_mm, z) for z in (-45.0, d.plate_z_mm)]
     printed = {name: body for name, body in head.items() if name not in {*bought.HEAD, "dust cap"}}
     light = front + behind + bundle(*far)
     assert {name for name, body in printed.items() if common_mm3(light, body) > NOTHING_MM3} == set()
@@ -106,8 +107,8 @@ def test_the_light_of_the_field_meets_no_printed_part(d: Dimensions, head: Solid
     assert common_mm3(wider, head["iris"]) > NOTHING_MM3
 
 
-def test_the_block_lets_through_what_the_plate_can(d: Dimensions, head: Solids) -> None:
-    """The tilted plate is the narrowest place of lens and LED path, not the block around it."""
+def test_block_is_wider_than_the_plate(d: Dimensions, head: Solids) -> None:
+    """The tilted plate, not its block, is the narrowest aperture of the lens path and of the LED path."""
     wide, z, y = d.plate_seen_mm - 0.1, d.plate_z_mm, d.lens_y_mm
     lens = rod((0, y, d.block_z_mm[0] - 13), (0, 0, 1), z - d.block_z_mm[0] + 13, wide)
     light = rod((0, y, z), (0, 1, 0), d.cap_front_y_mm - y, wide)
@@ -116,7 +117,7 @@ def test_the_block_lets_through_what_the_plate_can(d: Dimensions, head: Solids) 
 
 
 def screws(d: Dimensions) -> dict[str, list[tuple[Manifold, str]]]:
-    """Every screw as a rod of its own width, and the part in which it ends."""
+    """Return every screw as a rod of its own width, with the part that holds its thread."""
     half, rear = d.bought.board_holes_mm / 2, d.cell_rear_z_mm
     x, y = diffuser_cell.SCREWS_MM
     deep = d.cell_front_z_mm - d.fit.insert_deep_mm + 0.1
@@ -133,27 +134,27 @@ def screws(d: Dimensions) -> dict[str, list[tuple[Manifold, str]]]:
 
 
 @pytest.mark.parametrize("name", ["camera", "cell", "matrix", "tube", "diffuser", "plate"])
-def test_screws_find_their_holes_and_a_driver_finds_them(d: Dimensions, head: Solids, name: str) -> None:
-    """A screw of full width, with a driver as wide behind it, meets nothing on its way into its thread."""
+def test_screws_and_driver_have_free_access(d: Dimensions, head: Solids, name: str) -> None:
+    """A screw of full width with a driver of the same width behind it meets no part on its way into the thread."""
     for screw in screws(d)[name]:
         met = {part for part, body in head.items() if part != "lens tubes" and common_mm3(screw, body) > NOTHING_MM3}
         assert met == set()
 
 
-def test_a_screw_beside_its_hole_is_noticed(d: Dimensions, head: Solids) -> None:
+def test_screw_beside_its_hole_is_detected(d: Dimensions, head: Solids) -> None:
     moved = screws(d)["camera"][0].translate((0.6, 0, 0))
     assert common_mm3(moved, head["sensor spacer"]) > NOTHING_MM3
 
 
 def free(body: Manifold, start: Place, ways: Rays) -> Rays:
-    """Those of the rays that meet no surface."""
+    """Return the rays that meet no surface."""
     ends = np.array(start) + FAR_MM * ways
     met = [bool(body.ray_cast(start, tuple(end))) for end in ends.tolist()]
     return ways[~np.array(met)]
 
 
 def fan(down: tuple[float, float, float], most_deg: float, count: int) -> NDArray[np.float64]:
-    """Directions evenly over a cone, by the golden angle."""
+    """Return directions spread evenly over a cone, by the golden angle."""
     n = np.arange(count) + 0.5
     along = 1 - n / count * (1 - cos(radians(most_deg)))
     turn, away = n * pi * (3 - 5**0.5), np.sqrt(1 - along**2)
@@ -164,7 +165,7 @@ def fan(down: tuple[float, float, float], most_deg: float, count: int) -> NDArra
 
 
 def seen_through(d: Dimensions, cap: Manifold, half_deg: float) -> tuple[list[float], list[float]]:
-    """What part of each LED's light gets through the cap: within the cone, and outside of all that a hole allows."""
+    """Return the share of each LED's light that passes the cap, within the cone and outside every allowed direction."""
     inside, outside = [], []
     cone, rest = fan((0, -1, 0), 0.98 * half_deg, 24), fan((0, -1, 0), 89.0, 160)
     rest = rest[rest @ (0, -1, 0) < cos(radians(1.02 * half_deg))]
@@ -175,7 +176,7 @@ def seen_through(d: Dimensions, cap: Manifold, half_deg: float) -> tuple[list[fl
     return inside, outside
 
 
-def test_the_cap_shows_the_ring_and_no_other_led(d: Dimensions, head: Solids) -> None:
+def test_cap_passes_light_of_the_ring_only(d: Dimensions, head: Solids) -> None:
     half_deg = relay_of(d.path, d.path.optics).led_cone_deg(d.path.optics.field_deg) / 2
     inside, outside = seen_through(d, head["LED cap"], half_deg)
     assert {i for i, part in enumerate(inside) if part == 1} == set(ring(d.path.ring))
@@ -183,8 +184,8 @@ def test_the_cap_shows_the_ring_and_no_other_led(d: Dimensions, head: Solids) ->
     assert max(outside) == 0
 
 
-def test_no_light_reaches_the_sensor_but_along_the_axis(d: Dimensions, head: Solids) -> None:
-    """Rays backwards from the sensor: one that meets no part has passed the iris and leaves through the lens tube."""
+def test_light_reaches_the_sensor_only_along_the_axis(d: Dimensions, head: Solids) -> None:
+    """Every backward ray from the sensor that meets no part has passed the iris and leaves through the lens tube."""
     clear = {"polariser film", "LED film", "diffuser", "beam splitter", "dust cap"}
     whole = Manifold.batch_boolean([body for name, body in head.items() if name not in clear], OpType.Add)
     z = d.image_z_mm - 1.2
@@ -197,8 +198,8 @@ def test_no_light_reaches_the_sensor_but_along_the_axis(d: Dimensions, head: Sol
 
 
 @pytest.mark.parametrize("rings", [0, 1, 2])
-def test_step_rings_put_the_point_of_light_where_it_is_wanted(d: Dimensions, eye: Solids, rings: int) -> None:
-    """21, 25 and 29 mm behind the lens: -4, 0 and +4 mm of the screen."""
+def test_step_rings_set_the_distance_of_the_point_source(d: Dimensions, eye: Solids, rings: int) -> None:
+    """The point source is 21, 25 and 29 mm behind the lens: -4, 0 and +4 mm from the focus."""
     thick = np.diff(eye["step ring"].bounding_box()[2::3]).item()
     nose = eye["pinhole"].bounding_box()[5] + (1 - rings) * thick
     assert -nose == pytest.approx(d.bought.eye_focal_mm + (rings - 1) * d.bought.eye_step_mm, abs=1e-4)
@@ -207,7 +208,7 @@ def test_step_rings_put_the_point_of_light_where_it_is_wanted(d: Dimensions, eye
     assert lens == pytest.approx(0, abs=1e-4)
 
 
-def test_the_model_eyes_pupil_is_what_the_paper_used(d: Dimensions, eye: Solids) -> None:
+def test_pupil_of_the_model_eye_is_that_of_the_paper(d: Dimensions, eye: Solids) -> None:
     tube = eye["model eye tube"]
     end = tube.bounding_box()[5]
     widths = [hole_mm(tube, z) for z in np.linspace(end - 1.1, end - 0.01, 9)]
@@ -215,15 +216,15 @@ def test_the_model_eyes_pupil_is_what_the_paper_used(d: Dimensions, eye: Solids)
 
 
 def hole_mm(body: Manifold, z: float) -> float:
-    """Width of the hole in the middle of a slice, from its corners."""
+    """Return the width of the hole in the centre of a slice, from its corners."""
     middle = min(body.slice(z).to_polygons(), key=lambda corners: np.abs(corners).max())
     return 2 * float(np.hypot(*middle.T).max())
 
 
-# One file is the truth: what it says, the parts do
+# Changes of optics.toml change the parts
 
 
-def test_another_distance_is_another_spacer(d: Dimensions, changed: Change) -> None:
+def test_distance_determines_the_spacer(d: Dimensions, changed: Change) -> None:
 
     other = changed("diffuser_to_sensor_um = 6000", "diffuser_to_sensor_um = 5000")
     parts = {name: solid(assembly.printed()[name].shape(other)) for name in ("iris", "diffuser cell", "sensor spacer")}
@@ -232,7 +233,7 @@ def test_another_distance_is_another_spacer(d: Dimensions, changed: Change) -> N
     assert other.board_z_mm == pytest.approx(d.board_z_mm - 1)
 
 
-def test_another_iris_is_another_hole(changed: Change) -> None:
+def test_iris_diameter_determines_the_hole(changed: Change) -> None:
     other = changed("iris_um = 3200", "iris_um = 1600")
     assert hole_mm(solid(iris(other)), -0.1) == pytest.approx(1.6, abs=0.02)
 
@@ -245,7 +246,7 @@ def test_another_iris_is_another_hole(changed: Change) -> None:
         ("field_deg = 33.4", "field_deg = 45"),
     ],
 )
-def test_another_ring_or_field_is_another_cap(changed: Change, was: str, becomes: str) -> None:
+def test_ring_and_field_determine_the_cap(changed: Change, was: str, becomes: str) -> None:
 
     other = changed(was, becomes)
     half_deg = relay_of(other.path, other.path.optics).led_cone_deg(other.path.optics.field_deg) / 2

@@ -1,4 +1,4 @@
-"""What the assembly guide shows and says of the printed parts is what they are."""
+"""Agreement of pictures and text of the assembly guide with the printed parts."""
 
 import csv
 import re
@@ -11,18 +11,18 @@ from device.optics.light_path import relay_of
 from hardware.parts.dimensions import Dimensions
 from hardware.parts.pictures import PICTURES
 from hardware.parts.printed import camera_cover, led_cover, plate_lid, retaining_ring, tube_flange
-from tests.house import ROOT, text
+from tests.project_files import ROOT, text
 
 pytestmark = pytest.mark.parts
 
 
 @pytest.mark.parametrize("name", list(PICTURES))
-def test_a_picture_is_todays(d: Dimensions, name: str) -> None:
-    """`make part-pictures` makes it what it should be."""
+def test_picture_is_up_to_date(d: Dimensions, name: str) -> None:
+    """`make part-pictures` writes the same picture."""
     assert PICTURES[name](d) == (ROOT / "hardware" / "pictures" / f"parts-{name}.svg").read_text(encoding="utf-8")
 
 
-def test_another_light_path_is_another_picture(d: Dimensions) -> None:
+def test_light_path_determines_the_picture(d: Dimensions) -> None:
     optics = d.path.optics.model_copy(update={"diffuser_to_sensor_um": 9000})
     other = replace(d, path=d.path.model_copy(update={"optics": optics}))
     assert "6 mm in air" in text("hardware/pictures/parts-section.svg")
@@ -30,7 +30,7 @@ def test_another_light_path_is_another_picture(d: Dimensions) -> None:
 
 
 def lit(d: Dimensions, azimuth_deg: float) -> int:
-    """How many LEDs of the ring reach the tilted plate with light of the field's edge, seen from the plate's middle."""
+    """Return the number of ring LEDs whose light of the field edge reaches the centre of the tilted plate."""
     edge = radians(relay_of(d.path, d.path.optics).led_cone_deg(d.path.optics.field_deg) / 2)
     slope_x, slope_z = (tan(edge) * part(radians(azimuth_deg)) for part in (cos, sin))
     count = 0
@@ -42,7 +42,7 @@ def lit(d: Dimensions, azimuth_deg: float) -> int:
     return count
 
 
-def test_the_guide_says_the_figures_of_the_models(d: Dimensions) -> None:
+def test_guide_has_the_figures_of_the_models(d: Dimensions) -> None:
     leds = [lit(d, azimuth) for azimuth in range(0, 360, 15)]
     spacer, glass = d.board_z_mm - d.cell_rear_z_mm, d.image_z_mm - d.path.optics.diffuser_to_sensor_um / 1000
     figures = [
@@ -54,19 +54,19 @@ def test_the_guide_says_the_figures_of_the_models(d: Dimensions) -> None:
         f"the diffuser ({d.bought.diffuser_mm:g} mm, {d.bought.diffuser_thick_mm:g} mm",
         f"the plate ({d.bought.plate_thick_mm:g} mm", f"over its board ({d.bought.image_above_board_mm:g} mm)",
     ]  # fmt: skip
-    said = " ".join(text("hardware/assembly.md").split())
-    assert [figure for figure in figures if figure not in said] == []
+    guide = " ".join(text("hardware/assembly.md").split())
+    assert [figure for figure in figures if figure not in guide] == []
     assert (min(leds), max(leds)) == (4, 8)
-    assert "four LEDs of eight" in said
+    assert "four LEDs of eight" in guide
     wide = replace(d, path=d.path.model_copy(update={"relay": d.path.relay.model_copy(update={"splitter_mm": 50.8})}))
     assert min(lit(wide, azimuth) for azimuth in range(0, 360, 15)) == 8
 
 
-def test_the_screws_on_the_bill_hold_and_do_not_stand_up(d: Dimensions) -> None:
-    """Each is longer than what it joins by at least its own width, and by less than its thread is deep."""
+def test_screws_on_the_bill_have_the_right_length(d: Dimensions) -> None:
+    """Each screw exceeds the joined thickness by at least its own width, and by less than the depth of its thread."""
     back = d.led_y_mm + d.bought.led_high_mm + d.bought.led_board_thick_mm
     board = d.board_z_mm + d.bought.board_thick_mm
-    joins = {  # by what the guide calls them: what they join, how deep the thread is
+    joins = {  # name in the guide: joined thickness, depth of the thread
         "M2.5 x 20": (board + camera_cover.ROOM_MM + d.fit.wall_mm - d.cell_rear_z_mm, d.fit.insert_deep_mm),
         "M3 x 16": (d.cell_rear_z_mm - d.cell_front_z_mm, d.fit.insert_deep_mm),
         "M3 x 20": (back + led_cover.ROOM_MM + led_cover.ROOF_MM - d.cap_front_y_mm, d.fit.insert_deep_mm),

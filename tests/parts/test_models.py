@@ -1,4 +1,4 @@
-"""What comes out of `make parts` is what a slicer wants, seen by a library that did not make it."""
+"""Suitability of the output of `make parts` for a slicer, checked with an independent library."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.parts
 
 NAMES = sorted(printed())
 BED_MM = 120.0
-THIN = {"LED cap": 0.6, "iris": 0.6}  # the baffles between two LEDs are as thin as their pitch wants
+THIN = {"LED cap": 0.6, "iris": 0.6}  # the pitch of the LEDs limits the baffles between them
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def mesh_of(folder: Path, name: str) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_part_is_watertight_in_one_piece_and_lies_on_the_bed(folder: Path, name: str) -> None:
+def test_part_is_watertight_in_one_piece_and_on_the_bed(folder: Path, name: str) -> None:
     mesh = mesh_of(folder, name)
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
@@ -43,8 +43,8 @@ def test_a_part_is_watertight_in_one_piece_and_lies_on_the_bed(folder: Path, nam
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_step_and_stl_are_the_same_part(d: Dimensions, folder: Path, name: str) -> None:
-    """Turning a part for the printer must not change it, and neither file may lose a hole."""
+def test_step_and_stl_hold_the_same_part(d: Dimensions, folder: Path, name: str) -> None:
+    """Rotation for the printer leaves a part unchanged, and neither file loses a hole."""
     shape = printed()[name].shape(d)
     step = import_step(folder / f"{name.replace(' ', '-').lower()}.step")
     assert step.volume == pytest.approx(shape.volume, rel=1e-6)
@@ -54,11 +54,11 @@ def test_step_and_stl_are_the_same_part(d: Dimensions, folder: Path, name: str) 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_wall_is_too_thin_to_print(d: Dimensions, folder: Path, name: str) -> None:
-    """Layer by layer: what an opening by the wall's thickness loses is thinner than that."""
+def test_walls_have_the_minimum_thickness(d: Dimensions, folder: Path, name: str) -> None:
+    """Layer by layer, an opening by the minimum wall thickness removes nothing."""
     mesh = mesh_of(folder, name)
     body = Manifold(Mesh(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)))
-    least = 0.97 * THIN.get(name, d.fit.wall_mm)  # corners of a circle are a little nearer
+    least = 0.97 * THIN.get(name, d.fit.wall_mm)  # corners of a polygonal circle are slightly closer
     for height in np.arange(0.1, mesh.extents[2], 0.4):
         layer = body.slice(height).simplify(0.01)
         opened = layer.offset(-least / 2, JoinType.Miter).offset(least / 2, JoinType.Miter)

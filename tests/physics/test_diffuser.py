@@ -1,9 +1,10 @@
-"""The diffuser and its caustic against the golden numbers of optics.md 2.1, 2.2, 2.4 and 9."""
+"""Diffuser and caustic against the golden numbers of OPTICS.md 2.1, 2.3, 2.4, 2.6 and 5.1."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
+from device.config.head_file import OpticsSpec
 from device.errors import SpecError
 from device.optics.diffuser import (
     EMMETROPIA,
@@ -18,7 +19,6 @@ from device.optics.diffuser import (
     surface,
 )
 from device.optics.propagation import propagate
-from device.spec import OpticsSpec
 
 PITCH_UM = 5.04
 PAPER = OpticsSpec(
@@ -37,7 +37,7 @@ def correlation(a, b):
 
 
 def warped(image, matrix):
-    """`image`(T^-1 x) about its middle pixel; the matrix acts on (x, y), arrays are (y, x)."""
+    """Return `image`(T^-1 x) about its central pixel; the matrix acts on (x, y), arrays are (y, x)."""
     flipped = np.linalg.inv(matrix)[::-1, ::-1]
     middle = np.array(image.shape) // 2
     return ndimage.affine_transform(image.astype(np.float64), flipped, middle - flipped @ middle, order=3)
@@ -48,7 +48,7 @@ def test_the_roughness_follows_from_the_scattering_angle():
     assert opd_sigma_um(PAPER) == pytest.approx(0.18343, rel=1e-4)
 
 
-def test_the_surface_has_the_slopes_and_the_correlation_that_were_asked():
+def test_the_surface_has_the_given_slopes_and_correlation():
     opd = surface(PAPER, GRID, seed=3)
     assert opd.std() == pytest.approx(opd_sigma_um(PAPER), rel=1e-3)
     for axis in (0, 1):
@@ -59,13 +59,13 @@ def test_the_surface_has_the_slopes_and_the_correlation_that_were_asked():
     assert at_ell == pytest.approx(np.exp(-((shift * PITCH_UM / PAPER.correlation_um) ** 2)), abs=0.05)
 
 
-def test_one_seed_is_one_surface_however_finely_it_is_sampled():
+def test_the_surface_is_independent_of_the_sampling():
     coarse, fine = surface(PAPER, Grid(400, 1, 10.08), 5), surface(PAPER, Grid(400, 3, 10.08), 5)
     assert np.abs(coarse - fine[1::3, 1::3]).max() < 0.01 * opd_sigma_um(PAPER)
     assert correlation(coarse, surface(PAPER, Grid(400, 1, 10.08), 6)) < 0.1
 
 
-def test_the_light_is_all_there_and_inside_the_iris_shadow(psf):
+def test_the_caustic_sums_to_one_within_the_iris_shadow(psf):
     assert psf.dtype == np.float32
     assert psf.min() >= 0
     assert psf.sum(dtype=np.float64) == pytest.approx(1, abs=1e-5)
@@ -75,8 +75,8 @@ def test_the_light_is_all_there_and_inside_the_iris_shadow(psf):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_caustic_is_as_contrasty_as_the_papers(seed):
-    """optics.md: C = 1.29 for 0.5 degrees and 70 um at 6 mm; S0 asks for 1.1 to 1.5."""
+def test_the_contrast_of_the_caustic_equals_the_papers(seed):
+    """OPTICS.md 2.4: C = 1.29 for 0.5 degrees and 70 um at 6 mm; S0 asks for 1.1 to 1.5."""
     pattern = caustic(PAPER, PITCH_UM, seed, lines=1)
     x = (np.arange(pattern.shape[0]) - pattern.shape[0] // 2) * PITCH_UM
     centre = pattern[np.hypot(x[:, None], x[None, :]) < 0.3 * PAPER.iris_um]
@@ -86,7 +86,7 @@ def test_the_caustic_is_as_contrasty_as_the_papers(seed):
 @pytest.mark.parametrize(
     ("cycles_per_mm", "rms"), [(5, 2.0e-2), (9, 1.4e-2), (14.5, 9.5e-3), (22, 5.2e-3), (32, 1.8e-3), (45, 2.7e-4)]
 )
-def test_the_transfer_function_falls_as_tabled(psf, cycles_per_mm, rms):
+def test_the_mtf_equals_the_table(psf, cycles_per_mm, rms):
     spectrum = np.abs(np.fft.rfft2(psf))
     f = np.hypot(np.fft.fftfreq(psf.shape[0], PITCH_UM * 1e-3)[:, None], np.fft.rfftfreq(psf.shape[1], PITCH_UM * 1e-3))
     got = np.sqrt((spectrum[np.abs(f - cycles_per_mm) < 0.7] ** 2).mean())
@@ -95,7 +95,7 @@ def test_the_transfer_function_falls_as_tabled(psf, cycles_per_mm, rms):
 
 @pytest.mark.parametrize("eye", [Refraction(3.0), Refraction(-4.0), Refraction(1.0, 0.75, -1.0)])
 def test_a_refractive_error_warps_the_caustic_exactly(eye):
-    """optics.md 2.4: I_D(x) = I_0(T^-1 x) / det T; without the warp it is another picture."""
+    """OPTICS.md 2.6: I_D(x) = I_0(T^-1 x) / det T; without the warp the correlation is lost."""
     relaxed = caustic_on(GRID, PAPER, 1, EMMETROPIA, 1)
     strained = caustic_on(GRID, PAPER, 1, eye, 1)
     assert correlation(warped(relaxed, eye.warp(PAPER)), strained) > 0.999
@@ -104,7 +104,7 @@ def test_a_refractive_error_warps_the_caustic_exactly(eye):
 
 @pytest.mark.parametrize("m_dpt", [10.0, -10.0])
 def test_the_warp_holds_to_ten_dioptres(m_dpt):
-    """optics.md 2.4 gives 0.999; three diffusers 0.99897 to 0.9992: the plane moves a little with the refraction."""
+    """OPTICS.md 2.6 gives 0.999; three diffusers 0.99897 to 0.9992: the plane shifts a little with the refraction."""
     found = []
     for seed in (1, 2, 3):
         relaxed, strained = (caustic_on(GRID, PAPER, seed, Refraction(m)) for m in (0.0, m_dpt))
@@ -127,16 +127,16 @@ def test_a_point_off_axis_shifts_the_caustic_and_changes_nothing_else():
     assert correlation(np.roll(straight, shift_px, 1), tilted) > 0.999
 
 
-def test_the_pixels_hold_the_light_of_their_area():
-    """Whatever the sampling beneath, a pixel of twice the pitch holds what its four small ones held."""
+def test_pixels_integrate_over_their_area():
+    """At any sampling, a pixel of twice the pitch holds the light of its four small ones."""
     coarse = caustic_on(Grid(400, 2, 2 * PITCH_UM), PAPER, 1, EMMETROPIA, 1)
     finer = caustic_on(Grid(400, 4, 2 * PITCH_UM), PAPER, 1, EMMETROPIA, 1)
     difference = np.linalg.norm(coarse - finer) / np.linalg.norm(finer)
     assert difference < 0.03
 
 
-def test_colours_see_nearly_the_same_caustic():
-    """optics.md 2.2: raw correlation of red and green .982, green and blue .992."""
+def test_caustics_of_the_colours_correlate():
+    """OPTICS.md 2.3: raw correlation of red and green .982, green and blue .992."""
     green = caustic_on(GRID, PAPER.model_copy(update={"wavelength_um": 0.522}), 1)
     red = caustic_on(GRID, PAPER.model_copy(update={"wavelength_um": 0.622}), 1)
     blue = caustic_on(GRID, PAPER.model_copy(update={"wavelength_um": 0.467}), 1)

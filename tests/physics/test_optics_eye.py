@@ -1,4 +1,4 @@
-"""The golden numbers of the design: each formula against the figure that the paper, or a hand, gives for it."""
+"""First-order optics: each formula against a figure of the paper or of a hand calculation."""
 
 from math import degrees, radians
 
@@ -6,20 +6,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from device.config.head_file import OpticsSpec
+from device.config.sensors import known_sensors
+from device.optics import field_extent
 from device.optics.diffuser import opd_sigma_um, slope_sigma
 from device.optics.eye import (
     Relay,
+    beam_walk_mm,
     cornea_reflectance,
     correction_dpt,
     field_deg,
-    overlap,
+    iris_overlap,
     petzval_mm,
     reflex_free_mm,
     size_mm,
-    walk_mm,
 )
-from device.sensors import SENSORS
-from device.spec import OpticsSpec
 
 PAPER = Relay()
 OPTICS = OpticsSpec(iris_um=3200, diffuser_to_sensor_um=6000, angular_magnification=0.75, field_deg=33.4)
@@ -34,10 +35,10 @@ GOLDEN = {
     "pixels per degree": (PAPER.px_per_deg(5.04), 15.58330),
     "um per pixel, model eye": (PAPER.retina_um_per_px(5.04, 25), 28.0),
     "um per pixel, human eye": (PAPER.retina_um_per_px(5.04, 17), 19.04),
-    "s at 50 deg, mm": (PAPER.half_shift_mm(50), 1.96350),
-    "d + 2s at 50 deg, mm": (PAPER.extent_mm(50), 7.12699),
-    "widest field, long side": (PAPER.strict_field_deg(9.6768), 82.46),
-    "widest field, short side": (PAPER.strict_field_deg(5.4432), 28.56),
+    "s at 50 deg, mm": (field_extent.half_shift_mm(PAPER, 50), 1.96350),
+    "d + 2s at 50 deg, mm": (field_extent.extent_mm(PAPER, 50), 7.12699),
+    "widest field, long side": (field_extent.strict_field_deg(PAPER, 9.6768), 82.46),
+    "widest field, short side": (field_extent.strict_field_deg(PAPER, 5.4432), 28.56),
     "slope of the diffuser, mrad": (1000 * slope_sigma(OPTICS), 3.7059),
     "path of the diffuser, um": (opd_sigma_um(OPTICS), 0.18343),
     "scale per dioptre": (PAPER.scale_per_dpt(), 0.003375),
@@ -51,13 +52,13 @@ GOLDEN = {
     "ring that no reflex shows, mm": (reflex_free_mm(16.7), 2.24),
     "sagittal radius, mm": (petzval_mm()[0], 15.06),
     "tangential radius, mm": (petzval_mm()[1], 6.83),
-    "walk at 30 deg, mm": (walk_mm(30), 6.33748),
+    "walk at 30 deg, mm": (beam_walk_mm(30), 6.33748),
 }
 
 
 @pytest.mark.parametrize("name", GOLDEN)
 def test_golden_numbers(name: str) -> None:
-    """optics.md 9, to the digits that it gives."""
+    """OPTICS.md 5.1, to the digits that it gives."""
     value, golden = GOLDEN[name]
     assert value == pytest.approx(golden, rel=2e-3 if abs(golden) < 100 and golden == round(golden, 2) else 2e-5)
 
@@ -65,9 +66,9 @@ def test_golden_numbers(name: str) -> None:
 @pytest.mark.parametrize(
     ("angle_deg", "left"), [(15, 1), (25, 1), (25.6, 0.942), (26, 0.879), (28, 0.458), (29, 0.241), (30, 0.063)]
 )
-def test_what_the_iris_keeps_of_a_walking_beam(angle_deg: float, left: float) -> None:
-    """The paper's 6.3 % at 30 degrees, and the table of optics.md 1.4."""
-    assert overlap(walk_mm(angle_deg), 7.7 / 2 * 4 / 3, 1.6) == pytest.approx(left, abs=0.001)
+def test_the_iris_overlap_of_a_walking_beam(angle_deg: float, left: float) -> None:
+    """The paper's 6.3 % at 30 degrees, and the table of OPTICS.md 1.4."""
+    assert iris_overlap(beam_walk_mm(angle_deg), 7.7 / 2 * 4 / 3, 1.6) == pytest.approx(left, abs=0.001)
 
 
 @pytest.mark.parametrize(
@@ -80,17 +81,17 @@ def test_what_the_iris_keeps_of_a_walking_beam(angle_deg: float, left: float) ->
     ],
 )
 def test_the_extent_table(field: float, h_mm: float, s_mm: float, extent_mm: float) -> None:
-    """optics.md 1.2."""
+    """OPTICS.md 1.2."""
     assert size_mm(field) == pytest.approx(h_mm, abs=6e-4)
-    assert PAPER.half_shift_mm(field) == pytest.approx(s_mm, abs=6e-5)
-    assert PAPER.extent_mm(field) == pytest.approx(extent_mm, abs=6e-4)
-    assert PAPER.half_shift_tan_mm(field) > PAPER.half_shift_mm(field)
+    assert field_extent.half_shift_mm(PAPER, field) == pytest.approx(s_mm, abs=6e-5)
+    assert field_extent.extent_mm(PAPER, field) == pytest.approx(extent_mm, abs=6e-4)
+    assert field_extent.half_shift_tan_mm(PAPER, field) > field_extent.half_shift_mm(PAPER, field)
 
 
 def test_the_papers_own_sensor_breaks_its_rule_on_the_short_side() -> None:
-    long_mm, short_mm = SENSORS["quantalux"].size_mm
-    assert PAPER.extent_mm(50) < long_mm
-    assert PAPER.extent_mm(33.4) > short_mm
+    long_mm, short_mm = known_sensors()["quantalux"].size_mm
+    assert field_extent.extent_mm(PAPER, 50) < long_mm
+    assert field_extent.extent_mm(PAPER, 33.4) > short_mm
 
 
 @pytest.mark.parametrize(
@@ -98,8 +99,8 @@ def test_the_papers_own_sensor_breaks_its_rule_on_the_short_side() -> None:
     [("quantalux", 82.5, 28.6), ("imx296", 23.2, 7.0), ("imx477", 39.3, 19.3), ("ov2311", 20.4, 8.9)],
 )
 def test_the_field_table_of_the_sensors(name: str, long_deg: float, short_deg: float) -> None:
-    """optics.md 1.5, strict rule; the table rounds the sensors' sides to 0.01 mm."""
-    fields = [PAPER.strict_field_deg(side_mm) for side_mm in SENSORS[name].size_mm]
+    """OPTICS.md 1.5, strict rule; the table rounds the sensors' sides to 0.01 mm."""
+    fields = [field_extent.strict_field_deg(PAPER, side_mm) for side_mm in known_sensors()[name].size_mm]
     assert fields == pytest.approx([long_deg, short_deg], abs=0.15)
 
 
@@ -107,22 +108,24 @@ def test_the_field_table_of_the_sensors(name: str, long_deg: float, short_deg: f
     ("name", "field", "share"),
     [("quantalux", 33.4, 0.98), ("quantalux", 45, 0.86), ("imx296", 33.4, 0.72), ("imx296", 45, 0.54)],
 )
-def test_the_share_that_a_short_side_catches(name: str, field: float, share: float) -> None:
-    assert PAPER.captured(field, SENSORS[name].size_mm[1]) == pytest.approx(share, abs=0.006)
+def test_the_captured_share_on_the_short_side(name: str, field: float, share: float) -> None:
+    assert field_extent.captured_share(PAPER, field, known_sensors()[name].size_mm[1]) == pytest.approx(
+        share, abs=0.006
+    )
 
 
 @given(st.floats(0, 8), st.floats(1.7, 6), st.floats(0.2, 1.6))
 def test_an_overlap_is_a_share_and_falls_with_the_distance(shift: float, beam: float, iris: float) -> None:
-    share = overlap(shift, beam, iris)
+    share = iris_overlap(shift, beam, iris)
     assert -1e-9 <= share <= 1 + 1e-9
-    assert overlap(shift + 0.1, beam, iris) <= share + 1e-9
+    assert iris_overlap(shift + 0.1, beam, iris) <= share + 1e-9
 
 
 @given(st.floats(1, 100))
-def test_an_object_fills_the_field_that_it_fills(field: float) -> None:
+def test_field_and_size_are_inverse_functions(field: float) -> None:
     assert field_deg(size_mm(field)) == pytest.approx(field)
 
 
-def test_a_small_field_is_its_angle() -> None:
+def test_the_small_angle_limit_of_the_field() -> None:
     assert radians(field_deg(0.025)) == pytest.approx(0.025 / 25, rel=1e-6)
     assert degrees(0.001) == pytest.approx(field_deg(0.025), rel=1e-6)

@@ -1,4 +1,4 @@
-"""The photon budget against the table of optics.md 3.8."""
+"""Photon budget against the table of OPTICS.md 4.2."""
 
 import pytest
 
@@ -13,7 +13,7 @@ TABLE: dict[Colour, tuple[float, float, float, float]] = {
 
 
 @pytest.mark.parametrize("colour", TABLE)
-def test_what_arrives_is_what_the_table_says(colour: Colour) -> None:
+def test_the_photon_budget_equals_the_table(colour: Colour) -> None:
     """The solid angle of the field is taken from its area, which is 9 % more than the table's cone."""
     cornea_mw, retina, image_nw, electrons = TABLE[colour]
     found = photon_budget(colour, 5.04)

@@ -1,15 +1,15 @@
-"""Eyes and PSFs out of focus, a sensor off its place, and the refraction from the frame (S5, S6, S9, S11).
+"""The paper's experiments: defocused eyes and PSFs, a shifted sensor, refraction from the frame (S5, S6, S9, S11).
 
-The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from services.instrument.paper.bench import Bench
-from services.instrument.paper.report import EXPERIMENTS
-from services.instrument.paper.trainer import magnification
+from services.lab.paper.bench import Bench
+from services.lab.paper.report import EXPERIMENTS
+from services.lab.paper.trainer import magnification
 
 pytestmark = pytest.mark.paper
 
@@ -25,9 +25,9 @@ def test_every_assertion_holds(key: str) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.997, 1.004])
-def test_a_stretch_of_a_few_in_a_thousand_would_be_seen(scale: float) -> None:
-    """The limit of S5 is 3 in 1000: its ruler must be finer than that."""
-    take = BENCH.take("paper_heine")
+def test_the_magnification_detects_a_few_per_mille(scale: float) -> None:
+    """The limit of S5 is 3 in 1000; the measurement of magnification must be finer."""
+    take = BENCH.expose("paper_heine")
     picture = BENCH.solve(take, "gradient")
     middle = (np.array(picture.shape) - 1) / 2
     larger = ndimage.affine_transform(picture, np.full(2, 1 / scale), middle - middle / scale, order=3)

@@ -1,12 +1,12 @@
-"""The paper's numbers, its caustic and the beam that walks (N, S0, S8).
+"""The paper's experiments: its numbers, its caustic and the beam walk (N, S0, S8).
 
-The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
 import pytest
 
-from services.instrument.paper.bench import Bench
-from services.instrument.paper.report import EXPERIMENTS
+from services.lab.paper.bench import Bench
+from services.lab.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper
 

@@ -1,13 +1,13 @@
-"""What the paper printed and lit: rulers, a retina at three places, and how wide that is (S3, S4, S7).
+"""The paper's printed and lit objects: rulers, a retina at three places, and its field (S3, S4, S7).
 
-The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
 import pytest
 
-from services.instrument.paper.bench import Bench
-from services.instrument.paper.printed import edge_signs
-from services.instrument.paper.report import EXPERIMENTS
+from services.lab.paper.bench import Bench
+from services.lab.paper.printed import edge_signs
+from services.lab.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper
 
@@ -22,9 +22,9 @@ def test_every_assertion_holds(key: str) -> None:
     assert not broken, "\n".join(broken)
 
 
-def test_every_edge_of_a_negative_goes_the_wrong_way() -> None:
-    take = BENCH.take("paper_print")
-    asked, same = edge_signs(take, -take.truth, 0.0)
-    assert asked > 5
+def test_a_negative_picture_has_inverted_edges() -> None:
+    take = BENCH.expose("paper_print")
+    edges, same = edge_signs(take, -take.truth, 0.0)
+    assert edges > 5
     assert same == 0
-    assert edge_signs(take, take.truth, 0.0) == (asked, asked)
+    assert edge_signs(take, take.truth, 0.0) == (edges, edges)

@@ -1,12 +1,12 @@
-"""What the paper showed on a screen: dots, a retina, and how flat it is (S1, S2, S2b).
+"""The paper's objects on a screen: dots, a retina, and the flat-field correction (S1, S2, S2b).
 
-The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
 import pytest
 
-from services.instrument.paper.bench import Bench
-from services.instrument.paper.report import EXPERIMENTS
+from services.lab.paper.bench import Bench
+from services.lab.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper
 

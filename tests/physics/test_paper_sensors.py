@@ -1,12 +1,12 @@
-"""Sensors that are too small for the light, and frames that are bad in known ways (S10, S12).
+"""The paper's experiments: sensors smaller than the light, and frames with known faults (S10, S12).
 
-The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged: the caustic has nothing finer.
+The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
 import pytest
 
-from services.instrument.paper.bench import Bench
-from services.instrument.paper.report import EXPERIMENTS
+from services.lab.paper.bench import Bench
+from services.lab.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper
 

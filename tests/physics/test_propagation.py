@@ -1,4 +1,4 @@
-"""Truths about light in free space, not snapshots of what the code once gave."""
+"""Angular spectrum propagation against closed forms."""
 
 import numpy as np
 import pytest
@@ -24,27 +24,27 @@ def rms_width_um(intensity):
 
 
 @pytest.mark.parametrize("distance_um", [1000.0, 6000.0, 20000.0])
-def test_a_gaussian_beam_widens_as_its_closed_form_says(distance_um):
+def test_the_width_of_a_gaussian_beam_equals_its_closed_form(distance_um):
     waist = 60.0
     got = rms_width_um(np.abs(propagate(gaussian_beam(waist), DX_UM, WAVE_UM, distance_um)) ** 2)
     rayleigh = np.pi * waist**2 / WAVE_UM
     assert got == pytest.approx(waist / 2 * np.hypot(1, distance_um / rayleigh), rel=1e-3)
 
 
-def test_energy_is_kept():
+def test_energy_is_conserved():
     beam = gaussian_beam(40.0)
     after = propagate(beam, DX_UM, WAVE_UM, 6000.0)
     assert (np.abs(after) ** 2).sum() == pytest.approx((np.abs(beam) ** 2).sum(), rel=1e-5)
 
 
-def test_there_and_back_is_where_it_began():
+def test_back_propagation_restores_the_field():
     rng = np.random.default_rng(0)
     field = gaussian_beam(150.0) * np.exp(1j * rng.standard_normal((N, N))).astype(np.complex64)
     back = propagate(propagate(field, DX_UM, WAVE_UM, 6000.0), DX_UM, WAVE_UM, -6000.0)
     assert np.abs(back - field).max() < 1e-5
 
 
-def test_a_tilted_beam_lands_where_its_angle_points():
+def test_a_tilted_beam_shifts_by_its_angle():
     distance, shift_px = 6000.0, 20
     sine = np.sin(np.arctan(shift_px * DX_UM / distance))
     tilt = np.exp(2j * np.pi * sine / WAVE_UM * axis()[None, :]).astype(np.complex64)
@@ -53,7 +53,7 @@ def test_a_tilted_beam_lands_where_its_angle_points():
     assert np.corrcoef(np.roll(straight, shift_px, 1).ravel(), tilted.ravel())[0, 1] > 0.9999
 
 
-def test_evanescent_waves_do_not_arrive():
+def test_evanescent_waves_vanish():
     spectrum = transfer(64, 0.2, WAVE_UM, 100.0)
     f = np.fft.fftfreq(64, 0.2)
     fast = np.hypot(f[:, None], f[None, :]) * WAVE_UM > 1
@@ -66,7 +66,7 @@ def test_evanescent_waves_do_not_arrive():
     ("samples", "dx_um", "words"),
     [(1024, 20.0, "cannot hold rays"), (512, 5.0, "too small"), (4000, 0.9, "transfer function")],
 )
-def test_a_grid_that_would_lie_is_refused(samples, dx_um, words):
+def test_an_undersampled_grid_is_refused(samples, dx_um, words):
     with pytest.raises(SpecError, match=words):
         require_sampling(samples, dx_um, wavelength_um=0.55, distance_um=6000.0, aperture_um=3200.0, angle_rad=0.0185)
 

@@ -1,4 +1,4 @@
-"""Refraction from a frame, and the picture behind it: frames by wave propagation, of which recon knows nothing."""
+"""Refraction estimate and picture of wave-propagated frames, which share no operator with the solver."""
 
 from functools import cache
 from pathlib import Path
@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from device.clock import SystemClock, VirtualClock
+from device.config.head_file import load_head
+from device.config.scene import EyeSpec
 from device.optics.diffuser import Refraction, caustic
-from device.recon.geometry import disc
-from device.recon.model import field_radius_px
-from device.recon.plan import Planner
+from device.recon.estimation.psf_warp import transform, warped
+from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.grid import disc
 from device.recon.reconstructor import Recipe, Reconstructor
-from device.recon.warp import transform, warped
-from device.scene import EyeSpec
-from device.sim.calibrate import simulated_calibration
+from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.spec import load_head
 from device.values import Calibration, Counts, Image, Psf
 
 HEAD = load_head(Path(__file__).parents[2] / "hardware/heads/sim.toml")
@@ -32,7 +32,7 @@ def world(m_dpt: float) -> World:
 
 
 @cache
-def seen(m_dpt: float) -> Counts:
+def counts_of(m_dpt: float) -> Counts:
     eye = world(m_dpt)
     return eye.sensor.read(eye.electrons_per_s("green") * np.float32(HEAD.camera.exposure_s), (7, int(m_dpt * 10) % 99))
 
@@ -44,13 +44,13 @@ def relaxed() -> World:
 
 @pytest.fixture(scope="module")
 def reconstruct() -> Reconstructor:
-    """Calibrated with a relaxed eye; the closed form, so that what the PSF does is not hidden by rounds."""
+    """Reconstructor calibrated with a relaxed eye; a closed form, so that no iteration hides the effect of the PSF."""
     recipes = (Recipe("evidence", 4), Recipe("gradient", 2))
     return Reconstructor(simulated_calibration(relaxed()), relaxed().shape, PLANNER, SystemClock(), recipes)
 
 
-def likeness(picture: Image, calibration: Calibration) -> float:
-    """Pearson correlation with the truth inside the field."""
+def pcc(picture: Image, calibration: Calibration) -> float:
+    """Return the Pearson correlation with the truth inside the field."""
     rows, cols = relaxed().shape
     radius_px = field_radius_px(calibration)
     inside = disc((rows, cols), ((rows - 1) / 2, (cols - 1) / 2), radius_px - 3) > 0.5
@@ -60,8 +60,8 @@ def likeness(picture: Image, calibration: Calibration) -> float:
 @pytest.mark.parametrize(
     ("eye", "pitch_um"), [(Refraction(4.0), 5.04), (Refraction(-5.0), 3.45), (Refraction(1.0, 0.75, -1.0), 5.04)]
 )
-def test_the_warped_psf_is_the_one_that_waves_make(eye: Refraction, pitch_um: float) -> None:
-    """optics.md 2.4: 0.9995 up to 5.5 dpt; unwarped it is below 0.96."""
+def test_the_warped_psf_agrees_with_wave_propagation(eye: Refraction, pitch_um: float) -> None:
+    """OPTICS.md 2.6: 0.9995 up to 5.5 dpt; unwarped it is below 0.96."""
     assert HEAD.optics is not None
     geometry = HEAD.optics.geometry(pitch_um)
     stored, strained = (Psf(caustic(HEAD.optics, pitch_um, 1, of, 1)) for of in (Refraction(), eye))
@@ -73,11 +73,11 @@ def test_the_warped_psf_is_the_one_that_waves_make(eye: Refraction, pitch_um: fl
     assert np.corrcoef(stored.pixels.ravel(), strained.pixels.ravel())[0, 1] < 0.96
 
 
-def test_the_frame_tells_the_refraction(reconstruct: Reconstructor) -> None:
+def test_the_refraction_is_estimated_from_the_frame(reconstruct: Reconstructor) -> None:
     """Over 23 frames of photographs 0.09 dpt RMS, 0.24 at most; the report gives the correction, of opposite sign."""
     errors = []
     for m_dpt in EYES_DPT:
-        report = reconstruct(seen(m_dpt)).report
+        report = reconstruct(counts_of(m_dpt)).report
         assert report.refraction_dpt is not None
         assert 0.03 < report.refraction_dpt["sd"] < 0.25
         assert report.psf_scale == pytest.approx(1 - 0.003375 * m_dpt, abs=0.001)
@@ -85,14 +85,14 @@ def test_the_frame_tells_the_refraction(reconstruct: Reconstructor) -> None:
     assert np.sqrt(np.mean(np.square(errors))) < 0.15
 
 
-def test_an_eye_out_of_focus_is_seen_as_well_as_a_relaxed_one(reconstruct: Reconstructor) -> None:
-    """Within 0.3 dB, which at this likeness is 0.007 of correlation; the stored PSF alone keeps 0.88 of it."""
-    focused = [likeness(reconstruct(seen(m_dpt)).picture, reconstruct.calibration) for m_dpt in EYES_DPT]
+def test_an_eye_out_of_focus_is_reconstructed_as_well_as_a_relaxed_one(reconstruct: Reconstructor) -> None:
+    """At most 0.3 dB lost, 0.007 of correlation here; the stored PSF alone keeps 0.88 of the correlation."""
+    focused = [pcc(reconstruct(counts_of(m_dpt)).picture, reconstruct.calibration) for m_dpt in EYES_DPT]
     assert min(focused) > focused[1] - 0.007
     plain = Reconstructor(
         reconstruct.calibration, reconstruct.shape, PLANNER, VirtualClock(), (Recipe("gradient", 2),), refract=False
     )
-    made = plain(seen(4.0))
+    made = plain(counts_of(4.0))
     assert made.report.refraction_dpt is None
-    assert 0.88 * focused[1] < likeness(made.picture, plain.calibration) < 0.99 * focused[1]
-    assert np.array_equal(plain(seen(0.0)).picture, reconstruct(seen(0.0)).picture)
+    assert 0.88 * focused[1] < pcc(made.picture, plain.calibration) < 0.99 * focused[1]
+    assert np.array_equal(plain(counts_of(0.0)).picture, reconstruct(counts_of(0.0)).picture)

@@ -1,4 +1,4 @@
-"""The simulated sensor against the statistics that it must have."""
+"""Simulated sensor against the statistics of shot noise, read noise and converter."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_mean_and_variance_follow_the_photon_law_on_both_sides_of_the_gaussian_b
     assert electrons.var() == pytest.approx(variance, rel=0.03)
 
 
-def test_few_photons_are_skewed_as_poisson_is():
+def test_low_counts_have_the_skewness_of_poisson():
     quiet = SensorModel(0.1, 1000, 65535, 6000.0, 0.0)
     electrons = (quiet.read(flat(4.0), 2).astype(np.float64) - 1000) * 0.1
     assert ((electrons - 4) ** 3).mean() == pytest.approx(4, rel=0.1)
@@ -39,12 +39,12 @@ def test_counts_never_wrap_below_zero():
     assert noisy.max() < 200
 
 
-def test_the_seed_alone_decides_the_noise():
+def test_noise_is_reproducible_by_seed():
     assert np.array_equal(MODEL.read(flat(50), (4, 1)), MODEL.read(flat(50), (4, 1)))
     assert not np.array_equal(MODEL.read(flat(50), (4, 1)), MODEL.read(flat(50), (4, 2)))
 
 
-def test_strips_do_not_repeat_each_other():
+def test_strips_have_independent_noise():
     counts = MODEL.read(flat(500, (256, 200)), 1).astype(np.float64)
     assert abs(np.corrcoef(counts[:64].ravel(), counts[64:128].ravel())[0, 1]) < 0.05
 

@@ -1,4 +1,4 @@
-"""The parts under contract. A new camera or lamp joins by one line in IMPLEMENTATIONS."""
+"""Fixtures of the port contract tests; a new camera or lamp joins by one line in IMPLEMENTATIONS."""
 
 import platform
 import sys
@@ -13,44 +13,46 @@ import numpy as np
 import pytest
 
 from device.clock import Clock, SystemClock, VirtualClock
+from device.config.head_file import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.drivers.guardian import Guardian
 from device.drivers.pi_camera import PiCamera
 from device.drivers.ring import Apa102Ring
 from device.drivers.v4l2_camera import V4l2Camera
-from device.guard import GuardedLight
 from device.head import hazard_of
-from device.ledger import MemoryLedger
+from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.guard import GuardedLight
 from device.ports import Camera, Light
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.replay import ReplayCamera, ReplayLight
 from device.sim.world import World
-from device.spec import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from tests.ports.emulators.timeline import Timeline
 from tests.ports.emulators.video import EmulatedVideo
 
-sys.path.insert(0, str(Path(__file__).parent / "emulators" / "pi"))  # what only Raspberry Pi OS has
+sys.path.insert(
+    0, str(Path(__file__).parent / "emulators" / "pi")
+)  # emulated modules that exist only on Raspberry Pi OS
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
 
 def pytest_report_header() -> str:
-    """Which real packages the drivers are exercised through."""
+    """Return the versions of the hardware libraries that the drivers run on."""
     found = ", ".join(f"{name} {version(name)}" for name in ("picamera2", "spidev", "smbus2"))
     return f"drivers through: {found}; Python {platform.python_version()}"
 
 
 @dataclass
 class Rig:
-    """A camera and the lamp that lights what it sees."""
+    """Camera with the lamp that lights its scene."""
 
     camera: Camera
     light: Light
     clock: Clock
-    recorded: bool = False  # what it shows was exposed long ago: colour and duration change nothing
+    recorded: bool = False  # a recording: colour and duration have no effect
 
     def close(self) -> None:
-        """Dark, and gone."""
+        """Turn the lamp off and close all parts."""
         self.light.off()
         self.camera.close()
         if isinstance(self.light, Apa102Ring):
@@ -58,7 +60,7 @@ class Rig:
 
 
 def small_head() -> InstrumentSpec:
-    """The simulated head with sixteen times fewer, larger pixels."""
+    """Return the simulated head with sixteen times fewer, larger pixels."""
     spec = load_head(HEAD)
     coarse = {"rows": 270, "cols": 480, "pitch_um": 4 * spec.camera.pitch_um}
     return spec.model_copy(update={"camera": spec.camera.model_copy(update=coarse)})
@@ -77,7 +79,7 @@ def guarded_rig() -> Rig:
 
 
 def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
-    """Two recorded frames, 12 bits, with their black level."""
+    """Return a rig of two recorded 12-bit frames with their black level."""
     clock, lamp, rng = VirtualClock(), ReplayLight(), np.random.default_rng(0)
     with TemporaryDirectory() as folder:
         raws = tuple(Path(folder) / f"raw{n}.npy" for n in range(2))
@@ -88,24 +90,24 @@ def replay_rig(shape: tuple[int, ...] = (24, 32)) -> Rig:
 
 
 def pi_rig(*, wide: bool = False) -> Rig:
-    """The real picamera2 over an emulated libcamera, whose sensor looks at a simulated world in real time."""
+    """Return the real picamera2 over an emulated libcamera, whose sensor exposes a simulated world in real time."""
     timeline = Timeline()
     light = SimLight(timeline)
     return Rig(emulated_camera(timeline, light, wide=wide), light, SystemClock())
 
 
 def ring_rig() -> Rig:
-    """That camera, lit by the real spidev's bytes: the LEDs that shine are decoded from the emulated wire."""
-    from tests.ports.emulators.wires import wires
+    """Return picamera2's camera, lit by the real spidev: the lit LEDs are decoded from the emulated SPI bus."""
+    from tests.ports.emulators.wires import emulated_buses
 
     chain = ChainSpec()
-    wires().break_()
+    emulated_buses().set_faults()
     light = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s=30)
-    return Rig(emulated_camera(wires(), light), light, SystemClock())
+    return Rig(emulated_camera(emulated_buses(), light), light, SystemClock())
 
 
 def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCamera:
-    """picamera2's camera on a sensor of its own, which sees what `lamp` says."""
+    """Return picamera2's camera on a new emulated sensor, which is lit as `lamp` reports."""
     import libcamera
 
     from tests.ports.emulators.memory import MemoryAllocator
@@ -118,7 +120,7 @@ def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCa
 
 
 def v4l2_rig(grants: str, bits: int) -> Rig:
-    """The V4L2 driver over an emulated device of one format, in real time."""
+    """Return the V4L2 driver over an emulated device of one format, in real time."""
     head = small_head()
     black_dn = 60.0 * 2 ** (bits - 10)
     camera = head.camera.model_copy(update={"backend": "v4l2", "bit_depth": bits, "black_dn": black_dn})
@@ -151,7 +153,7 @@ def rig_of_module(request):
 
 @pytest.fixture
 def rig(rig_of_module):
-    """A rig whose lamp is dark before and after every test."""
+    """Yield a rig whose lamp is off before and after every test."""
     rig_of_module.light.off()
     yield rig_of_module
     rig_of_module.light.off()
@@ -159,7 +161,7 @@ def rig(rig_of_module):
 
 @pytest.fixture
 def live_rig(rig):
-    """A rig that exposes what is there now, not what was recorded."""
+    """Yield a rig that exposes the present scene, not a recording."""
     if rig.recorded:
         pytest.skip("a recording was exposed once, in one light")
     return rig
@@ -167,7 +169,7 @@ def live_rig(rig):
 
 @pytest.fixture(params=sorted(IMPLEMENTATIONS))
 def fresh_rig(request):
-    """A rig of one's own, to be broken or closed."""
+    """Yield a new rig, which a test may break or close."""
     rig = IMPLEMENTATIONS[request.param]()
     yield rig
     rig.close()

@@ -1,16 +1,16 @@
-"""What every Camera keeps, whoever made it (device/ports.py)."""
+"""Contract of every Camera implementation (device/ports.py)."""
 
 import numpy as np
 import pytest
 
 from device.errors import CameraMissing, FrameError
-from device.values import Glow, Shot
+from device.values import ExposureSettings, Illumination
 
-SHOT = Shot(0.05)
-GREEN = Glow("green")
+SHOT = ExposureSettings(0.05)
+GREEN = Illumination("green")
 
 
-def test_a_frame_is_as_large_as_the_sensor_and_holds_counts(rig):
+def test_a_frame_has_the_sensor_shape_and_uint16_counts(rig):
     frame = rig.camera.expose(SHOT)
     assert frame.counts.shape == rig.camera.shape
     assert frame.counts.dtype == np.uint16
@@ -18,14 +18,14 @@ def test_a_frame_is_as_large_as_the_sensor_and_holds_counts(rig):
     assert not frame.counts.flags.writeable
 
 
-def test_frames_are_numbered_upwards_and_never_the_same(rig):
+def test_frame_numbers_increase_and_frames_differ(rig):
     with rig.light.on(GREEN):
         frames = [rig.camera.expose(SHOT) for _ in range(3)]
     assert frames[0].number < frames[1].number < frames[2].number
     assert not np.array_equal(frames[0].counts, frames[1].counts)
 
 
-def test_an_earlier_frame_is_not_overwritten_by_the_next(rig):
+def test_a_later_exposure_does_not_overwrite_an_earlier_frame(rig):
     with rig.light.on(GREEN):
         first = rig.camera.expose(SHOT)
         kept = first.counts.copy()
@@ -48,12 +48,12 @@ def test_a_buffer_that_does_not_fit_is_refused(rig):
             rig.camera.expose(SHOT, wrong)
 
 
-def test_it_is_dark_when_the_lamp_is_off_and_says_so(rig):
+def test_a_frame_without_lamp_is_dark_and_reports_no_illumination(rig):
     with rig.light.on(GREEN):
         lit = rig.camera.expose(SHOT)
     dark = rig.camera.expose(SHOT)
-    assert lit.glow == GREEN
-    assert dark.glow is None
+    assert lit.illumination == GREEN
+    assert dark.illumination is None
     assert lit.counts.max() > dark.counts.max() + 50  # of 255, where a camera has eight bits
     assert dark.counts.mean() < lit.counts.mean()
 
@@ -61,19 +61,19 @@ def test_it_is_dark_when_the_lamp_is_off_and_says_so(rig):
 def test_twice_the_exposure_gives_twice_the_light(live_rig):
     rig = live_rig
     dark = rig.camera.expose(SHOT).counts.astype(np.float64).mean()
-    with rig.light.on(Glow("green", 0.5)):
-        once = rig.camera.expose(Shot(0.03)).counts.mean() - dark
-        twice = rig.camera.expose(Shot(0.06)).counts.mean() - dark
+    with rig.light.on(Illumination("green", 0.5)):
+        once = rig.camera.expose(ExposureSettings(0.03)).counts.mean() - dark
+        twice = rig.camera.expose(ExposureSettings(0.06)).counts.mean() - dark
     assert twice == pytest.approx(2 * once, rel=0.02)
 
 
-def test_an_exposure_takes_its_time(rig):
+def test_an_exposure_lasts_at_least_the_exposure_time(rig):
     before = rig.clock.now_s()
-    rig.camera.expose(Shot(0.2))
+    rig.camera.expose(ExposureSettings(0.2))
     assert rig.clock.now_s() - before >= 0.2 - 1e-9
 
 
-def test_closing_twice_is_harmless_and_a_closed_camera_is_missing(fresh_rig):
+def test_closing_twice_is_harmless_and_a_closed_camera_raises_camera_missing(fresh_rig):
     fresh_rig.camera.close()
     fresh_rig.camera.close()
     with pytest.raises(CameraMissing):

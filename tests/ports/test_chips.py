@@ -1,4 +1,4 @@
-"""What every Thermometer, Battery and HeadMemory keeps, simulated or real over an emulated bus (device/ports.py)."""
+"""Contract of every Thermometer, Battery and HeadMemory, simulated or over an emulated I2C bus (device/ports.py)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from device.errors import BusFault, MemoryDamaged
 from device.ports import Battery, HeadMemory, Thermometer
 from device.sim.chips import SimBattery, SimHeadMemory, SimThermometer
 from device.sim.world import World
-from device.values import Charge, Identity
+from device.values import BatteryState, HeadIdentity
 from tests.ports.conftest import small_head
-from tests.ports.emulators.wires import wires
+from tests.ports.emulators.wires import emulated_buses
 
-IDENTITY = Identity("DS-0042", "9f" * 32)
+IDENTITY = HeadIdentity("DS-0042", "9f" * 32)
 
 
 @dataclass
 class Chips:
-    """The chips of one head, and how to silence them."""
+    """Chips of one head, with a switch that stops their answers."""
 
     thermometer: Thermometer
     battery: Battery
@@ -39,12 +39,12 @@ def simulated() -> Chips:
 
 
 def emulated() -> Chips:
-    """The real smbus2."""
-    wires().break_()
+    """Return the chips over the real smbus2."""
+    emulated_buses().set_faults()
     bus = I2cBus("/dev/i2c-1")
 
     def silence(on: bool) -> None:
-        wires().break_(*["i2c.silent"] * on)
+        emulated_buses().set_faults(*["i2c.silent"] * on)
 
     memory = Eeprom24(bus, 0x50, VirtualClock())
     return Chips(Tmp117(bus, 0x48), Max17048(bus, 0x36), memory, silence, bus.close)
@@ -58,45 +58,45 @@ def chips(request):
     made.close()
 
 
-def test_the_thermometer_says_degrees(chips):
+def test_the_thermometer_returns_degrees_celsius(chips):
     assert chips.thermometer.read_c() == 25.0
 
 
-def test_the_battery_says_how_full_it_is(chips):
-    assert chips.battery.read() == Charge(pytest.approx(0.775, abs=0.002), pytest.approx(3.88, abs=0.01))
+def test_the_battery_returns_charge_and_voltage(chips):
+    assert chips.battery.read() == BatteryState(pytest.approx(0.775, abs=0.002), pytest.approx(3.88, abs=0.01))
 
 
-def test_the_memory_keeps_who_the_head_is(chips):
+def test_the_memory_stores_the_identity_of_the_head(chips):
     chips.memory.write(IDENTITY)
     assert chips.memory.read() == IDENTITY
-    other = Identity("DS-0043", "0a" * 32)
+    other = HeadIdentity("DS-0043", "0a" * 32)
     chips.memory.write(other)
     assert chips.memory.read() == other
 
 
-def test_a_silent_bus_is_a_fault_with_a_remedy(chips):
+def test_a_silent_bus_raises_bus_fault_with_a_remedy(chips):
     chips.silence(True)
     for ask in (chips.thermometer.read_c, chips.battery.read, chips.memory.read, lambda: chips.memory.write(IDENTITY)):
-        with pytest.raises(BusFault) as told:
+        with pytest.raises(BusFault) as caught:
             ask()
-        assert "technician" in told.value.remedy
+        assert "technician" in caught.value.remedy
 
 
 @pytest.mark.parametrize(("place", "message"), [(0, "something else"), (12, "checksum")])
-def test_a_damaged_memory_is_told_from_an_empty_one(place, message):
-    wires().break_()
+def test_a_damaged_memory_is_distinguished_from_a_blank_one(place, message):
+    emulated_buses().set_faults()
     bus = I2cBus("/dev/i2c-1")
     memory = Eeprom24(bus, 0x50, VirtualClock())
     memory.write(IDENTITY)
-    bus.send(0x50, place.to_bytes(2, "big") + b"\x00")
-    with pytest.raises(MemoryDamaged, match=message) as told:
+    bus.write(0x50, place.to_bytes(2, "big") + b"\x00")
+    with pytest.raises(MemoryDamaged, match=message) as caught:
         memory.read()
-    assert "diffuscope calibrations use" in told.value.remedy
+    assert "diffuscope calibrations use" in caught.value.remedy
     bus.close()
 
 
-class ShortOfPower(VirtualClock):
-    """Power goes away while the memory keeps its n-th page."""
+class PowerCutClock(VirtualClock):
+    """Clock that simulates a power cut while the memory stores its n-th page."""
 
     def __init__(self, pages: int) -> None:
         super().__init__()
@@ -110,14 +110,14 @@ class ShortOfPower(VirtualClock):
 
 
 @pytest.mark.parametrize("pages", [1, 2, 3])
-def test_a_power_cut_while_it_is_written_is_noticed_and_writing_again_mends_it(pages):
-    wires().break_()
+def test_a_power_cut_during_a_write_is_detected_and_repaired_by_a_new_write(pages):
+    emulated_buses().set_faults()
     bus = I2cBus("/dev/i2c-1")
     memory = Eeprom24(bus, 0x50, VirtualClock())
     memory.write(IDENTITY)
-    other = Identity("DS-0007-rebuilt", "0a" * 32)
+    other = HeadIdentity("DS-0007-rebuilt", "0a" * 32)
     with pytest.raises(KeyboardInterrupt):
-        Eeprom24(bus, 0x50, ShortOfPower(pages)).write(other)
+        Eeprom24(bus, 0x50, PowerCutClock(pages)).write(other)
     with pytest.raises(MemoryDamaged):
         memory.read()
     memory.write(other)
@@ -125,6 +125,6 @@ def test_a_power_cut_while_it_is_written_is_noticed_and_writing_again_mends_it(p
     bus.close()
 
 
-def test_a_bus_that_is_not_there_is_a_fault():
+def test_a_missing_bus_raises_bus_fault():
     with pytest.raises(BusFault, match="i2c-7"):
         I2cBus("/dev/i2c-7")

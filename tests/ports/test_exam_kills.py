@@ -1,4 +1,4 @@
-"""The whole instrument, with the real ring on an emulated wire, killed in the middle of aiming and of a press."""
+"""Kill tests of the whole instrument with the real ring on an emulated SPI bus, during aiming and during a press."""
 
 import os
 import random
@@ -15,7 +15,7 @@ from threading import Thread
 import pytest
 
 from tests.ports.conftest import HEAD
-from tests.ports.emulators.wires import Wires, wires
+from tests.ports.emulators.wires import EmulatedBuses, emulated_buses
 
 ROOT = HEAD.parents[2]
 DARK_S, READY_S = 0.1, 60.0
@@ -23,7 +23,7 @@ MIXED = '[light]\nbackend = "apa102"'
 
 
 class Instrument:
-    """`diffuscope run` with a simulated camera that is lit by the real ring, and somebody who looks and presses."""
+    """`diffuscope run` with a simulated camera lit by the real ring, and a client that polls and presses."""
 
     def __init__(self, folder: Path) -> None:
         self.head = folder / "mixed.toml"
@@ -37,8 +37,8 @@ class Instrument:
 
     @contextmanager
     def running(self) -> Iterator[subprocess.Popen[bytes]]:
-        words = ["run", "--head", str(self.head), "--port", str(self.port), "--data", str(self.data)]
-        command = [sys.executable, "-c", "from services.cli import main; main()", *words]
+        arguments = ["run", "--head", str(self.head), "--port", str(self.port), "--data", str(self.data)]
+        command = [sys.executable, "-c", "from services.cli import main; main()", *arguments]
         process = subprocess.Popen(command, cwd=ROOT, env=os.environ.copy(), stdout=subprocess.DEVNULL)
         try:
             self.wait_until(lambda: self.ask("/api/preview?after=0") is not None)
@@ -63,7 +63,7 @@ class Instrument:
             return answer.read() if answer.status != 204 else None
 
     def use(self) -> None:
-        """Look, and press, until nobody answers any more."""
+        """Poll the preview and press until the server no longer answers."""
         with suppress(OSError):
             for number in range(1000):
                 self.ask(f"/api/preview?after={number}")
@@ -72,13 +72,13 @@ class Instrument:
 
 
 @pytest.fixture
-def sound_wires() -> Wires:
-    wires().break_()
-    return wires()
+def sound_wires() -> EmulatedBuses:
+    emulated_buses().set_faults()
+    return emulated_buses()
 
 
-def dark_after_s(chain: Wires, moment_s: float) -> float:
-    """How long after a moment the last LED went out; it must stay dark for a while."""
+def dark_after_s(chain: EmulatedBuses, moment_s: float) -> float:
+    """Return the time from a moment to the message that turned the last LED off; the ring must then stay off."""
     time.sleep(0.5)
     assert not chain.lit
     later = [one["at_s"] for one in chain.messages if one["at_s"] > moment_s]
@@ -90,7 +90,7 @@ def dark_after_s(chain: Wires, moment_s: float) -> float:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_an_instrument_that_is_killed_while_it_is_used_leaves_no_light(tmp_path, sound_wires, seed):
+def test_killing_the_instrument_in_use_leaves_no_light(tmp_path, sound_wires, seed):
     instrument = Instrument(tmp_path)
     with instrument.running() as process:
         seen = len(sound_wires.messages)

@@ -1,48 +1,48 @@
-"""What every Light keeps, whoever made it (device/ports.py)."""
+"""Contract of every Light implementation (device/ports.py)."""
 
 import pytest
 
-from device.values import Glow, Shot
+from device.values import ExposureSettings, Illumination
 
-GREEN, RED = Glow("green"), Glow("red", 0.5)
-
-
-def test_it_is_dark_by_default(fresh_rig):
-    assert fresh_rig.light.glow is None
-    assert fresh_rig.camera.expose(Shot(0.01)).glow is None
+GREEN, RED = Illumination("green"), Illumination("red", 0.5)
 
 
-def test_it_shines_what_it_was_told_until_the_context_ends(rig):
+def test_the_light_is_off_by_default(fresh_rig):
+    assert fresh_rig.light.illumination is None
+    assert fresh_rig.camera.expose(ExposureSettings(0.01)).illumination is None
+
+
+def test_the_light_shows_the_requested_illumination_until_the_context_ends(rig):
     for glow in (GREEN, RED):
         with rig.light.on(glow):
-            assert rig.light.glow == glow
-        assert rig.light.glow is None
+            assert rig.light.illumination == glow
+        assert rig.light.illumination is None
 
 
-def test_it_is_dark_after_an_exception(rig):
+def test_the_light_is_off_after_an_exception(rig):
     with pytest.raises(ZeroDivisionError), rig.light.on(GREEN):
         raise ZeroDivisionError
-    assert rig.light.glow is None
+    assert rig.light.illumination is None
 
 
-def test_a_context_that_is_never_entered_stays_dark(rig):
+def test_a_context_that_is_never_entered_leaves_the_light_off(rig):
     rig.light.on(GREEN)
-    assert rig.light.glow is None
+    assert rig.light.illumination is None
 
 
-def test_off_ends_the_light_at_once_and_is_harmless_twice(rig):
+def test_off_is_immediate_and_idempotent(rig):
     with rig.light.on(GREEN):
         rig.light.off()
-        assert rig.light.glow is None
+        assert rig.light.illumination is None
         rig.light.off()
-    assert rig.light.glow is None
+    assert rig.light.illumination is None
 
 
-def test_the_colours_are_different_pictures(live_rig):
+def test_colours_give_different_frames(live_rig):
     rig = live_rig
     frames = {}
     for colour in ("green", "red"):
-        with rig.light.on(Glow(colour, 0.5)):
-            frames[colour] = rig.camera.expose(Shot(0.05))
-    assert frames["red"].glow == RED
+        with rig.light.on(Illumination(colour, 0.5)):
+            frames[colour] = rig.camera.expose(ExposureSettings(0.05))
+    assert frames["red"].illumination == RED
     assert abs(frames["red"].counts.mean() / frames["green"].counts.mean() - 1) > 0.1

@@ -1,4 +1,4 @@
-"""Numbers and outcomes: what holds for every number and every visit."""
+"""Identification numbers and visit outcomes: properties of every number and every visit."""
 
 from typing import Any
 
@@ -7,9 +7,17 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from device.errors import InputError
-from services.records.numbering import check_digit, is_checked, looks_automatic, numbered, tidy, whole
+from services.records.capture import PictureVerdict
+from services.records.numbering import (
+    automatic_number,
+    check_digit,
+    has_valid_check_digit,
+    join_check_digit,
+    looks_automatic,
+    normalise,
+)
 from services.records.protocol import VISIONS, load_protocol
-from services.records.visit import Decided, SlotState, Taken, decided_after, outcome
+from services.records.visit import SlotCapture, SlotDecision, SlotState, decide_outcome, decision_after
 
 PROTOCOL = load_protocol()
 LIMIT = VISIONS.index(PROTOCOL.programme.vision_limit)
@@ -18,51 +26,51 @@ counters, prefixes = st.integers(1, 10**9), st.from_regex("[A-Z]{0,4}", fullmatc
 
 @given(prefixes, counters)
 def test_an_automatic_number_is_checked_and_tidy(prefix: str, counter: int) -> None:
-    number = numbered(prefix, counter)
-    assert is_checked(prefix, number)
-    assert tidy(f" {number.lower()} ") == number
+    number = automatic_number(prefix, counter)
+    assert has_valid_check_digit(prefix, number)
+    assert normalise(f" {number.lower()} ") == number
     assert looks_automatic(prefix, number) == bool(prefix)
 
 
 @given(st.from_regex("[A-Z]{1,4}", fullmatch=True), counters)
-def test_a_number_with_its_check_digit_apart_is_the_same_number(prefix: str, counter: int) -> None:
-    number = numbered(prefix, counter)
-    assert tidy(f"{number[:-1]}-{number[-1]}".lower()) == number
+def test_a_separated_check_digit_gives_the_same_number(prefix: str, counter: int) -> None:
+    number = automatic_number(prefix, counter)
+    assert normalise(f"{number[:-1]}-{number[-1]}".lower()) == number
     wrong = f"{number[:-1]}-{(int(number[-1]) + 1) % 10}"
-    assert whole(wrong) == wrong
+    assert join_check_digit(wrong) == wrong
 
 
 @given(counters, st.integers(0, 20), st.integers(1, 9))
-def test_any_one_wrong_digit_is_found(counter: int, place: int, by: int) -> None:
-    digits = numbered("", counter)
+def test_one_wrong_digit_is_detected(counter: int, place: int, by: int) -> None:
+    digits = automatic_number("", counter)
     place %= len(digits)
     wrong = digits[:place] + str((int(digits[place]) + by) % 10) + digits[place + 1 :]
-    assert not is_checked("", wrong)
+    assert not has_valid_check_digit("", wrong)
 
 
 @given(counters, st.integers(0, 20))
-def test_any_two_swapped_neighbours_are_found(counter: int, place: int) -> None:
-    digits = numbered("", counter)
+def test_two_swapped_neighbours_are_detected(counter: int, place: int) -> None:
+    digits = automatic_number("", counter)
     place %= len(digits) - 1
     swapped = digits[:place] + digits[place + 1] + digits[place] + digits[place + 2 :]
     assume(swapped != digits)
-    assert not is_checked("", swapped)
+    assert not has_valid_check_digit("", swapped)
 
 
 @given(counters, counters)
-def test_two_people_never_have_one_number(one: int, other: int) -> None:
-    assert (numbered("A", one) == numbered("A", other)) == (one == other)
+def test_different_counters_give_different_numbers(one: int, other: int) -> None:
+    assert (automatic_number("A", one) == automatic_number("A", other)) == (one == other)
 
 
 @given(st.text(max_size=30))
-def test_a_number_is_kept_as_it_can_be_spoken_or_refused(text: str) -> None:
+def test_a_number_is_normalised_to_ascii_or_refused(text: str) -> None:
     try:
-        kept = tidy(text)
+        tidied = normalise(text)
     except InputError:
         return
-    assert kept == tidy(kept)
-    assert kept.isascii()
-    assert 1 <= len(kept) <= 20
+    assert tidied == normalise(tidied)
+    assert tidied.isascii()
+    assert 1 <= len(tidied) <= 20
 
 
 def test_the_published_example_of_the_check_digit() -> None:
@@ -70,14 +78,14 @@ def test_the_published_example_of_the_check_digit() -> None:
 
 
 taken = st.builds(
-    lambda name, word: Taken(name, None if word is None else {"word": word, "code": None, "numbers": {}}),
+    lambda name, word: SlotCapture(name, None if word is None else PictureVerdict(word)),
     st.from_regex("[a-z]{8}", fullmatch=True), st.sampled_from(["good", "again", None]),
 )  # fmt: skip
 slot_states = st.lists(taken, max_size=4, unique_by=lambda one: one.capture).flatmap(
     lambda shots: st.builds(
         SlotState, st.just(tuple(shots)),
-        st.one_of(st.none(), st.just(Decided()), st.just(Decided(reason="pupil")),
-                  *(st.just(Decided(one.capture)) for one in shots)),
+        st.one_of(st.none(), st.just(SlotDecision()), st.just(SlotDecision(reason="pupil")),
+                  *(st.just(SlotDecision(one.capture)) for one in shots)),
     )
 )  # fmt: skip
 visits = st.fixed_dictionaries({slot.id: slot_states for slot in PROTOCOL.slots})
@@ -88,48 +96,48 @@ fields = st.fixed_dictionaries({}, optional={
 
 
 @given(fields, visits)
-def test_the_outcome_follows_the_rules_in_their_order(said: dict[str, Any], slots: dict[str, SlotState]) -> None:
-    told = outcome(PROTOCOL, said, slots)
-    urgent = {"sudden_loss", "pain"} & set(said.get("complaints") or [])
-    weak = any(VISIONS.index(said[eye]) > LIMIT for eye in ("vision_od", "vision_os") if said.get(eye))
+def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: dict[str, SlotState]) -> None:
+    result = decide_outcome(PROTOCOL, answers, slots)
+    urgent = {"sudden_loss", "pain"} & set(answers.get("complaints") or [])
+    is_low = any(VISIONS.index(answers[eye]) > LIMIT for eye in ("vision_od", "vision_os") if answers.get(eye))
     states = {id: slot.state for id, slot in slots.items()}
-    blank = any({states[f"{side}-centre"], states[f"{side}-nerve"]} == {"empty"} for side in "RL")
+    is_missing = any({states[f"{side}-centre"], states[f"{side}-nerve"]} == {"empty"} for side in "RL")
     expected = (
-        "refer_today" if urgent else "refer_vision" if weak
-        else "refer_picture" if blank or "could_not" in states.values() else "send"
+        "refer_today" if urgent else "refer_vision" if is_low
+        else "refer_picture" if is_missing or "could_not" in states.values() else "send"
     )  # fmt: skip
-    assert told.code == expected
-    assert told.sentence.endswith(".")
-    assert not {"normal", "disease", "healthy", "retinopathy", "glaucoma"} & set(told.sentence.lower().split())
+    assert result.code == expected
+    assert result.sentence.endswith(".")
+    assert not {"normal", "disease", "healthy", "retinopathy", "glaucoma"} & set(result.sentence.lower().split())
 
 
 @given(slot_states)
-def test_one_picture_stands_for_a_slot_and_it_is_one_of_its_own(slot: SlotState) -> None:
+def test_the_chosen_picture_of_a_slot_is_one_of_its_own(slot: SlotState) -> None:
     chosen = slot.chosen
-    assert chosen is None or chosen in slot.taken
+    assert chosen is None or chosen in slot.captures
     assert (slot.state == "taken") == (chosen is not None)
-    if slot.decided is None and slot.taken:
+    if slot.decision is None and slot.captures:
         assert chosen is not None
-        assert chosen.good == any(one.good for one in slot.taken)  # a good one, if there is any
+        assert chosen.is_good == any(one.is_good for one in slot.captures)  # a good one, if there is any
 
 
 @given(slot_states, taken)
-def test_after_another_picture_a_slot_is_taken_and_never_worse(slot: SlotState, new: Taken) -> None:
-    assume(new.capture not in {one.capture for one in slot.taken})
-    after = SlotState((*slot.taken, new), decided_after(slot, new))
+def test_another_picture_never_makes_a_slot_worse(slot: SlotState, new: SlotCapture) -> None:
+    assume(new.capture not in {one.capture for one in slot.captures})
+    after = SlotState((*slot.captures, new), decision_after(slot, new))
     assert after.state == "taken"
     assert after.chosen is not None
-    assert after.chosen.good >= bool(slot.chosen and slot.chosen.good)
-    assert after.taken[:-1] == slot.taken
+    assert after.chosen.is_good >= bool(slot.chosen and slot.chosen.is_good)
+    assert after.captures[:-1] == slot.captures
 
 
-@pytest.mark.parametrize("worse", [VISIONS[LIMIT], VISIONS[LIMIT + 1]])
-def test_the_limit_itself_is_not_referred(worse: str) -> None:
-    good = SlotState((Taken("a", None),))
-    told = outcome(PROTOCOL, {"vision_os": worse}, {slot.id: good for slot in PROTOCOL.slots})
-    assert told.code == ("send" if worse == VISIONS[LIMIT] else "refer_vision")
-    if told.code == "refer_vision":
-        assert told.sentence == "Refer: vision of the left eye below 6/18."
+@pytest.mark.parametrize("vision", [VISIONS[LIMIT], VISIONS[LIMIT + 1]])
+def test_vision_at_the_limit_is_not_referred(vision: str) -> None:
+    good = SlotState((SlotCapture("a", None),))
+    result = decide_outcome(PROTOCOL, {"vision_os": vision}, {slot.id: good for slot in PROTOCOL.slots})
+    assert result.code == ("send" if vision == VISIONS[LIMIT] else "refer_vision")
+    if result.code == "refer_vision":
+        assert result.sentence == "Refer: vision of the left eye below 6/18."
 
 
 @pytest.mark.parametrize(
@@ -143,8 +151,10 @@ def test_the_limit_itself_is_not_referred(worse: str) -> None:
         (("taken", "taken"), ("taken", "taken"), "The pictures are kept. They are for an eye specialist."),
     ],
 )  # fmt: skip
-def test_what_was_not_tried_was_not_impossible(right: tuple[str, str], left: tuple[str, str], sentence: str) -> None:
-    refused = SlotState((), Decided(None, "pupil"))
-    of = {"taken": SlotState((Taken("a", None),)), "empty": SlotState(), "could_not": refused}
+def test_untaken_and_impossible_pictures_have_different_sentences(
+    right: tuple[str, str], left: tuple[str, str], sentence: str
+) -> None:
+    refused = SlotState((), SlotDecision(None, "pupil"))
+    of = {"taken": SlotState((SlotCapture("a", None),)), "empty": SlotState(), "could_not": refused}
     states = dict(zip(("R-centre", "R-nerve", "L-centre", "L-nerve"), (*right, *left), strict=True))
-    assert outcome(PROTOCOL, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence
+    assert decide_outcome(PROTOCOL, {}, {slot: of[state] for slot, state in states.items()}).sentence == sentence

@@ -1,4 +1,4 @@
-"""Put before the text of device/drivers/blank.py: run as root, it writes down when, with which words and why."""
+"""Prefix of the text of device/drivers/blank.py: run as root, it records time, arguments and reason of each run."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""The instrument has no network, and what it sends arrives all the same: through one socket, at one address."""
+"""Upload without a network: the instrument reaches the receiver through one socket, at one address."""
 
 import base64
 import json
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.house import ROOT
+from tests.project_files import ROOT
 from tests.receiver import KEY
 from tests.site import identity
 from tests.systemd.machine import UNIT, Machine, booted
@@ -41,15 +41,15 @@ def put(machine: Machine, path: str, content: str) -> None:
 
 
 def ask(machine: Machine, method: str, path: str, body: dict[str, str] | None = None) -> dict[str, object]:
-    said: dict[str, object] = json.loads(
+    answer: dict[str, object] = json.loads(
         machine.run("python3", "-c", ASK, method, path, json.dumps(body) if body else "")
     )
-    return said
+    return answer
 
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """A device that was told, as systemd/README.md says, where to send."""
+    """A device configured for uploads as systemd/README.md describes."""
     folder = tmp_path_factory.mktemp("machine")
     certificate, key = identity(folder)
     with booted(folder) as machine:
@@ -69,23 +69,23 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 
 def sent(machine: Machine) -> int:
-    time.sleep(1)  # each question starts a Python beside the instrument
+    time.sleep(1)  # each request starts a Python process beside the instrument
     known: dict[str, int] = ask(machine, "GET", "/api/status")["sending"]  # type: ignore[assignment]
     return known["sent"]
 
 
 def lines(language: str) -> str:
-    """An example of the README, with the receiver of this test."""
+    """Return an example of the README, with the receiver of this test."""
     text = (ROOT / "systemd" / "README.md").read_text()
     (found,) = re.findall(rf"```{language}\n(.*?)```", text, re.S)
-    found = found.replace("reader.example.org:443", f"127.0.0.1:{PORT}")  # nobody resolves names in the container
+    found = found.replace("reader.example.org:443", f"127.0.0.1:{PORT}")  # no name resolution in the container
     return found.replace("reader.example.org", f"localhost:{PORT}")
 
 
 SET_UP = {"send.env": lines("ini"), "send.toml": lines("toml")}
 
 
-def test_a_visit_is_sent_by_a_process_that_has_no_network(machine: Machine) -> None:
+def test_visit_is_uploaded_by_a_process_without_network(machine: Machine) -> None:
     machine.until(lambda: machine.show(UNIT, "ActiveState") == ["active"], 240)
     key = [f"{number:016x}" for number in range(4)]
     visit = str(ask(machine, "POST", "/api/visits", {"key": key[0]})["id"])
@@ -99,7 +99,7 @@ def test_a_visit_is_sent_by_a_process_that_has_no_network(machine: Machine) -> N
     assert [link.split(":")[0].strip() for link in links] == ["lo"]
 
 
-def test_who_passes_it_on_has_no_rights_and_nobody_else_may_ask_it(machine: Machine) -> None:
+def test_upload_proxy_is_unprivileged_and_its_socket_is_protected(machine: Machine) -> None:
     pid = int(machine.show("diffuscope-send.service", "MainPID")[0])
     status = machine.run("cat", str(Path("/proc") / str(pid) / "status"))
     assert int(re.findall(r"^Uid:\s+(\d+)", status, re.M)[0]) > 60000

@@ -1,7 +1,7 @@
-"""The units in a real systemd: ready, fed, hung, killed, given up, stopped, and the blanker after each of these ends.
+"""Units in a real systemd: ready, idle, hung, killed, stopped and given up, and the blanker's run after each end.
 
-Inside runs `diffuscope run` with the simulated head, under the units that are shipped. There is no SPI in a container,
-so what is seen of the blanker is when it is called, and how.
+`diffuscope run` runs with the simulated head, under the units of a release. A container has no SPI, so the checks see
+when and with which arguments the blanker is called.
 """
 
 import json
@@ -29,14 +29,14 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 @pytest.fixture
 def running(machine: Machine) -> Machine:
-    """The machine with its instrument ready and no past."""
+    """The machine with the instrument ready and no failures recorded."""
     machine.run("systemctl", "reset-failed")
     machine.run("systemctl", "start", UNIT)
     return machine
 
 
 def blanked_after(machine: Machine, end_s: float, why: str) -> Blanked:
-    """The run of the blanker that answers the end at `end_s`; says how long it took."""
+    """Return the first run of the blanker after `end_s` for reason `why`; print the delay."""
 
     def answers() -> list[Blanked]:
         return [one for one in machine.blanked() if one.at_s > end_s and one.why == why]
@@ -44,12 +44,12 @@ def blanked_after(machine: Machine, end_s: float, why: str) -> Blanked:
     machine.until(lambda: bool(answers()))
     first = answers()[0]
     assert first.words == LAMP
-    print(f"{why}: dark {1000 * (first.at_s - end_s):.0f} ms later")  # noqa: T201  # the figure that README quotes
+    print(f"{why}: dark {1000 * (first.at_s - end_s):.0f} ms later")  # noqa: T201  # figure quoted in the README
     return first
 
 
-def test_the_address_answers_while_the_instrument_starts(machine: Machine) -> None:
-    """Also on the first start, which takes half a minute: who asks waits, and is not refused."""
+def test_requests_wait_while_the_instrument_starts(machine: Machine) -> None:
+    """Also at the first start, which takes half a minute: early requests wait in the socket's backlog."""
     machine.run("systemctl", "start", "diffuscope.socket")
     begin_s = time.monotonic()
     status = json.loads(machine.run("python3", "-c", ASK.format("/api/status")))
@@ -61,14 +61,14 @@ def test_the_address_answers_while_the_instrument_starts(machine: Machine) -> No
     assert machine.show(UNIT, "StatusText", "NRestarts") == ["aim", "0"]
 
 
-def test_the_blanker_ran_before_the_instrument_did(running: Machine) -> None:
+def test_blanker_runs_before_the_instrument(running: Machine) -> None:
     first = running.blanked()[0]
     started_us = int(running.show(UNIT, "ExecMainStartTimestampMonotonic")[0])
     assert first.at_s < started_us / 1e6
     assert first.words == LAMP
 
 
-def test_it_runs_as_nobody_in_particular_and_without_a_network(running: Machine) -> None:
+def test_instrument_runs_unprivileged_and_without_network(running: Machine) -> None:
     process = Path("/proc") / str(running.main_pid())
     status = running.run("cat", str(process / "status"))
     assert int(re.findall(r"^Uid:\s+(\d+)", status, re.M)[0]) > 60000
@@ -77,8 +77,8 @@ def test_it_runs_as_nobody_in_particular_and_without_a_network(running: Machine)
     assert [link.split(":")[0].strip() for link in links] == ["lo"]
 
 
-def test_a_stick_can_be_written_by_the_instrument_and_by_nobody_else(running: Machine) -> None:
-    """One that comes while it runs, one that was there before; a memory disk stands for FAT, which needs a kernel."""
+def test_usb_drive_is_writable_for_the_instrument_only(running: Machine) -> None:
+    """A drive mounted during a run, and one mounted before the start; a tmpfs stands for FAT, which needs a kernel."""
     place = "/run/systemd/system/diffuscope-stick@sda1.service.d"
     disk = "ExecStart=/usr/bin/mount -t tmpfs -o nosuid,nodev,noexec,gid=stick,mode=0770 stick /media/stick-sda1"
     running.run("mkdir", "-p", place)
@@ -87,9 +87,9 @@ def test_a_stick_can_be_written_by_the_instrument_and_by_nobody_else(running: Ma
     running.run("systemctl", "start", "diffuscope-stick@sda1.service")
     for name in ("came-later", "was-there-before"):
         inside = ["nsenter", "-t", str(running.main_pid()), "-m"]
-        who = re.findall(r"^Uid:\s+(\d+)", running.run("cat", f"/proc/{running.main_pid()}/status"), re.M)[0]
+        uid = re.findall(r"^Uid:\s+(\d+)", running.run("cat", f"/proc/{running.main_pid()}/status"), re.M)[0]
         touch = ["touch", f"/media/stick-sda1/{name}"]
-        running.run(*inside, "setpriv", f"--reuid={who}", f"--regid={who}", "--groups=stick", *touch)
+        running.run(*inside, "setpriv", f"--reuid={uid}", f"--regid={uid}", "--groups=stick", *touch)
         running.run("systemctl", "restart", UNIT)
     assert running.run("ls", "/media/stick-sda1").split() == ["came-later", "was-there-before"]
     stranger = ["setpriv", "--reuid=nobody", "--clear-groups", "ls", "/media/stick-sda1"]
@@ -100,8 +100,8 @@ def test_a_stick_can_be_written_by_the_instrument_and_by_nobody_else(running: Ma
     assert not running.is_there("/media/stick-sda1")
 
 
-def test_the_rule_mounts_a_usb_stick_and_lets_go_of_it(machine: Machine) -> None:
-    """udev's own reading of the rule: of a device that says that it is a USB stick, and of one that is none."""
+def test_udev_rule_mounts_and_unmounts_a_usb_drive(machine: Machine) -> None:
+    """udev's evaluation of the rule, for a device marked as USB drive and for another one."""
     claims = 'KERNEL=="loop0", ENV{ID_BUS}="usb", ENV{ID_FS_TYPE}="vfat"'
     machine.run("sh", "-c", f"mkdir -p /run/udev/rules.d && echo '{claims}' > /run/udev/rules.d/89-claims.rules")
     machine.run("cp", "/opt/diffuscope/systemd/image/stick.rules", "/run/udev/rules.d/90-diffuscope-stick.rules")
@@ -111,28 +111,28 @@ def test_the_rule_mounts_a_usb_stick_and_lets_go_of_it(machine: Machine) -> None
     assert "systemctl --no-block stop diffuscope-stick@loop0.service" in gone
     none = machine.run("sh", "-c", asked.format("add", "loop1"))
     assert "diffuscope-stick@" not in none
-    said = [line for line in (gone + none).splitlines() if "stick.rules:" in line and " RUN " not in line]
-    assert not said, "udev has something to say about the rule"
+    warnings = [line for line in (gone + none).splitlines() if "stick.rules:" in line and " RUN " not in line]
+    assert not warnings, "udev warns about the rule"
 
 
-def test_an_idle_instrument_outlives_its_watchdog(running: Machine) -> None:
+def test_idle_instrument_feeds_the_watchdog(running: Machine) -> None:
     pid = running.main_pid()
     time.sleep(12)  # longer than WatchdogSec
     assert running.main_pid() == pid
     assert running.show(UNIT, "NRestarts") == ["0"]
 
 
-def test_a_hung_instrument_is_killed_darkened_and_started_anew(running: Machine) -> None:
+def test_hung_instrument_is_killed_blanked_and_restarted(running: Machine) -> None:
     pid = running.main_pid()
     hung_s = running.signal(SIGSTOP)
     blanked = blanked_after(running, hung_s, "watchdog")
-    assert 7 < blanked.at_s - hung_s < 11  # WatchdogSec less one beat, and up to a second of a busy machine
+    assert 7 < blanked.at_s - hung_s < 11  # WatchdogSec minus one beat, plus up to 1 s on a busy machine
     running.until(lambda: running.show(UNIT, "ActiveState") == ["active"], 60)
     assert running.main_pid() not in (0, pid)
     assert "watchdog" in running.journal()
 
 
-def test_a_killed_instrument_is_darkened_at_once_and_started_anew(running: Machine) -> None:
+def test_killed_instrument_is_blanked_at_once_and_restarted(running: Machine) -> None:
     pid = running.main_pid()
     killed_s = running.signal(SIGKILL)
     assert blanked_after(running, killed_s, "signal").at_s - killed_s < 1
@@ -140,14 +140,14 @@ def test_a_killed_instrument_is_darkened_at_once_and_started_anew(running: Machi
     assert running.main_pid() != pid
 
 
-def test_told_to_stop_it_ends_well_and_dark(running: Machine) -> None:
+def test_stopped_instrument_exits_cleanly_and_is_blanked(running: Machine) -> None:
     stopped_s = time.monotonic()
     running.run("systemctl", "stop", "diffuscope.socket", UNIT)
     assert running.show(UNIT, "ActiveState", "Result") == ["inactive", "success"]
     assert blanked_after(running, stopped_s, "success").at_s - stopped_s < 10
 
 
-def test_after_five_ends_it_is_given_up_and_darkened_once_more(machine: Machine) -> None:
+def test_instrument_stays_down_and_is_blanked_after_five_failures(machine: Machine) -> None:
     machine.run("systemctl", "stop", "diffuscope.socket", UNIT)
     machine.run("systemctl", "reset-failed")
     machine.run("systemctl", "start", "--no-block", UNIT)
@@ -160,7 +160,7 @@ def test_after_five_ends_it_is_given_up_and_darkened_once_more(machine: Machine)
     ends = [one for one in machine.blanked() if one.at_s > begin_s and one.why == "signal"]
     assert len(ends) == 5
     machine.until(lambda: machine.show("diffuscope-dark.service", "ExecMainExitTimestampMonotonic") != ["0"])
-    assert machine.show("diffuscope-dark.service", "Result") == ["success"]  # though there is no SPI to be darkened
+    assert machine.show("diffuscope-dark.service", "Result") == ["success"]  # also without SPI
     given_up = [one for one in machine.blanked() if one.at_s > ends[-1].at_s and one.why == "-"]
     assert given_up
     time.sleep(2)

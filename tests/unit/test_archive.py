@@ -1,4 +1,4 @@
-"""Calibrations are kept whole or not at all, and one wrong byte is noticed."""
+"""Tests of the calibration archive: atomic writes, and detection of any single wrong byte."""
 
 import random
 from dataclasses import replace
@@ -30,11 +30,11 @@ def calibration(black_dn: float = 64.25) -> Calibration:
 @pytest.fixture
 def archive(tmp_path: Path) -> Archive:
     kept = Archive(tmp_path / "calibrations")
-    kept.keep(calibration(), WHO)
+    kept.add_and_activate(calibration(), WHO)
     return kept
 
 
-def test_what_is_kept_is_what_comes_back(archive):
+def test_a_stored_calibration_is_loaded_unchanged(archive):
     found, expected = archive.load(), calibration()
     assert found.calibration.id == expected.id
     assert found.provenance == WHO
@@ -44,10 +44,10 @@ def test_what_is_kept_is_what_comes_back(archive):
     assert not found.calibration.flat.flags.writeable
 
 
-def test_a_plain_psf_with_nothing_known_is_kept_as_just_that(tmp_path):
+def test_a_psf_without_further_values_is_stored_without_them(tmp_path):
     plain = Calibration((Psf(speckle((9, 9))),), Sensor())
     kept = Archive(tmp_path)
-    kept.keep(plain, replace(WHO, temperature_c=None, figures=()))
+    kept.add_and_activate(plain, replace(WHO, temperature_c=None, figures=()))
     found = kept.load()
     assert found.calibration.geometry is None
     assert found.calibration.field_deg is None
@@ -55,32 +55,32 @@ def test_a_plain_psf_with_nothing_known_is_kept_as_just_that(tmp_path):
     assert found.provenance.temperature_c is None
 
 
-def test_an_earlier_one_can_be_put_in_force_again(archive):
-    first = archive.current()
-    second = archive.keep(calibration(65.0), WHO)
-    assert archive.current() == second != first
-    archive.use(first)
+def test_an_earlier_calibration_can_be_activated_again(archive):
+    first = archive.active_id()
+    second = archive.add_and_activate(calibration(65.0), WHO)
+    assert archive.active_id() == second != first
+    archive.activate(first)
     assert archive.load().calibration.sensor.black_dn == 64.25
     assert archive.ids() == (first, second)
 
 
-def test_a_folder_that_cannot_be_written_is_said_and_nothing_changes(archive, tmp_path):
+def test_an_unwritable_folder_raises_store_error_and_changes_nothing(archive, tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(StoreError, match="cannot be written") as told:
-        Archive(tmp_path / "file").keep(calibration(), WHO)
-    assert "as before" in told.value.remedy
+    with pytest.raises(StoreError, match="cannot be written") as caught:
+        Archive(tmp_path / "file").add_and_activate(calibration(), WHO)
+    assert "as before" in caught.value.remedy
     with pytest.raises(StoreError):
-        Archive(tmp_path / "file" / "below").keep(calibration(), WHO)
+        Archive(tmp_path / "file" / "below").add_and_activate(calibration(), WHO)
 
 
-def test_an_empty_archive_says_that_there_is_none(tmp_path):
-    with pytest.raises(CalibrationMissing) as told:
+def test_an_empty_archive_raises_calibration_missing(tmp_path):
+    with pytest.raises(CalibrationMissing) as caught:
         Archive(tmp_path / "nothing").load()
-    assert "Calibrate" in told.value.remedy
+    assert "Calibrate" in caught.value.remedy
 
 
-def test_every_wrong_byte_is_noticed_and_none_crashes(archive):
-    """A thousand single bytes, spread over all files."""
+def test_every_wrong_byte_raises_calibration_error(archive):
+    """A thousand single-byte errors, spread over all files."""
     files = [path for path in sorted(archive.root.rglob("*")) if path.is_file() and path.name != ".lock"]
     draw = random.Random(1)
     for _ in range(1000):
@@ -95,8 +95,8 @@ def test_every_wrong_byte_is_noticed_and_none_crashes(archive):
 
 
 @pytest.mark.parametrize("name", ["manifest.toml", "psf1.npy", "flat.npy"])
-def test_a_lost_or_cut_file_is_damage(archive, name):
-    path = archive.root / archive.current() / name
+def test_a_missing_or_truncated_file_raises_calibration_damaged(archive, name):
+    path = archive.root / archive.active_id() / name
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(CalibrationDamaged):

@@ -1,4 +1,4 @@
-"""Time: real and virtual, and deadlines made from either."""
+"""Clocks, real and virtual, and deadlines on either."""
 
 import math
 import time
@@ -12,7 +12,7 @@ from device.clock import Deadline, SystemClock, VirtualClock
 from device.errors import SettingError
 
 
-def test_virtual_hours_pass_in_no_time() -> None:
+def test_virtual_sleep_takes_no_real_time() -> None:
     clock = VirtualClock()
     before, wall = time.monotonic(), clock.wall()
     clock.sleep(3600)
@@ -22,7 +22,7 @@ def test_virtual_hours_pass_in_no_time() -> None:
 
 
 @pytest.mark.parametrize("clock", [SystemClock(), VirtualClock()])
-def test_time_never_goes_back(clock: SystemClock | VirtualClock) -> None:
+def test_clocks_are_monotonic(clock: SystemClock | VirtualClock) -> None:
     before = clock.now_s()
     clock.sleep(-5)
     clock.sleep(0)
@@ -39,14 +39,14 @@ def test_the_systems_clock_sleeps_and_knows_its_time_zone() -> None:
 
 
 @pytest.mark.parametrize("budget_s", [0, -1, -0.0, math.nan, math.inf, -math.inf])
-def test_what_is_not_a_time_is_refused_with_words(budget_s: float) -> None:
+def test_invalid_budget_is_refused(budget_s: float) -> None:
     with pytest.raises(SettingError, match="is not a time") as refused:
         Deadline.after(VirtualClock(), budget_s)
     assert "positive" in refused.value.remedy
 
 
 @given(st.floats(1e-6, 1e6), st.floats(0, 1e6))
-def test_what_is_left_is_the_budget_less_what_was_used(budget_s: float, used_s: float) -> None:
+def test_time_left_is_budget_minus_elapsed(budget_s: float, used_s: float) -> None:
     clock = VirtualClock()
     deadline = Deadline.after(clock, budget_s)
     clock.sleep(used_s)

@@ -1,24 +1,29 @@
-"""The point source in other colours: a PSF of its own where it differs, and where the source was moved a refusal."""
+"""Tests of the colour step: a separate PSF only where it differs, and a refusal if the source moved."""
 
 from pathlib import Path
 
 import pytest
 
-from device.calibration.archive import Archive, Kept
-from device.calibration.colours import SAME
-from device.calibration.procedure import Job, Operator, Procedure, Stand
+from device.calibration.archive import Archive, StoredCalibration
+from device.calibration.procedure.calibration_sequence import (
+    CalibrationJob,
+    CalibrationSequence,
+    CalibrationTarget,
+    Operator,
+)
+from device.calibration.procedure.colours import SAME_PSF_CORRELATION
 from device.clock import VirtualClock
 from device.errors import CalibrationRefused
-from device.sim import stage
+from device.head import target_placer
+from device.sim import calibration_targets
 from device.sim.camera import SimCamera
 from device.sim.world import World
 from device.values import Colour
-from services.instrument.calibrating import staging
-from tests.unit.test_measure import E_PER_S, small_world
+from tests.unit.test_calibration_measurements import E_PER_S, small_world
 
 
 def narrow_world() -> World:
-    """Half of the paper's iris and a sensor to match, with pixels of 10 um: fine enough to tell colours apart."""
+    """Return half of the paper's iris on a matching sensor with 10 um pixels, fine enough to separate colours."""
     spec = small_world(coarser=2).spec
     assert spec.optics is not None
     camera = spec.camera.model_copy(update={"rows": 270, "cols": 270})
@@ -28,37 +33,39 @@ def narrow_world() -> World:
 
 def calibrated(
     world: World, root: Path, colours: tuple[Colour, ...], wrong: World | None = None
-) -> tuple[Kept, list[Stand]]:
-    asked: list[Stand] = []
+) -> tuple[StoredCalibration, list[CalibrationTarget]]:
+    requested: list[CalibrationTarget] = []
 
-    def put(stand: Stand) -> None:
-        asked.append(stand)
-        staging(world)(stand)
+    def put(stand: CalibrationTarget) -> None:
+        requested.append(stand)
+        target_placer(world)(stand)
         if wrong is not None and stand == "point red":
-            world.stage = wrong.stage
+            world.target = wrong.target
 
-    job = Job(world.spec, "D-1", "a technician", "0.1.0", colours=colours)
-    procedure = Procedure(job, SimCamera(world), Operator(put, lambda line: None), world.clock, root / ".steps")
+    job = CalibrationJob(world.spec, "D-1", "a technician", "0.1.0", colours=colours)
+    procedure = CalibrationSequence(
+        job, SimCamera(world), Operator(put, lambda line: None), world.clock, root / ".steps"
+    )
     id = procedure.run(Archive(root))
-    assert asked == list(job.stands)
-    return Archive(root).load(id), asked
+    assert requested == list(job.targets)
+    return Archive(root).load(id), requested
 
 
-def test_a_psf_that_differs_by_its_colour_is_kept_beside_the_pictures(tmp_path: Path) -> None:
+def test_a_psf_that_differs_by_colour_is_stored_separately(tmp_path: Path) -> None:
     world = narrow_world()
-    kept, asked = calibrated(world, tmp_path, ("green", "red"))
-    assert asked[-1] == "point red"
+    kept, requested = calibrated(world, tmp_path, ("green", "red"))
+    assert requested[-1] == "point red"
     assert [psf.colour for psf in kept.calibration.psfs] == ["green", "red"]
     figures = dict(kept.provenance.figures)
-    assert 0.98 < figures["psf_red_likeness"] < SAME
+    assert 0.98 < figures["psf_red_likeness"] < SAME_PSF_CORRELATION
     assert figures["psf_red_scale"] == pytest.approx(1, abs=1e-3)
 
 
 def test_colours_that_make_the_same_psf_share_it(tmp_path: Path) -> None:
-    kept, asked = calibrated(small_world(coarser=8), tmp_path, ("red", "green", "blue"))
-    assert asked[-2:] == ["point red", "point blue"]
+    kept, requested = calibrated(small_world(coarser=8), tmp_path, ("red", "green", "blue"))
+    assert requested[-2:] == ["point red", "point blue"]
     assert [psf.colour for psf in kept.calibration.psfs] == [None]
-    assert dict(kept.provenance.figures)["psf_blue_likeness"] > SAME
+    assert dict(kept.provenance.figures)["psf_blue_likeness"] > SAME_PSF_CORRELATION
 
 
 @pytest.mark.parametrize(
@@ -72,6 +79,6 @@ def test_a_source_that_moved_with_its_colour_is_refused(
     assert world.spec.sim is not None
     spec = world.spec.model_copy(update={"sim": world.spec.sim.model_copy(update={"seed": seed})})
     wrong = World(spec, world.clock)
-    wrong.stage = stage.point(wrong, E_PER_S, moved_px, moved_mm, "red")
+    wrong.target = calibration_targets.point(wrong, E_PER_S, moved_px, moved_mm, "red")
     with pytest.raises(CalibrationRefused, match=words):
         calibrated(world, tmp_path, ("red",), wrong)

@@ -1,4 +1,4 @@
-"""One damaged row is one damaged capture or visit: lists, health's counts and the next start go on without it."""
+"""Damaged rows: lists, counts and the next start work without the damaged capture or visit."""
 
 import json
 import random
@@ -13,17 +13,20 @@ from pathlib import Path
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import DiffuscopeError, NotKept, StoreDamaged
-from device.values import Capture
-from services.instrument.visits_api import shown_visit
-from services.records.light_book import LightBook
-from services.records.outbox import Outbox
-from services.records.people import People
+from device.errors import DiffuscopeError
+from services.delivery.visit_json import visit_as_json
+from services.errors import RecordNotFound, StoreDamaged
+from services.records.capture import Capture
+from services.records.capture_journal import CaptureJournal
+from services.records.capture_report import read_report, report_as_json
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
-from services.records.store import WHOLE, Store
-from services.records.underway import Underway
+from services.records.quarantine import REQUIRED_FILES
+from services.records.upload_queue import UploadQueue
+from services.records.visit_repository import VisitRepository
 
-FILES = dict.fromkeys(sorted(WHOLE), b"content")
+FILES = dict.fromkeys(sorted(REQUIRED_FILES), b"content")
 REPORT = {
     "method": "variation", "seconds": {"expose": 0.25, "solve": 0.125}, "budget_s": 10.5, "warnings": ["dim"],
     "refraction_dpt": {"sphere": -1.25, "sd": 0.5}, "verdict": {"word": "good", "code": None, "numbers": {"a": 123456}},
@@ -37,31 +40,37 @@ TABLES = {
     "persons": ("number",), "light_time": ("boot",), "light_doses": ("eye",), "keys": ("key", "answer", "done_at"),
 }  # fmt: skip
 TURNS = 4
-DISTINCT = 8  # bytes of a text that stands in rows and indices alone, and not in the words that make the tables
+DISTINCT = 8  # length from which a text occurs in rows and indices only, not in the schema
 COLUMNS = [(table, column) for table, columns in TABLES.items() for column in columns]
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store with three visits, two of them finished and not sent, and a capture in each."""
+    """Return a store with three visits and a capture in each; two visits are finished and queued for upload."""
     folder, clock = tmp_path_factory.mktemp("filled"), VirtualClock()
     keys = (f"{number:016x}" for number in count())
-    with Store(folder, reserve_bytes=0) as store:
-        people, light = People(store.engine, load_protocol(), clock), LightBook(store.engine, clock, 86_400.0, "boot")
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people, light = (
+            VisitRepository(store.engine, load_protocol(), clock),
+            DoseLedgerStore(store.engine, clock, 86_400.0, "boot"),
+        )
         for number in range(3):
             visit = people.begin(next(keys)).id
             people.answer(next(keys), visit, "consent", "agreed")
             people.answer(next(keys), visit, "complaints", ["flashes", "red"])
             people.answer(next(keys), visit, "name", f"Name{number}")
-            errand = people.errand("OD", next(keys), visit, "R-centre")
-            taken = Capture(f"c{number}", "OD", clock.wall(), True, "00ff", errand.facts | REPORT, {})
-            store.keep(taken, FILES, errand.beside)
-            people.keep(next(keys), f"c{number}")
+            target = people.pictures.capture_target("OD", next(keys), visit, "R-centre")
+            report = read_report(REPORT | {"visit": visit, "slot": "R-centre"})
+            taken = Capture(f"c{number}", "OD", clock.wall(), True, "00ff", report, {})
+            store.save(taken, FILES, target.write_rows)
+            people.pictures.accept_capture(next(keys), f"c{number}")
             if number:
                 people.finish(next(keys), visit)
             light.reserve(("OD",), 0.001, 10.0)
             clock.sleep(1)
-        Outbox(store.engine, clock).failed(Outbox(store.engine, clock).waiting(), DiffuscopeError("no way"))
+        UploadQueue(store.engine, clock).record_failure(
+            UploadQueue(store.engine, clock).queued(), DiffuscopeError("no way")
+        )
     return folder
 
 
@@ -75,65 +84,70 @@ def copied(filled: Path, to: Path) -> Path:
     return to
 
 
-def spoil(folder: Path, table: str, column: str, chance: random.Random) -> str:
-    """Change one byte of a text of that column: in the row and its indices, or at one of its places in the file."""
+def corrupt(folder: Path, table: str, column: str, random_source: random.Random) -> str:
+    """Change one byte of a text of that column, in the row with its indices or at one place of the file."""
     path = folder / "shelf.sqlite"
     with closing(database(folder)) as tables:
         tables.text_factory = bytes
         rows = tables.execute(f"SELECT rowid, {column} FROM {table} WHERE {column} IS NOT NULL").fetchall()
-        rowid, content = chance.choice(rows)
-        at = chance.randrange(len(content))
-        spoilt = bytearray(content)
-        spoilt[at] = chance.choice([one for one in range(1, 256) if one != content[at]])
-        if len(content) < DISTINCT or chance.random() < 0.5:
+        rowid, content = random_source.choice(rows)
+        at = random_source.randrange(len(content))
+        corrupted = bytearray(content)
+        corrupted[at] = random_source.choice([one for one in range(1, 256) if one != content[at]])
+        if len(content) < DISTINCT or random_source.random() < 0.5:
             change = f"UPDATE OR IGNORE {table} SET {column} = CAST(? AS TEXT) WHERE rowid = ?"
-            tables.execute(change, (bytes(spoilt), rowid))
-            return f"row {rowid} of {table}.{column}: {content!r} -> {bytes(spoilt)!r}"
+            tables.execute(change, (bytes(corrupted), rowid))
+            return f"row {rowid} of {table}.{column}: {content!r} -> {bytes(corrupted)!r}"
     file = path.read_bytes()
     places = [place.start() for place in re.finditer(re.escape(content), file)]
-    place = chance.choice(places)
-    path.write_bytes(file[:place] + bytes(spoilt) + file[place + len(spoilt) :])
-    return f"{content!r} -> {bytes(spoilt)!r}, {places.index(place) + 1} of {len(places)} in the file"
+    place = random_source.choice(places)
+    path.write_bytes(file[:place] + bytes(corrupted) + file[place + len(corrupted) :])
+    return f"{content!r} -> {bytes(corrupted)!r}, {places.index(place) + 1} of {len(places)} in the file"
 
 
 @pytest.mark.parametrize(("table", "column"), COLUMNS)
-def test_a_changed_byte_in_any_column_fails_no_list_no_count_and_no_start(
+def test_a_corrupted_byte_in_any_column_breaks_no_list_no_count_and_no_start(
     filled: Path, tmp_path: Path, table: str, column: str
 ) -> None:
-    chance = random.Random(f"{table}.{column}")
+    random_source = random.Random(f"{table}.{column}")
     for turn in range(TURNS):
         folder = copied(filled, tmp_path / f"{turn}")
-        said = spoil(folder, table, column, chance)
-        with Store(folder, reserve_bytes=0) as store:
-            everything_is_asked(store, said)
+        change_made = corrupt(folder, table, column, random_source)
+        with CaptureStore(folder, reserve_bytes=0) as store:
+            assert_all_queries_work(store, change_made)
 
 
-def everything_is_asked(store: Store, said: str) -> None:
-    people, clock = People(store.engine, load_protocol(), VirtualClock()), VirtualClock()
+def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
+    people, clock = VisitRepository(store.engine, load_protocol(), VirtualClock()), VirtualClock()
     captures, visits = store.captures(2), people.visits(10)
     captures += store.captures(5, before=captures[-1].id)
-    if said.startswith("row"):  # of an index alone, what is listed goes by the index, and what is counted by the row
-        assert len(captures) + store.damaged() == 3, said
-        assert len(visits) + people.damaged() == 3, said
-    written = [shown_visit(visit, people) for visit in visits], [capture.report for capture in captures]
+    if change_made.startswith(
+        "row"
+    ):  # after damage to an index alone, lists follow the index and counts follow the row
+        assert len(captures) + store.damaged() == 3, change_made
+        assert len(visits) + people.damaged() == 3, change_made
+    written = (
+        [visit_as_json(visit) for visit in visits],
+        [report_as_json(capture.report) for capture in captures],
+    )
     json.dumps(written, allow_nan=False, ensure_ascii=False).encode()
     assert set(people.counts()) == {"done", "to_finish", "referred"}
-    people.asked_side()
-    outbox = Outbox(store.engine, clock)
-    assert outbox.trouble().waiting <= 2
-    for waiting in outbox.waiting(sizes=True):
+    people.pictures.laterality_question()
+    queue = UploadQueue(store.engine, clock)
+    assert queue.status().waiting <= 2
+    for waiting in queue.queued(sizes=True):
         with suppress(StoreDamaged):
-            outbox.failed([waiting], DiffuscopeError("no way"))
-    Underway(store)
-    assert LightBook(store.engine, clock, 86_400.0).spent_j_per_cm2("OD") >= 0.003 - 1e-9, said
-    assert store.space_left() > 0
-    assert store.people_left(4) > 0
+            queue.record_failure([waiting], DiffuscopeError("no way"))
+    CaptureJournal(store)
+    assert DoseLedgerStore(store.engine, clock, 86_400.0).spent_j_per_cm2("OD") >= 0.003 - 1e-9, change_made
+    assert store.space.captures_left() > 0
+    assert store.space.visits_left(4) > 0
     for id in ("c0", "c1", "c2"):
-        with suppress(StoreDamaged, NotKept):
+        with suppress(StoreDamaged, RecordNotFound):
             store.get(id)
-        with suppress(StoreDamaged, NotKept):
+        with suppress(StoreDamaged, RecordNotFound):
             assert store.read(id, "raw.tiff") == b"content"
-    assert {path.name for path in (store.folder / "captures").iterdir()} == {"c0", "c1", "c2"}, said
+    assert {path.name for path in (store.folder / "captures").iterdir()} == {"c0", "c1", "c2"}, change_made
 
 
 def database(folder: Path) -> sqlite3.Connection:
@@ -143,27 +157,27 @@ def database(folder: Path) -> sqlite3.Connection:
 
 
 @pytest.fixture
-def store(filled: Path, tmp_path: Path) -> Iterator[Store]:
-    with Store(copied(filled, tmp_path / "own"), reserve_bytes=0) as store:
+def store(filled: Path, tmp_path: Path) -> Iterator[CaptureStore]:
+    with CaptureStore(copied(filled, tmp_path / "own"), reserve_bytes=0) as store:
         yield store
 
 
-def test_a_damaged_capture_is_refused_alone_and_counted_and_its_files_can_still_be_read(store: Store) -> None:
+def test_a_damaged_capture_is_refused_and_counted_and_its_files_stay_readable(store: CaptureStore) -> None:
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET report = replace(report, ':', ';') WHERE id = 'c1'")
     assert [one.id for one in store.captures()] == ["c2", "c0"]
     assert [one.id for one in store.captures(1, before="c2")] == ["c0"]
     assert store.damaged() == 1
-    with pytest.raises(StoreDamaged, match="entry of 'c1' cannot be read") as told:
+    with pytest.raises(StoreDamaged, match="entry of 'c1' cannot be read") as raised:
         store.get("c1")
-    assert "call the technician" in told.value.remedy.lower()
+    assert "call the technician" in raised.value.remedy.lower()
     assert store.read("c1", "raw.tiff") == b"content"
-    people = People(store.engine, load_protocol(), VirtualClock())
-    assert [visit.slots["R-centre"].taken[0].capture for visit in people.visits(10)] == ["c2", "c1", "c0"]
+    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    assert [visit.slots["R-centre"].captures[0].capture for visit in people.visits(10)] == ["c2", "c1", "c0"]
 
 
-def test_a_damaged_visit_is_refused_alone_and_counted(store: Store) -> None:
-    people = People(store.engine, load_protocol(), VirtualClock())
+def test_a_damaged_visit_is_refused_and_counted(store: CaptureStore) -> None:
+    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
     newest, middle, _ = people.visits(10)
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE visits SET outcome = CAST(x'7bff' AS TEXT) WHERE id = ?", (middle.id,))
@@ -173,28 +187,28 @@ def test_a_damaged_visit_is_refused_alone_and_counted(store: Store) -> None:
     for visit in (newest, middle):
         with pytest.raises(StoreDamaged, match="cannot be read"):
             people.get(visit.id)
-    outbox = Outbox(store.engine, VirtualClock())
-    assert [one.visit for one in outbox.waiting()] == [middle.id, newest.id]  # whoever packs it, hears of the damage
+    queue = UploadQueue(store.engine, VirtualClock())
+    assert [one.visit for one in queue.queued()] == [middle.id, newest.id]  # building its archive reports the damage
 
 
-def test_a_finish_that_cannot_be_read_does_not_stand_before_the_others(store: Store) -> None:
-    outbox = Outbox(store.engine, VirtualClock())
-    first, second = outbox.waiting()
+def test_an_unreadable_finish_does_not_block_the_queue(store: CaptureStore) -> None:
+    queue = UploadQueue(store.engine, VirtualClock())
+    first, second = queue.queued()
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE visits SET finished_at = replace(finished_at, '-', '+') WHERE id = ?", (first.visit,))
-    assert [one.visit for one in outbox.waiting(1)] == [second.visit]
+    assert [one.visit for one in queue.queued(1)] == [second.visit]
 
 
-def test_a_moment_is_one_with_a_zone(store: Store) -> None:
+def test_a_timestamp_without_a_time_zone_is_damaged(store: CaptureStore) -> None:
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET taken_at = '2026-03-01T12:00:00' WHERE id = 'c0'")
     assert datetime.now(UTC) > min(one.taken_at for one in store.captures())
     assert store.damaged() == 1
 
 
-@pytest.mark.parametrize("said", ["1e3456", "NaN", "-Infinity", "1.5E+999", '"\\ud83d"', '{"a": 1', "[1]"])
-def test_a_report_that_cannot_be_written_as_json_again_is_damaged(store: Store, said: str) -> None:
-    report = said if said.startswith(("{", "[")) else f'{{"noise_dn": {said}}}'
+@pytest.mark.parametrize("value", ["1e3456", "NaN", "-Infinity", "1.5E+999", '"\\ud83d"', '{"a": 1', "[1]"])
+def test_a_report_that_cannot_be_written_as_json_again_is_damaged(store: CaptureStore, value: str) -> None:
+    report = value if value.startswith(("{", "[")) else f'{{"noise_dn": {value}}}'
     with closing(database(store.folder)) as tables:
         tables.execute("UPDATE captures SET report = ? WHERE id = 'c1'", (report,))
     assert [one.id for one in store.captures()] == ["c2", "c0"]

@@ -1,4 +1,4 @@
-"""A moved point source says what one dioptre does to this head's PSF; whatever else moved is refused with a number."""
+"""Tests of the dioptre step: scale per dioptre from a moved point source, and refusal of other movements."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,57 +9,54 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from device.calibration.archive import Archive
-from device.calibration.dioptres import Stretch, measured_dioptres, refuse_other_place, sphere_dpt, stretch
-from device.calibration.procedure import MOVES, Job, Operator, Procedure, Stand
+from device.calibration.procedure.calibration_sequence import (
+    AXIAL_OFFSETS_MM,
+    CalibrationJob,
+    CalibrationTarget,
+)
+from device.calibration.procedure.dioptres import (
+    PsfSimilarity,
+    fit_dioptre_scale,
+    fit_similarity,
+    refuse_wrong_position,
+    sphere_dpt,
+)
 from device.clock import VirtualClock
 from device.errors import CalibrationRefused
-from device.recon.warp import warped
-from device.sim import stage
-from device.sim.camera import SimCamera
+from device.head import target_placer
+from device.recon.estimation.psf_warp import warped
+from device.sim import calibration_targets
 from device.sim.world import World
 from device.values import Psf
-from services.instrument.calibrating import staging
 from tests.scenes import GEOMETRY, speckle
-from tests.unit.test_measure import FLAWS, small_world
+from tests.unit.test_calibration_measurements import FLAWS, small_world
+from tests.unit.test_calibration_sequence import CalibrationBench
 
 E_PER_S = 160_000.0
 OTHER_OPTICS = {"diffuser_to_sensor_um": 8000.0, "angular_magnification": 0.6, "iris_um": 2600.0}
-SHALLOW = {"diffuser_to_sensor_um": 6600.0}  # a head whose diffuser sits 10 % farther than its drawings say
+SHALLOW = {
+    "diffuser_to_sensor_um": 6600.0
+}  # a head whose diffuser is 10 % farther from the sensor than in its drawings
 
 
-class Rail:
-    """A bench on which the source is moved; `wrong` stands elsewhere than asked, where it says so."""
+class Rail(CalibrationBench):
+    """Bench on which the source is moved; the light path of the world may differ from the drawings by `built`."""
 
     def __init__(self, root: Path, built: dict[str, float] | None = None, **flaws: Any) -> None:
-        world = small_world(**flaws)
-        self.spec = world.spec
-        optics = world.spec.optics
+        spec = small_world(**flaws).spec
+        optics = spec.optics
         assert optics is not None
-        self.world = World(
-            world.spec.model_copy(update={"optics": optics.model_copy(update=built or {})}), VirtualClock()
-        )
-        self.archive, self.work = Archive(root / "archive"), root / "archive" / ".steps"
-        self.asked: list[Stand] = []
-        self.said: list[str] = []
-        self.wrong: dict[Stand, Callable[[World], None]] = {}
-
-    def put(self, stand: Stand) -> None:
-        self.asked.append(stand)
-        staging(self.world)(stand)
-        if stand in self.wrong:
-            self.wrong[stand](self.world)
+        moved = spec.model_copy(update={"optics": optics.model_copy(update=built or {})})
+        super().__init__(root, World(moved, VirtualClock()))
+        self.spec, self.work = spec, root / "archive" / ".steps"
 
     def run(self) -> str:
-        self.asked.clear()
-        job = Job(self.spec, "D-1", "a technician", "0.1.0", dioptres=True)
-        operator = Operator(self.put, self.said.append)
-        return Procedure(job, SimCamera(self.world), operator, self.world.clock, self.work).run(self.archive)
+        return self.calibrate(CalibrationJob(self.spec, "D-1", "a technician", "0.1.0", dioptres=True))
 
 
 def at(moved_mm: float, moved_px: tuple[int, int] = (0, 0)) -> Callable[[World], None]:
     def put(world: World) -> None:
-        world.stage = stage.point(world, E_PER_S, moved_px, moved_mm)
+        world.target = calibration_targets.point(world, E_PER_S, moved_px, moved_mm)
 
     return put
 
@@ -69,11 +66,11 @@ def power_cut(world: World) -> None:
 
 
 def test_the_factor_of_a_head_is_found_within_one_percent(tmp_path: Path) -> None:
-    """Of the paper's geometry: `python -m tests.bench calibration`."""
+    """For another geometry than the paper's; the paper's is in `python -m tests.bench calibration`."""
     rail = Rail(tmp_path, OTHER_OPTICS, **FLAWS)
     rail.spec = rail.world.spec
     kept = rail.archive.load(rail.run())
-    assert rail.asked == ["cap", "screen", "point", *MOVES]
+    assert rail.requested == ["cap", "screen", "point", *AXIAL_OFFSETS_MM]
     found, truth = kept.calibration.geometry, rail.world.geometry
     assert found is not None
     assert found.measured_scale_per_dpt == pytest.approx(truth.nominal_scale_per_dpt, rel=0.01)
@@ -81,7 +78,7 @@ def test_the_factor_of_a_head_is_found_within_one_percent(tmp_path: Path) -> Non
     assert not rail.work.exists()
 
 
-def test_a_head_that_is_not_built_as_drawn_is_measured_as_built(tmp_path: Path) -> None:
+def test_a_head_that_differs_from_its_drawings_is_measured_as_built(tmp_path: Path) -> None:
     rail = Rail(tmp_path, SHALLOW)
     kept = rail.archive.load(rail.run()).calibration
     assert kept.geometry is not None
@@ -97,53 +94,53 @@ def test_a_head_that_is_not_built_as_drawn_is_measured_as_built(tmp_path: Path) 
         ("point -2 mm", at(-4.0), "moved too far"),
         ("point +2 mm", at(2.0, (0, 2)), "sideways by 1.0"),
         ("point +4 mm", at(3.6), "beside the line"),
-        ("point +4 mm", lambda world: staging(world)("cap"), "too dark"),
+        ("point +4 mm", lambda world: target_placer(world)("cap"), "too dark"),
     ],
 )
-def test_a_source_that_stands_elsewhere_is_refused_and_asked_for_again(
-    tmp_path: Path, stand: Stand, fault: Callable[[World], None], words: str
+def test_a_source_at_a_wrong_position_is_refused_and_requested_again(
+    tmp_path: Path, stand: CalibrationTarget, fault: Callable[[World], None], words: str
 ) -> None:
     rail = Rail(tmp_path, coarser=8)
     rail.wrong[stand] = power_cut
     with pytest.raises(KeyboardInterrupt):
         rail.run()
     rail.wrong[stand] = fault
-    with pytest.raises(CalibrationRefused, match=words) as told:
+    with pytest.raises(CalibrationRefused, match=words) as caught:
         rail.run()
-    assert rail.asked[0] == stand, "the steps before the power cut are kept"
-    assert any(digit.isdigit() for digit in told.value.message)
+    assert rail.requested[0] == stand, "the steps before the power cut are kept"
+    assert any(digit.isdigit() for digit in caught.value.message)
     assert not rail.archive.ids()
     rail.wrong.clear()
-    if words == "beside the line":  # nobody knows which of the places is the wrong one
+    if words == "beside the line":  # the wrong position is unknown
         rail.run()
-        assert rail.asked == list(MOVES)
+        assert rail.requested == list(AXIAL_OFFSETS_MM)
 
 
 @settings(max_examples=25)
 @given(st.floats(-0.06, 0.06), st.tuples(st.integers(-3, 3), st.integers(-3, 3)))
-def test_a_stretch_is_found_again(by: float, moved_px: tuple[int, int]) -> None:
-    """At half the pixels' own fineness; the other is made by recon's own warp, which shares no code."""
+def test_a_known_scale_and_shift_are_recovered(by: float, moved_px: tuple[int, int]) -> None:
+    """At half the pixel pitch; the second PSF is made by recon's own warp, which shares no code."""
     psf = Psf(speckle((120, 128), grain_px=2.0))
     other = warped(psf, (1 + by) * np.eye(2))
-    found = stretch(psf, Psf(np.roll(other.pixels, moved_px, (0, 1))), pitch_um=10.0)
+    found = fit_similarity(psf, Psf(np.roll(other.pixels, moved_px, (0, 1))), pitch_um=10.0)
     assert found.scale - 1 == pytest.approx(by, abs=3e-4)
     assert found.moved_px == pytest.approx(moved_px, abs=0.05)
-    assert found.likeness > 0.99
+    assert found.correlation > 0.99
 
 
-def test_another_source_is_no_stretch_of_the_first() -> None:
-    found = stretch(Psf(speckle((120, 128), 1, 2.0)), Psf(speckle((120, 128), 2, 2.0)), 10.0)
+def test_another_source_is_refused_by_its_correlation() -> None:
+    found = fit_similarity(Psf(speckle((120, 128), 1, 2.0)), Psf(speckle((120, 128), 2, 2.0)), 10.0)
     with pytest.raises(CalibrationRefused, match="correlation 0"):
-        refuse_other_place(found, 2.0, 25.0, GEOMETRY)
-    refuse_other_place(Stretch(1 - 0.003375 * sphere_dpt(2.0, 25.0), (0.0, 0.0), 0.99), 2.0, 25.0, GEOMETRY)
+        refuse_wrong_position(found, 2.0, 25.0, GEOMETRY)
+    refuse_wrong_position(PsfSimilarity(1 - 0.003375 * sphere_dpt(2.0, 25.0), (0.0, 0.0), 0.99), 2.0, 25.0, GEOMETRY)
 
 
-def test_the_papers_steps_of_the_screen() -> None:
+def test_sphere_matches_the_screen_positions_of_the_paper() -> None:
     """-5.5 and +7.6 dpt of spectacle correction at +-4 mm (paper, "Refractive error"); M has the other sign."""
     assert sphere_dpt(4, 25) == pytest.approx(5.517, abs=1e-3)
     assert sphere_dpt(-4, 25) == pytest.approx(-7.619, abs=1e-3)
 
 
-def test_one_place_makes_no_line() -> None:
+def test_a_single_position_is_refused() -> None:
     with pytest.raises(CalibrationRefused, match="1 places"):
-        measured_dioptres({2.0: 0.99}, 25.0)
+        fit_dioptre_scale({2.0: 0.99}, 25.0)

@@ -1,4 +1,4 @@
-"""The retina that nobody has: is it one, and is it always the same one?"""
+"""Procedural fundus: reproducible, and within published figures of real eyes."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def spots(mask, smallest=3):
     return int((ndimage.sum_labels(mask, labels, range(1, found + 1)) >= smallest).sum())
 
 
-def test_one_seed_is_one_eye(healthy):
+def test_fundus_is_reproducible_by_seed(healthy):
     again, other = fundus(SHAPE, PX_PER_DEG, FIELD_DEG, 1), fundus(SHAPE, PX_PER_DEG, FIELD_DEG, 2)
     for colour in COLOURS:
         assert np.array_equal(healthy.reflectance[colour], again.reflectance[colour])
@@ -53,13 +53,13 @@ def test_the_field_is_a_disc_of_the_right_size_and_dark_outside(healthy):
         assert plane[ndimage.binary_erosion(healthy.field, iterations=2)].min() > 0
 
 
-def test_a_field_larger_than_the_frame_is_cut_off_in_the_middle(healthy):
+def test_a_field_larger_than_the_frame_is_cropped_to_its_centre(healthy):
     part = fundus((300, 400), PX_PER_DEG, FIELD_DEG, 1)
     assert np.array_equal(part.reflectance["green"], healthy.reflectance["green"][120:420, 80:480])
     assert part.fovea == pytest.approx((healthy.fovea[0] - 120, healthy.fovea[1] - 80))
 
 
-def test_levels_are_those_of_a_human_eye(healthy):
+def test_reflectance_levels_equal_published_values(healthy):
     """Delori & Pflibsen 1989: perifovea .81, 1.41, 4.9 % in blue, green, red; the disc two to three times that."""
     inside = healthy.field & ~healthy.vessels
     typical = {colour: np.median(healthy.reflectance[colour][inside]) for colour in COLOURS}
@@ -102,16 +102,16 @@ def test_every_eye_has_connected_vessels_and_a_free_fovea(seed):
     assert heights.max() > 4.5  # and one below
 
 
-def test_lesions_are_counted_and_change_nothing_but_themselves(healthy):
-    ill = fundus(SHAPE, PX_PER_DEG, FIELD_DEG, 1, haemorrhages=5, microaneurysms=7, exudates=6)
-    ratio = np.where(healthy.field, ill.reflectance["green"] / np.maximum(healthy.reflectance["green"], 1e-9), 1)
+def test_lesions_change_only_their_own_pixels(healthy):
+    diseased = fundus(SHAPE, PX_PER_DEG, FIELD_DEG, 1, haemorrhages=5, microaneurysms=7, exudates=6)
+    ratio = np.where(healthy.field, diseased.reflectance["green"] / np.maximum(healthy.reflectance["green"], 1e-9), 1)
     assert 6 <= spots(ratio < 0.85) <= 12  # some may touch
     assert 2 <= spots(ratio > 1.15) <= 6
     assert (np.abs(ratio - 1) < 0.01).mean() > 0.95
-    assert np.array_equal(ill.vessels, healthy.vessels)
+    assert np.array_equal(diseased.vessels, healthy.vessels)
 
 
 @pytest.mark.parametrize(("px_per_deg", "field_deg"), [(4.0, 33.4), (15.583, 12.0), (22.8, 50.0)])
-def test_other_scales_and_fields_are_drawn_too(px_per_deg, field_deg):
+def test_other_scales_and_fields_are_drawn(px_per_deg, field_deg):
     eye = fundus((301, 400), px_per_deg, field_deg, 3, haemorrhages=2, exudates=3)
     assert all(np.isfinite(plane).all() and plane.max() > 0 for plane in eye.reflectance.values())

@@ -1,4 +1,4 @@
-"""The heartbeat of the gate and the button, on lines of our own: GPIO has no emulator without a kernel module."""
+"""Tests of the gate heartbeat and the button on simulated lines: a GPIO emulator would need a kernel module."""
 
 import time
 
@@ -10,16 +10,16 @@ from device.drivers.gpio import OutputLine
 from device.drivers.heartbeat import BEAT_S, Heartbeat
 from device.errors import BusFault
 
-GATE_S = 0.5  # how long the one-shot of hardware/dead-man.md gives power after an edge
+GATE_S = 0.5  # hold time of the one-shot of hardware/dead-man.md after an edge
 
 
 class Gate:
-    """A line that remembers its edges."""
+    """Line that records its edges."""
 
     def __init__(self) -> None:
         self.high, self.closed = False, False
         self.edges_s: list[float] = []
-        self.rising_s: list[float] = []  # the only ones that the one-shot hears
+        self.rising_s: list[float] = []  # the only edges that trigger the one-shot
 
     def set(self, high: bool) -> None:
         if high != self.high:
@@ -32,18 +32,18 @@ class Gate:
         self.closed = True
 
 
-def test_no_lease_no_edge():
+def test_without_a_lease_there_is_no_edge():
     gate = Gate()
     Heartbeat(gate)
     assert not gate.edges_s
 
 
-def test_edges_come_closer_than_the_gate_closes_and_end_with_the_light():
+def test_edges_are_closer_than_the_gate_hold_time_and_end_with_the_light():
     gate = Gate()
     pulse = Heartbeat(gate)
     begin_s = time.monotonic()
     pulse.start(5.0)
-    assert gate.edges_s[0] - begin_s < 0.1, "the LEDs have power before they are told to shine"
+    assert gate.edges_s[0] - begin_s < 0.1, "the LEDs have power before they are turned on"
     time.sleep(6 * BEAT_S)
     pulse.stop()
     edges = len(gate.edges_s)
@@ -55,20 +55,20 @@ def test_edges_come_closer_than_the_gate_closes_and_end_with_the_light():
 
 
 @pytest.mark.parametrize("beats", [1.5, 2.5])
-def test_every_light_begins_with_an_edge_that_the_gate_hears(beats):
+def test_every_light_begins_with_a_rising_edge(beats):
     gate = Gate()
     pulse = Heartbeat(gate)
     for _ in range(2):
-        heard, begin_s = len(gate.rising_s), time.monotonic()
+        rising, begin_s = len(gate.rising_s), time.monotonic()
         pulse.start(5.0)
-        assert len(gate.rising_s) == heard + 1
+        assert len(gate.rising_s) == rising + 1
         assert gate.rising_s[-1] - begin_s < 0.1
         time.sleep(beats * BEAT_S)
         pulse.stop()
     assert not gate.high
 
 
-def test_a_holder_that_never_stops_it_outlives_its_lease_by_no_edge():
+def test_a_lease_that_is_never_stopped_expires_without_further_edges():
     gate = Gate()
     pulse = Heartbeat(gate)
     begin_s = time.monotonic()
@@ -81,7 +81,7 @@ def test_a_holder_that_never_stops_it_outlives_its_lease_by_no_edge():
 
 
 class Key:
-    """A line to ground."""
+    """Simulated button line to ground."""
 
     def __init__(self) -> None:
         self.down = False
@@ -93,7 +93,7 @@ class Key:
         self.down = False
 
 
-def test_a_button_knows_since_when_it_is_pressed():
+def test_a_button_reports_since_when_it_is_pressed():
     key, clock = Key(), VirtualClock()
     button = GpioButton(key, clock)
     assert button.pressed_since_s() is None
@@ -106,7 +106,7 @@ def test_a_button_knows_since_when_it_is_pressed():
     assert button.pressed_since_s() is None
 
 
-def test_a_line_that_cannot_be_had_is_named_with_what_to_do():
+def test_an_unavailable_line_raises_bus_fault_with_a_remedy():
     with pytest.raises(BusFault, match="/dev/gpiochip99") as missing:
         OutputLine("/dev/gpiochip99", 17)
     assert missing.value.remedy

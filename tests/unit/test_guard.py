@@ -1,4 +1,4 @@
-"""The guard around a lamp: dark by default, one holder at a time, and never longer than it may be."""
+"""Tests of the light guard: dark by default, one holder at a time, and limits on duration and irradiance."""
 
 import time
 from types import TracebackType
@@ -6,35 +6,35 @@ from types import TracebackType
 import pytest
 
 from device.clock import Clock, SystemClock, VirtualClock
-from device.dose import Beam, Hazard, light_limits, radiometry
 from device.errors import LightFault, LightLimit
-from device.guard import GuardedLight
-from device.ledger import MemoryLedger
-from device.values import Glow
+from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.guard import GuardedLight
+from device.light_safety.hazard import Beam, Hazard, light_limits, radiometry
+from device.values import Illumination
 
-GREEN, RED = Glow("green"), Glow("red", 0.5)
+GREEN, RED = Illumination("green"), Illumination("red", 0.5)
 
 
 class Lamp:
-    """A lamp that remembers; `slow_s` is how long it takes to light up, `broken` makes it fail halfway."""
+    """Lamp that records its states; `slow_s` is its turn-on time, `broken` makes it fail during turn-on."""
 
     def __init__(self, slow_s: float = 0.0) -> None:
-        self.glow: Glow | None = GREEN  # somebody left it on
+        self.illumination: Illumination | None = GREEN  # left on by an earlier process
         self.slow_s, self.broken = slow_s, False
-        self.history: list[Glow | None] = []
+        self.history: list[Illumination | None] = []
 
-    def on(self, glow: Glow) -> "Lamp":
+    def on(self, glow: Illumination) -> "Lamp":
         self.asked = glow
         return self
 
     def off(self) -> None:
-        self.glow = None
+        self.illumination = None
         self.history.append(None)
 
     def __enter__(self) -> "Lamp":
         time.sleep(self.slow_s)
-        self.glow = self.asked
-        self.history.append(self.glow)
+        self.illumination = self.asked
+        self.history.append(self.illumination)
         if self.broken:
             raise LightFault("half of the ring does not answer")
         return self
@@ -66,64 +66,64 @@ def guarded(lamp: Lamp, clock: VirtualClock) -> GuardedLight:
 
 def wait_until_dark(lamp: Lamp, patience_s: float = 10.0) -> float:
     begin = time.monotonic()
-    while lamp.glow is not None:
+    while lamp.illumination is not None:
         assert time.monotonic() - begin < patience_s, "the lamp stayed on"
         time.sleep(0.002)
     return time.monotonic() - begin
 
 
 def test_a_lamp_that_was_left_on_is_dark_once_it_is_guarded(lamp: Lamp, clock: VirtualClock) -> None:
-    assert lamp.glow is not None
-    assert guard(lamp, clock, 1.0).glow is None
-    assert lamp.glow is None
+    assert lamp.illumination is not None
+    assert guard(lamp, clock, 1.0).illumination is None
+    assert lamp.illumination is None
 
 
-def test_it_shines_for_its_holder_and_not_a_moment_longer(guarded: GuardedLight, lamp: Lamp) -> None:
+def test_the_lamp_is_on_only_within_the_context(guarded: GuardedLight, lamp: Lamp) -> None:
     holding = guarded.on(GREEN)
-    assert lamp.glow is None
+    assert lamp.illumination is None
     with holding:
-        assert guarded.glow == lamp.glow == GREEN
-    assert lamp.glow is None
+        assert guarded.illumination == lamp.illumination == GREEN
+    assert lamp.illumination is None
 
 
-def test_an_exception_inside_leaves_it_dark_and_usable(guarded: GuardedLight, lamp: Lamp) -> None:
+def test_an_exception_inside_leaves_the_lamp_off_and_usable(guarded: GuardedLight, lamp: Lamp) -> None:
     with pytest.raises(KeyboardInterrupt), guarded.on(GREEN):
         raise KeyboardInterrupt
-    assert lamp.glow is None
+    assert lamp.illumination is None
     with guarded.on(RED):
-        assert lamp.glow == RED
+        assert lamp.illumination == RED
 
 
-def test_a_second_holder_is_refused_and_all_is_dark(guarded: GuardedLight, lamp: Lamp) -> None:
+def test_a_second_holder_is_refused_and_the_lamp_is_off(guarded: GuardedLight, lamp: Lamp) -> None:
     with guarded.on(GREEN):
         with pytest.raises(LightLimit, match="someone else"), guarded.on(RED):
             pytest.fail("two held the lamp")
-        assert lamp.glow is None  # a mistake in our own software: darkness is the only answer
+        assert lamp.illumination is None  # an error in our own software: turn the lamp off
     assert RED not in lamp.history
     with guarded.on(RED):
-        assert lamp.glow == RED
+        assert lamp.illumination == RED
 
 
-def test_after_enough_light_only_darkness_earns_more(guarded: GuardedLight, lamp: Lamp, clock: VirtualClock) -> None:
+def test_more_light_needs_as_much_darkness(guarded: GuardedLight, lamp: Lamp, clock: VirtualClock) -> None:
     with guarded.on(GREEN):
         clock.sleep(0.9)
     with guarded.on(GREEN):
         clock.sleep(0.9)  # 0.9 s of debt is still less than the limit
     with pytest.raises(LightLimit, match=r"1\.8 s"), guarded.on(GREEN):
         pytest.fail("it shone")
-    assert lamp.glow is None
+    assert lamp.illumination is None
     clock.sleep(0.7)
     with pytest.raises(LightLimit, match=r"1\.1 s"), guarded.on(GREEN):
         pytest.fail("it shone")
     clock.sleep(0.2)
     with guarded.on(GREEN):
-        assert lamp.glow == GREEN
+        assert lamp.illumination == GREEN
 
 
-def test_refusals_do_not_add_to_the_debt_nor_shorten_it(guarded: GuardedLight, clock: VirtualClock) -> None:
+def test_refusals_do_not_change_the_light_debt(guarded: GuardedLight, clock: VirtualClock) -> None:
     with guarded.on(GREEN):
         clock.sleep(1.5)
-    for _ in range(4):  # darkness counts once, however often somebody asks
+    for _ in range(4):  # darkness counts once, however often light is requested
         with pytest.raises(LightLimit), guarded.on(GREEN):
             pytest.fail("it shone")
         clock.sleep(0.1)
@@ -132,7 +132,7 @@ def test_refusals_do_not_add_to_the_debt_nor_shorten_it(guarded: GuardedLight, c
         pass
 
 
-def test_as_much_darkness_as_light_goes_on_for_ever(guarded: GuardedLight, clock: VirtualClock) -> None:
+def test_equal_light_and_darkness_can_continue_without_limit(guarded: GuardedLight, clock: VirtualClock) -> None:
     for _ in range(100):
         with guarded.on(RED):
             clock.sleep(0.05)
@@ -146,13 +146,13 @@ def test_the_timer_darkens_a_lamp_whose_holder_hangs(lamp: Lamp) -> None:
     with guarded.on(GREEN):
         took_s = wait_until_dark(lamp)
         time.sleep(0.3)  # the holder still hangs
-        assert guarded.glow is None
+        assert guarded.illumination is None
         with pytest.raises(LightLimit), guarded.on(GREEN):
             pytest.fail("it shone")
     assert took_s > 0.05
 
 
-def test_only_the_time_in_which_it_shone_counts_however_long_the_holder_hung(lamp: Lamp) -> None:
+def test_only_the_lit_time_of_a_hung_holder_counts(lamp: Lamp) -> None:
     clock = VirtualClock()
     guarded = guard(lamp, clock, 0.1)
     with guarded.on(GREEN):
@@ -160,10 +160,10 @@ def test_only_the_time_in_which_it_shone_counts_however_long_the_holder_hung(lam
         wait_until_dark(lamp)
         clock.sleep(3600)
     with guarded.on(GREEN):
-        assert lamp.glow == GREEN
+        assert lamp.illumination == GREEN
 
 
-def test_a_holder_in_time_is_not_disturbed_by_its_timer_later(lamp: Lamp) -> None:
+def test_the_timer_is_cancelled_when_the_context_ends(lamp: Lamp) -> None:
     guarded = guard(lamp, SystemClock(), 0.2)
     with guarded.on(GREEN):
         pass
@@ -177,47 +177,45 @@ def test_a_lamp_slower_than_its_timer_does_not_stay_on(clock: VirtualClock) -> N
     guarded = guard(lamp, clock, 0.05)
     with pytest.raises(LightLimit, match="longer"), guarded.on(GREEN):
         pytest.fail("it shone without a timer")
-    assert lamp.glow is None
+    assert lamp.illumination is None
 
 
 def test_a_lamp_that_fails_while_it_lights_up_is_dark_and_free(guarded: GuardedLight, lamp: Lamp) -> None:
     lamp.broken = True
     with pytest.raises(LightFault), guarded.on(GREEN):
         pytest.fail("it shone")
-    assert lamp.glow is None
+    assert lamp.illumination is None
     lamp.broken = False
     with guarded.on(GREEN):
-        assert lamp.glow == GREEN
+        assert lamp.illumination == GREEN
 
 
-def test_off_from_anywhere_ends_it_and_is_harmless_twice(guarded: GuardedLight, lamp: Lamp) -> None:
+def test_off_ends_the_light_and_is_idempotent(guarded: GuardedLight, lamp: Lamp) -> None:
     with guarded.on(GREEN):
         guarded.off()
         guarded.off()
-        assert lamp.glow is None
+        assert lamp.illumination is None
     with guarded.on(RED):
-        assert lamp.glow == RED
+        assert lamp.illumination == RED
 
 
-def test_a_holder_that_was_stopped_wakes_up_with_a_lamp_that_does_not_count_as_lit(
-    guarded: GuardedLight, lamp: Lamp, clock: VirtualClock
-) -> None:
-    """Its guardian has darkened the ring, and its own timer has not had its turn yet."""
-    with guarded.on(Glow("green")):
+def test_after_max_on_s_the_lamp_is_reported_as_off(guarded: GuardedLight, lamp: Lamp, clock: VirtualClock) -> None:
+    """The guardian has darkened the ring, and the guard's own timer has not fired yet."""
+    with guarded.on(Illumination("green")):
         clock.sleep(0.9)
-        assert guarded.glow == Glow("green")
+        assert guarded.illumination == Illumination("green")
         clock.sleep(0.1)
-        assert lamp.glow == Glow("green")
-        assert guarded.glow is None
+        assert lamp.illumination == Illumination("green")
+        assert guarded.illumination is None
 
 
-def test_light_brighter_than_a_retina_may_see_is_refused_dark_and_uncounted(lamp: Lamp, clock: VirtualClock) -> None:
-    """Its dose would be small: the irradiance is what refuses it."""
+def test_light_above_the_irradiance_limit_is_refused_and_not_counted(lamp: Lamp, clock: VirtualClock) -> None:
+    """The dose would be small: the irradiance limit refuses the light."""
     bright = Hazard({"green": Beam(0.440, 1e-3, 1e-6)}, light_limits())
     guarded = GuardedLight(lamp, clock, 1.0, bright, MemoryLedger(clock))
     with pytest.raises(LightLimit, match="times brighter"), guarded.on(GREEN):
         pytest.fail("it shone")
-    assert lamp.glow is None
+    assert lamp.illumination is None
     assert guarded.ledger.spent_j_per_cm2("OD") == 0.0
-    with guarded.on(Glow("green", 0.2)):
-        assert lamp.glow == Glow("green", 0.2)
+    with guarded.on(Illumination("green", 0.2)):
+        assert lamp.illumination == Illumination("green", 0.2)

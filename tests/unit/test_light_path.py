@@ -1,14 +1,14 @@
-"""One light path: heads agree with `hardware/optics.toml`, or say on the line why not."""
+"""Light path: heads agree with `hardware/optics.toml`, or give the reason on the line of the deviation."""
 
 import re
 from pathlib import Path
 
 import pytest
 
+from device.config.head_file import InstrumentSpec, OpticsSpec, load_head
+from device.config.toml_file import line_of
 from device.errors import SpecError
 from device.optics.light_path import LightPath, load_light_path, relay_of
-from device.spec import InstrumentSpec, OpticsSpec, load_head
-from device.tables import line_of
 
 HARDWARE = Path(__file__).parents[2] / "hardware"
 OPTICS = HARDWARE / "optics.toml"
@@ -17,7 +17,7 @@ PATH = load_light_path(OPTICS)
 
 
 def unexplained(path: LightPath, spec: InstrumentSpec, text: str) -> list[str]:
-    """The keys in which a head is another than the path, without a word why on their line."""
+    """Return the keys in which a head deviates from the path without a reason on their line."""
     ours = spec.optics or path.optics
     chain = spec.light.chain or path.ring
     others = [("optics", key, getattr(ours, key), getattr(path.optics, key)) for key in OpticsSpec.model_fields]
@@ -27,18 +27,18 @@ def unexplained(path: LightPath, spec: InstrumentSpec, text: str) -> list[str]:
     found = []
     for table, key, here, there in others:
         line = line_of(text, [table, key])
-        said = lines[line - 1] if line else ""
-        if here != there and not re.search(rf"{key} .*# deviates: .{{10,}}", said):
+        written = lines[line - 1] if line else ""
+        if here != there and not re.search(rf"{key} .*# deviates: .{{10,}}", written):
             found.append(f"{table}.{key} = {here}, not {there}")
     return found
 
 
 @pytest.mark.parametrize("head", HEADS, ids=lambda path: path.stem)
-def test_a_head_has_the_one_light_path_or_says_why_not(head: Path) -> None:
+def test_heads_follow_the_light_path_or_give_a_reason(head: Path) -> None:
     assert unexplained(PATH, load_head(head), head.read_text()) == []
 
 
-def test_a_head_that_is_another_one_is_noticed(tmp_path: Path) -> None:
+def test_deviation_without_a_reason_is_found(tmp_path: Path) -> None:
     text = (HARDWARE / "heads" / "imx296.toml").read_text()
     (other := tmp_path / "other.toml").write_text(text.replace("iris_um = 3200", "iris_um = 1600"))
     assert unexplained(PATH, load_head(other), other.read_text()) == ["optics.iris_um = 1600.0, not 3200.0"]
@@ -47,7 +47,7 @@ def test_a_head_that_is_another_one_is_noticed(tmp_path: Path) -> None:
 
 
 def test_the_relay_of_the_path_is_the_heads_geometry() -> None:
-    """What `Geometry` and the drawing compute with is one relay."""
+    """`Geometry` and the drawing use the same relay."""
     relay = relay_of(PATH, PATH.optics)
     assert (relay.first_mm, relay.second_mm) == (PATH.relay.first_mm, pytest.approx(PATH.relay.second_mm))
     assert relay.angular_magnification == pytest.approx(PATH.optics.angular_magnification)
@@ -62,7 +62,7 @@ def test_the_relay_of_the_path_is_the_heads_geometry() -> None:
         ("lens_mm = 50.8", "lens = 50.8", "did you mean 'lens_mm'"),
     ],
 )
-def test_a_path_that_cannot_be_is_refused(tmp_path: Path, was: str, becomes: str, says: str) -> None:
+def test_invalid_light_path_is_refused(tmp_path: Path, was: str, becomes: str, says: str) -> None:
     (broken := tmp_path / "optics.toml").write_text(OPTICS.read_text().replace(was, becomes))
     with pytest.raises(SpecError, match=re.escape(says)):
         load_light_path(broken)

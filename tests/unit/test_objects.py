@@ -1,4 +1,4 @@
-"""What a scene looks at: drawings in the right place, of the right size, shared between pixels by area."""
+"""Objects of a scene: drawings at the right place, of the right size, anti-aliased by covered area."""
 
 from math import atan, degrees, pi
 
@@ -7,11 +7,11 @@ import pytest
 from PIL import Image as Pictures
 from scipy import ndimage
 
+from device.config.head_file import OpticsSpec
+from device.config.scene import EyeSpec, ObjectSpec, SimSpec
 from device.errors import SpecError
-from device.scene import EyeSpec, ObjectSpec, SimSpec
 from device.sim.fundus import fundus
-from device.sim.objects import drawn
-from device.spec import OpticsSpec
+from device.sim.objects import draw_object
 
 PX_PER_DEG = 8.0
 F_UM = 25000.0
@@ -23,17 +23,17 @@ def optics(field_deg):
 
 def seen(field_deg=33.4, shape=(300, 301), gaze_deg=(0.0, 0.0), **what):
     scene = SimSpec(object=ObjectSpec(**what), eye=EyeSpec(gaze_deg=gaze_deg))
-    return drawn(scene, optics(field_deg), "OD", shape, PX_PER_DEG)
+    return draw_object(scene, optics(field_deg), "OD", shape, PX_PER_DEG)
 
 
 def centre(plane):
-    """The middle of a plane's light, in degrees right and down of the shape's middle."""
+    """Return the centroid of a plane's light, degrees right and down of the middle."""
     row, col = ndimage.center_of_mass(plane)
     return (col - (plane.shape[1] - 1) / 2) / PX_PER_DEG, (row - (plane.shape[0] - 1) / 2) / PX_PER_DEG
 
 
 def test_a_dot_on_the_axis_has_its_area_and_its_place() -> None:
-    """275 um behind 25 mm are 0.630 degrees (optics.md 1.1); the disc's light is its area to a few parts in 1000."""
+    """275 um behind 25 mm are 0.630 degrees (OPTICS.md 1.1); the disc's light is its area to a few parts in 1000."""
     plane = seen(kind="point").reflectance["green"]
     radius_px = degrees(atan(137.5 / F_UM)) * PX_PER_DEG
     assert plane.sum() == pytest.approx(pi * radius_px**2, rel=0.003)
@@ -50,8 +50,8 @@ def test_place_and_gaze_move_an_object_by_parts_of_a_pixel(at_deg) -> None:
     assert seen(kind="point", at_deg=half, gaze_deg=half).reflectance["green"] == pytest.approx(plane, abs=1e-5)
 
 
-def test_dots_stand_where_the_screen_shows_them() -> None:
-    """+-12 mm are +-25.64 degrees: closer together at the edge than in the middle, as atan says."""
+def test_dots_are_at_their_field_angles() -> None:
+    """+-12 mm are +-25.64 degrees: the angular distance of the dots shrinks towards the edge, as atan(h / f)."""
     plane = seen(field_deg=60, shape=(500, 500), kind="dots").reflectance["green"]
     labels, count = ndimage.label(plane > 0.5)
     assert count == 13 * 7
@@ -60,7 +60,7 @@ def test_dots_stand_where_the_screen_shows_them() -> None:
     row = places[np.abs(places[:, 0] - 249.5) < 1]
     angles = np.sort((row[:, 1] - 249.5) / PX_PER_DEG)
     assert angles == pytest.approx([degrees(atan(k * 2000 / F_UM)) for k in range(-6, 7)], abs=0.01)
-    assert across[-1] <= angles[-1] + 0.01  # off the middle row the same 12 mm are seen from farther away
+    assert across[-1] <= angles[-1] + 0.01  # off the middle row 12 mm are farther away, and so a smaller angle
 
 
 def test_a_ruler_of_15_mm_spans_33_4_degrees_and_has_a_tick_each_millimetre() -> None:
@@ -72,7 +72,7 @@ def test_a_ruler_of_15_mm_spans_33_4_degrees_and_has_a_tick_each_millimetre() ->
     assert ticks == 15  # 1 mm apart within 15 mm, one in the middle
 
 
-def test_a_negative_ruler_is_the_positive_one_upside_down_in_brightness_within_the_field() -> None:
+def test_negative_ruler_is_the_complement_of_the_positive_one() -> None:
     positive, negative = (seen(kind="ruler", polarity=p) for p in ("positive", "negative"))
     total = positive.reflectance["green"] + negative.reflectance["green"]
     assert total[positive.field].min() > 0.49  # the soft rim
@@ -89,13 +89,13 @@ def test_a_negative_ruler_is_the_positive_one_upside_down_in_brightness_within_t
         ({"kind": "point", "at_deg": (16.6, 0.0)}, "dot_um"),
     ],
 )
-def test_what_the_field_would_cut_is_refused_with_key_value_and_range(what, key) -> None:
+def test_object_beyond_the_field_is_refused_with_key_value_and_range(what, key) -> None:
     with pytest.raises(SpecError, match=rf"sim\.object\.{key} = .* ends at 16\.7") as refused:
         seen(**what)
     assert "within 0 to 7500 um" in refused.value.remedy
 
 
-def test_a_retina_that_does_not_move_is_the_fundus_itself() -> None:
+def test_unshifted_retina_equals_the_fundus() -> None:
     plain = fundus((300, 301), PX_PER_DEG, 33.4, 1, haemorrhages=2)
     found = seen(haemorrhages=2)
     assert (found.reflectance["green"] == plain.reflectance["green"]).all()
@@ -103,19 +103,19 @@ def test_a_retina_that_does_not_move_is_the_fundus_itself() -> None:
     assert (found.disc, found.fovea) == (plain.disc, plain.fovea)
 
 
-def test_a_retina_moves_behind_a_field_that_stays() -> None:
-    """The same print at two places: what both show is the same, 4 degrees apart."""
-    here, there = (seen(size_deg=50, at_deg=at) for at in ((0.0, 0.0), (4.0, -2.0)))
-    assert (here.field == there.field).all()
+def test_shifted_retina_keeps_the_field() -> None:
+    """One print at two places: the common part is the same, 4 degrees apart."""
+    centred, shifted = (seen(size_deg=50, at_deg=at) for at in ((0.0, 0.0), (4.0, -2.0)))
+    assert (centred.field == shifted.field).all()
     right, down = 32, -16
-    moved = np.roll(here.reflectance["green"], (down, right), axis=(0, 1))
-    both = ndimage.binary_erosion(here.field & np.roll(here.field, (down, right), axis=(0, 1)), iterations=3)
-    assert moved[both] == pytest.approx(there.reflectance["green"][both], abs=1e-4)
-    assert there.disc == pytest.approx((here.disc[0] + down, here.disc[1] + right))
-    assert there.reflectance["green"][~ndimage.binary_dilation(there.field)].max() == 0
+    moved = np.roll(centred.reflectance["green"], (down, right), axis=(0, 1))
+    both = ndimage.binary_erosion(centred.field & np.roll(centred.field, (down, right), axis=(0, 1)), iterations=3)
+    assert moved[both] == pytest.approx(shifted.reflectance["green"][both], abs=1e-4)
+    assert shifted.disc == pytest.approx((centred.disc[0] + down, centred.disc[1] + right))
+    assert shifted.reflectance["green"][~ndimage.binary_dilation(shifted.field)].max() == 0
 
 
-def test_a_photograph_moves_too_and_leaves_darkness_behind(tmp_path) -> None:
+def test_shifted_photograph_is_dark_outside_its_edge(tmp_path) -> None:
     Pictures.new("RGB", (64, 64), (255, 128, 0)).save(tmp_path / "even.png")
     found = seen(kind="image", image=tmp_path / "even.png", at_deg=(8.0, 0.0))
     red = found.reflectance["red"][150]

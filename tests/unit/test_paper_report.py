@@ -1,4 +1,4 @@
-"""The page of `diffuscope paper`: what it says when an assertion fails, and what it refuses."""
+"""Report of `diffuscope paper`: failed assertions, self-contained page, refusals, and scenes of the bench."""
 
 import xml.etree.ElementTree as ET
 from base64 import b64decode
@@ -11,15 +11,15 @@ from device.clock import VirtualClock
 from device.errors import SettingError, SpecError, StoreError
 from device.sim.world import World
 from services.cli import app
-from services.instrument.paper.bench import Bench, changed
-from services.instrument.paper.outcome import Experiment, Outcome, Shown, above, attempted, below, within
-from services.instrument.paper.pictures import plane, trend
-from services.instrument.paper.report import EXPERIMENTS, ORDER, Ran, all_hold, html, rerun, table
+from services.lab.paper.bench import Bench, with_changes
+from services.lab.paper.outcome import Experiment, Figure, Outcome, above, attempted, below, within
+from services.lab.paper.pictures import plane, trend
+from services.lab.paper.report import EXPERIMENTS, ORDER, ExperimentRun, all_hold, html, run_experiments, table
 
 
-def ran(*claims, **more) -> list[Ran]:
+def ran(*claims, **more) -> list[ExperimentRun]:
     experiment = Experiment("X1", "A <made up> title", "One sentence.", "Nothing.", lambda bench: Outcome(claims))
-    return [Ran(experiment, Outcome(claims, **more), 1.0)]
+    return [ExperimentRun(experiment, Outcome(claims, **more), 1.0)]
 
 
 @pytest.mark.parametrize(
@@ -35,14 +35,14 @@ def ran(*claims, **more) -> list[Ran]:
         (within("a", float("nan"), 0.5, 1.0), False),
     ],
 )
-def test_a_claim_can_fail_and_a_missing_number_fails_it(claim, holds) -> None:
+def test_claim_fails_outside_its_limits_and_for_nan(claim, holds) -> None:
     assert claim.holds is holds
     assert all_hold(ran(claim)) is holds
     assert ("does not hold" in html(ran(claim), 1)) is not holds
     assert ("NO" in table(ran(claim))) is not holds
 
 
-def test_what_is_not_reproduced_is_seen_and_is_not_counted_as_held() -> None:
+def test_number_that_is_not_reproduced_is_not_counted_as_held() -> None:
     missed = attempted("SSIM", 0.977, 0.49, 0.69, "SSIM .59")
     both = ran(above("a", 0.9, 0.88), missed)
     page = html(both, 1)
@@ -57,7 +57,7 @@ def test_what_is_not_reproduced_is_seen_and_is_not_counted_as_held() -> None:
     assert attempted("SSIM", float("nan"), 0.49, 0.69, "SSIM .59").status == "not reproduced"
 
 
-def test_the_page_is_self_contained_and_escapes_what_it_is_told() -> None:
+def test_page_is_self_contained_and_escapes_its_texts() -> None:
     shown = (
         plane("grey & black", np.eye(40, dtype=np.float32)),
         trend("t", "u", "x", "y", {"a": {0.0: 1.0, 1.0: 2.0}}),
@@ -72,7 +72,7 @@ def test_the_page_is_self_contained_and_escapes_what_it_is_told() -> None:
 
 
 def test_plots_are_svg_and_pictures_png() -> None:
-    def content(shown: Shown) -> bytes:
+    def content(shown: Figure) -> bytes:
         return b64decode(shown.address.split(",", 1)[1])
 
     assert content(plane("p", np.eye(40, dtype=np.float32)))[:4] == b"\x89PNG"
@@ -80,35 +80,35 @@ def test_plots_are_svg_and_pictures_png() -> None:
     assert drawn.tag.endswith("svg")
 
 
-def test_every_experiment_of_the_order_exists_once() -> None:
+def test_each_experiment_exists_once() -> None:
     assert tuple(EXPERIMENTS) == ORDER
 
 
-def test_one_experiment_makes_a_page(tmp_path) -> None:
-    said = []
-    found = rerun(tmp_path / "new", VirtualClock(), said.append, ["N"])
+def test_report_of_one_experiment_is_written(tmp_path) -> None:
+    progress = []
+    found = run_experiments(tmp_path / "new", VirtualClock(), progress.append, ["N"])
     assert [one.experiment.key for one in found] == ["N"]
-    assert said == ["N: 10 of 10 assertions hold"]
+    assert progress == ["N: 10 of 10 assertions hold"]
     assert "The paper&#x27;s numbers" in (tmp_path / "new" / "report.html").read_text()
 
 
-def test_the_command_says_where_the_page_is(tmp_path) -> None:
+def test_command_prints_the_path_of_the_report(tmp_path) -> None:
     done = CliRunner().invoke(app, ["paper", "-o", str(tmp_path), "--only", "N"])
     assert done.exit_code == 0, done.output
     assert "report.html" in done.stdout
     assert "33.40" in done.stdout
 
 
-def test_an_unknown_experiment_and_a_place_that_cannot_be_are_refused(tmp_path) -> None:
+def test_unknown_experiment_and_unwritable_folder_are_refused(tmp_path) -> None:
     with pytest.raises(SettingError, match="S99") as refused:
-        rerun(tmp_path, VirtualClock(), lambda line: None, ["S99"])
+        run_experiments(tmp_path, VirtualClock(), lambda line: None, ["S99"])
     assert "S2b" in refused.value.remedy
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError):
-        rerun(tmp_path / "file" / "under", VirtualClock(), lambda line: None, ["N"])
+        run_experiments(tmp_path / "file" / "under", VirtualClock(), lambda line: None, ["N"])
 
 
-def test_a_bench_merges_light_wells_and_noise_with_the_pixels() -> None:
+def test_merged_pixels_scale_light_full_well_and_noise() -> None:
     one, two = (Bench(n).scene("paper_heine") for n in (1, 2))
     assert (two.camera.rows, two.camera.cols) == (one.camera.rows // 2, one.camera.cols // 2)
     assert two.camera.pitch_um == 2 * one.camera.pitch_um
@@ -116,11 +116,11 @@ def test_a_bench_merges_light_wells_and_noise_with_the_pixels() -> None:
     assert two.sim.peak_e / two.camera.read_noise_e**2 == pytest.approx(one.sim.peak_e / one.camera.read_noise_e**2)
 
 
-def test_a_change_is_checked_as_if_it_had_been_read() -> None:
+def test_change_of_a_scene_is_validated() -> None:
     spec = Bench().scene("paper_heine")
-    assert changed(spec, {"sim.eye.m_dpt": 3.0}).sim.eye.m_dpt == 3
+    assert with_changes(spec, {"sim.eye.m_dpt": 3.0}).sim.eye.m_dpt == 3
     with pytest.raises(ValueError, match="less than or equal to 20"):
-        changed(spec, {"sim.eye.m_dpt": 30.0})
-    dots = changed(spec, {"sim.object.kind": "dots"})
+        with_changes(spec, {"sim.eye.m_dpt": 30.0})
+    dots = with_changes(spec, {"sim.object.kind": "dots"})
     with pytest.raises(SpecError, match="half_size_um"):
         _ = World(dots, VirtualClock()).retina

@@ -1,30 +1,30 @@
-"""The Pareto edge, and the plots: small enough to be judged without a bench."""
+"""Pareto front and SVG plots."""
 
 from xml.etree import ElementTree
 
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.instrument.frontier import on_edge
-from services.instrument.plot import Mark, Plot, Series, svg, time_axis, value_axis
+from services.lab.frontier import pareto_front
+from services.lab.plot import Mark, Plot, Series, svg, time_axis, value_axis
 
 SVG = "{http://www.w3.org/2000/svg}"
 places = st.lists(st.tuples(st.integers(1, 9).map(float), st.integers(0, 9).map(float)), min_size=1, max_size=30)
 
 
 def dominates(a: tuple[float, float], b: tuple[float, float]) -> bool:
-    """Whether a costs at most as much, is worth at least as much, and is better in one of the two."""
+    """Return whether `a` costs at most as much as `b`, is worth at least as much, and is better in one of the two."""
     return a[0] <= b[0] and a[1] >= b[1] and a != b
 
 
 @given(places)
-def test_a_place_is_on_the_edge_if_and_only_if_nothing_dominates_it(among):
-    assert on_edge(among) == [not any(dominates(other, place) for other in among) for place in among]
+def test_point_is_on_the_pareto_front_if_and_only_if_it_is_not_dominated(among):
+    assert pareto_front(among) == [not any(dominates(other, place) for other in among) for place in among]
 
 
 @given(places)
-def test_the_edge_is_never_empty_and_holds_the_fastest_and_the_best(among):
-    edge = {place for place, on in zip(among, on_edge(among), strict=True) if on}
+def test_pareto_front_holds_the_fastest_and_the_best(among):
+    edge = {place for place, on in zip(among, pareto_front(among), strict=True) if on}
     fastest, best = min(place[0] for place in among), max(place[1] for place in among)
     assert any(place[0] == fastest for place in edge)
     assert any(place[1] == best for place in edge)
@@ -37,7 +37,7 @@ def plotted(marks: list[Mark], **more: object) -> ElementTree.Element:
 
 
 @given(st.lists(st.tuples(st.floats(1e-5, 1e3), st.floats(-60, 200)), min_size=1, max_size=25))
-def test_every_mark_lies_within_the_frame(values):
+def test_marks_lie_within_the_frame(values):
     root = plotted([Mark(x, y, "label", "says") for x, y in values])
     frame = next(rect for rect in root.iter(f"{SVG}rect") if rect.get("class") == "frame")
     left, top, wide, tall = (float(frame.get(key, "nan")) for key in ("x", "y", "width", "height"))
@@ -48,20 +48,20 @@ def test_every_mark_lies_within_the_frame(values):
             assert top <= y <= top + tall
 
 
-def test_a_plot_speaks_to_those_who_cannot_see_it():
-    root = plotted([Mark(0.1, 1.0, says="a"), Mark(0.2, 2.0, says="b")], ring=(0.2, 2.0, "chosen"))
+def test_plot_has_texts_for_screen_readers():
+    root = plotted([Mark(0.1, 1.0, tooltip="a"), Mark(0.2, 2.0, tooltip="b")], ring=(0.2, 2.0, "chosen"))
     assert root.get("role") == "img"
     named = {element.get("id") for element in root.iter() if element.get("id")}
     assert set((root.get("aria-labelledby") or "").split()) == named
     assert [title.text for title in root.iter(f"{SVG}title")] == ["A < B", "a", "b", "chosen"]
 
 
-def test_a_plot_needs_nothing_from_elsewhere():
+def test_plot_has_no_external_resources():
     text = ElementTree.tostring(plotted([Mark(0.1, 1.0), Mark(0.2, 2.0)]), "unicode")
     assert not [word for word in ("href", "url(", "@import", "<script") if word in text]
 
 
-def test_labels_do_not_lie_on_one_another():
+def test_labels_do_not_overlap():
     root = plotted([Mark(0.1 * 1.02**k, 1 + 0.01 * k, "bin 2, 8") for k in range(12)] + [Mark(1, 3, "far")])
     labels = [t for t in root.iter(f"{SVG}text") if "label" in (t.get("class") or "")]
     boxes = [(float(t.get("x", 0)), float(t.get("y", 0)), 6.6 * len(t.text or "")) for t in labels]

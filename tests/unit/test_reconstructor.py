@@ -1,4 +1,4 @@
-"""The ladder of recipes: stages, deadlines, colour, memory, and no planning on a press."""
+"""Reconstructor: stages, deadlines, colour, memory; no FFT planning and no compilation after construction."""
 
 import subprocess
 import sys
@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from device.clock import Deadline, VirtualClock
-from device.recon.geometry import Grid
 from device.recon.methods import METHODS
-from device.recon.plan import Planner
-from device.recon.reconstructor import Recipe, Reconstructor, Stage
+from device.recon.model.fft_plans import Planner
+from device.recon.model.grid import Grid
+from device.recon.reconstructor import Recipe, Reconstructor, RoundDone, StageResult
+from device.values import Reconstruction
 from tests import scenes
 
 SHAPE = (96, 128)
@@ -20,7 +21,7 @@ QUICK, FULL = Recipe("gradient", 4), Recipe("gradient", 1)
 
 
 class SlowClock(VirtualClock):
-    """Virtual time in which every look at the clock costs a tenth of a second."""
+    """Virtual clock in which every reading takes a tenth of a second."""
 
     def now_s(self) -> float:
         self.elapsed_s += 0.1
@@ -31,17 +32,40 @@ def counts(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(500, 1500, SHAPE).astype(np.uint16)
 
 
-def test_stages_come_in_order_and_the_last_says_so() -> None:
-    seen: list[Stage] = []
+def test_stages_run_in_order_and_the_last_is_marked() -> None:
     reconstruct = scenes.reconstructor(scenes.calibration(scenes.speckle(SHAPE)), SHAPE, QUICK, FULL)
-    result = reconstruct(counts(), watch=seen.append)
+    *steps, result = reconstruct.steps(counts())
+    seen = [step for step in steps if isinstance(step, StageResult)]
+    assert isinstance(result, Reconstruction)
     assert [(stage.recipe.bin, stage.last) for stage in seen] == [(4, False), (1, True)]
     assert seen[0].picture.shape == (24, 32)
     assert result.picture.shape == SHAPE
     assert result.report.stopped == "done"
 
 
-def test_a_passed_deadline_still_gives_the_quick_look() -> None:
+def test_a_pause_after_a_round_moves_the_deadline_and_admits_a_quick_look() -> None:
+    clock, frame = VirtualClock(), counts()
+    cal = scenes.calibration(scenes.speckle(SHAPE))
+    reconstruct = Reconstructor(cal, SHAPE, scenes.PLANNER, clock, (QUICK, Recipe("variation", 1, 8)))
+    alone, pauses = reconstruct(frame), 0
+    for step in reconstruct.steps(frame, deadline=Deadline.after(clock, 1.0)):
+        if isinstance(step, RoundDone):
+            pauses += 1
+            clock.sleep(10.0)  # longer than the deadline
+            reconstruct(counts(pauses), quick=True)
+    assert isinstance(step, Reconstruction)
+    assert (step.report.stopped, pauses) == ("done", step.report.rounds)
+    assert pauses > 3
+    assert step.report.seconds["solve"] == pytest.approx(0.0)
+    assert np.array_equal(step.picture, alone.picture)
+
+
+def test_a_single_stage_has_no_pauses() -> None:
+    reconstruct = scenes.reconstructor(scenes.calibration(scenes.speckle(SHAPE)), SHAPE, Recipe("variation", 1, 8))
+    assert [type(step) for step in reconstruct.steps(counts())] == [StageResult, Reconstruction]
+
+
+def test_a_passed_deadline_gives_the_quick_look() -> None:
     clock = SlowClock()
     cal = scenes.calibration(scenes.speckle(SHAPE))
     reconstruct = Reconstructor(cal, SHAPE, scenes.PLANNER, clock, (QUICK, FULL))
@@ -51,7 +75,7 @@ def test_a_passed_deadline_still_gives_the_quick_look() -> None:
     assert result.picture.shape == SHAPE
 
 
-def test_three_channels_are_three_pictures() -> None:
+def test_channels_are_reconstructed_independently() -> None:
     reconstruct = scenes.reconstructor(scenes.calibration(scenes.speckle(SHAPE)), SHAPE)
     colour = np.stack([counts(1), counts(2), counts(3)], axis=-1)
     together = reconstruct(colour).picture
@@ -60,7 +84,7 @@ def test_three_channels_are_three_pictures() -> None:
         assert together[..., c] == pytest.approx(alone, abs=1e-3)
 
 
-def test_a_press_never_plans() -> None:
+def test_reconstruction_makes_no_fft_plan() -> None:
     planner = Planner(folder=None, threads=1, effort="FFTW_ESTIMATE")
     reconstruct = Reconstructor(
         scenes.calibration(scenes.speckle(SHAPE)), SHAPE, planner, VirtualClock(), (QUICK, FULL)
@@ -70,8 +94,8 @@ def test_a_press_never_plans() -> None:
     assert planner.planned == planned
 
 
-def test_wisdom_is_kept_and_a_damaged_file_costs_only_time(tmp_path) -> None:
-    shape = (154, 286)  # of no other test: FFTW keeps what it has learnt for the whole process
+def test_fftw_wisdom_is_stored_and_a_damaged_file_is_ignored(tmp_path) -> None:
+    shape = (154, 286)  # used by no other test: FFTW accumulates wisdom per process
     Planner(tmp_path, threads=1).plan(shape)
     (file,) = tmp_path.glob("*.wisdom")
     file.write_text("no wisdom at all")
@@ -80,61 +104,61 @@ def test_wisdom_is_kept_and_a_damaged_file_costs_only_time(tmp_path) -> None:
     assert fft.forward()[0, 0] == pytest.approx(154 * 286)
 
 
-def test_what_a_solve_allocates_does_not_grow_with_the_image() -> None:
+def test_solver_allocations_do_not_grow_with_the_image() -> None:
     def peak_bytes(shape: tuple[int, int]) -> int:
         reconstruct = scenes.reconstructor(scenes.calibration(scenes.speckle(shape)), shape)
         y = np.full(shape, 700, np.uint16)
-        rung = reconstruct.rungs[0]
+        stage = reconstruct.stages[0]
         tracemalloc.start()
-        rung.solver.start(rung.preparer(y))
+        stage.solver.start(stage.preparer(y))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return peak
 
     small, large = peak_bytes((256, 256)), peak_bytes((1024, 1024))
-    # the frequencies that decide are capped at 20 000, so sixteen times the pixels may not need twice the scratch
+    # the sampled frequencies are limited to 20 000, so sixteen times the pixels need less than twice the memory
     assert large < 2 * small
 
 
-def test_memory_is_known_before_it_is_taken() -> None:
+def test_estimated_memory_is_plausible_and_falls_with_binning() -> None:
     inf = float("inf")
     for method in METHODS.values():
-        asked = method.memory_bytes(Grid.periodic((1080, 1920), 1, inf))
-        assert 60e6 < asked < 300e6
-        assert method.memory_bytes(Grid.periodic((1080, 1920), 2, inf)) < asked
+        memory_bytes = method.memory_bytes(Grid.periodic((1080, 1920), 1, inf))
+        assert 60e6 < memory_bytes < 300e6
+        assert method.memory_bytes(Grid.periodic((1080, 1920), 2, inf)) < memory_bytes
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_known_memory_is_what_is_taken(method: str) -> None:
+def test_estimated_memory_is_the_allocated_memory(method: str) -> None:
     shape = (512, 640)
-    even = np.ones(shape, np.float32)  # a map of the sensor's dark and one of its response, as a head has
+    even = np.ones(shape, np.float32)  # dark frame and flat frame, as a head has
     cal = scenes.calibration(scenes.speckle(shape), dark_dn=even, flat=even)
-    scenes.reconstructor(cal, shape, Recipe(method, 1))  # compiles, which also takes memory
+    scenes.reconstructor(cal, shape, Recipe(method, 1))  # compiles, which also allocates memory
     tracemalloc.start()
-    kept = scenes.reconstructor(cal, shape, Recipe(method, 1))
-    taken = tracemalloc.get_traced_memory()[0]
+    reconstructor = scenes.reconstructor(cal, shape, Recipe(method, 1))
+    allocated_bytes = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert kept.rungs
-    assert taken == pytest.approx(METHODS[method].memory_bytes(kept.rungs[0].grid), rel=0.25)
+    assert reconstructor.stages
+    assert allocated_bytes == pytest.approx(METHODS[method].memory_bytes(reconstructor.stages[0].grid), rel=0.25)
 
 
-def test_one_bad_moment_does_not_refuse_the_good_picture_for_ever() -> None:
+def test_one_slow_run_does_not_refuse_the_stage_forever() -> None:
     clock = VirtualClock()
     cal = scenes.calibration(scenes.speckle(SHAPE))
     reconstruct = Reconstructor(cal, SHAPE, scenes.PLANNER, clock, (QUICK, FULL))
-    reconstruct.rungs[1].start_cost.add(60.0)  # a neighbour held the machine for a minute
+    reconstruct.stages[1].start_cost.add(60.0)  # another process occupied the machine for a minute
     bins = [reconstruct(counts(), deadline=Deadline.after(clock, 1.0)).report.bin for _ in range(15)]
     assert bins[0] == 4
     assert bins[-1] == 1
 
 
-COMPILED_ON_A_PRESS = """
+PRINT_COMPILED_SIGNATURES = """
 import numpy as np
-from device.recon import kernels, sweeps
+from device.recon.model import fused_kernels, kernels
 from tests import scenes
 
 def compiled():
-    both = {**vars(kernels), **vars(sweeps)}.items()
+    both = {**vars(kernels), **vars(fused_kernels)}.items()
     return {(name, str(types)) for name, f in both if hasattr(f, "signatures") for types in f.signatures}
 
 cal = scenes.calibration(scenes.speckle((48, 64)))
@@ -143,15 +167,15 @@ before = compiled()
 frame = np.random.default_rng(0).integers(500, 1500, (48, 64)).astype(np.uint16)
 dark = np.zeros_like(frame)
 make(frame)
-frame.flags.writeable = dark.flags.writeable = False  # as a camera hands them over
+frame.flags.writeable = dark.flags.writeable = False  # as frames of a camera are
 make(frame)
 make(frame, dark)
 print(sorted(compiled() - before))
 """
 
 
-def test_a_press_compiles_nothing() -> None:
-    """In a process of its own, where no other test has compiled anything: a first press once took 0.8 s of 0.26 s."""
-    command = [sys.executable, "-c", COMPILED_ON_A_PRESS]
+def test_reconstruction_compiles_no_kernel() -> None:
+    """In a process of its own, where no other test has compiled a kernel: a first press once took 0.8 s."""
+    command = [sys.executable, "-c", PRINT_COMPILED_SIGNATURES]
     done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "[]\n"), done.stdout + done.stderr

@@ -1,16 +1,17 @@
-"""Scenes that cannot be: refused with the key, the value that was given, and what is allowed."""
+"""Invalid scenes: refused with the key, the given value, and the permitted range."""
 
 from pathlib import Path
 
 import pytest
 
+from device.config.head_file import load_head
+from device.config.scene import SimSpec
 from device.errors import SpecError
-from device.spec import load_head
 from tests.simulated import SCENES
 
 TEXT = (SCENES / "healthy.toml").read_text()
 
-BAD = {  # what is added to or replaced in a scene, and the words that must be said
+BAD = {  # text added to a scene, and the required words of the error
     "a missing image": (
         '[sim.object]\nkind = "image"\nimage = "nowhere.png"',
         ("sim.object.image", "nowhere.png", "path of a photograph"),
@@ -51,22 +52,27 @@ def message(text: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_scene_that_cannot_be_is_refused_with_key_value_and_range(case: str, tmp_path: Path) -> None:
+def test_invalid_scene_is_refused_with_key_value_and_range(case: str, tmp_path: Path) -> None:
     added, words = BAD[case]
-    said = message(f"{TEXT}\n{added}\n", tmp_path)
-    assert all(word in said for word in words), said
+    found = message(f"{TEXT}\n{added}\n", tmp_path)
+    assert all(word in found for word in words), found
 
 
 @pytest.mark.parametrize(("right", "wrong"), [(right, wrong) for right, some in WRONG.items() for wrong in some])
-def test_optics_and_camera_that_cannot_be_are_refused_likewise(right: str, wrong: str, tmp_path: Path) -> None:
+def test_invalid_optics_and_camera_are_refused(right: str, wrong: str, tmp_path: Path) -> None:
     assert right in TEXT
-    said = message(TEXT.replace(right, wrong), tmp_path)
-    assert all(word in said for word in WRONG[right][wrong]), said
+    found = message(TEXT.replace(right, wrong), tmp_path)
+    assert all(word in found for word in WRONG[right][wrong]), found
 
 
-def test_a_scene_says_only_what_is_different(tmp_path: Path) -> None:
+def test_scene_files_are_short_and_default_to_the_papers_optics(tmp_path: Path) -> None:
     optics = load_head(SCENES / "healthy.toml").optics
     assert optics is not None
     paper = (optics.iris_um, optics.diffuser_to_sensor_um, optics.angular_magnification, optics.field_deg)
     assert paper == (3200, 6000, 0.75, 33.4)
     assert max(len(path.read_text().splitlines()) for path in SCENES.glob("*.toml")) < 60
+
+
+def test_scene_can_be_a_key() -> None:
+    assert hash(SimSpec()) == hash(SimSpec())
+    assert hash(SimSpec(seed=2)) != hash(SimSpec())

@@ -1,4 +1,4 @@
-"""The one world behind camera and lamp."""
+"""Simulated world behind camera and lamp."""
 
 from pathlib import Path
 
@@ -8,21 +8,21 @@ from PIL import Image
 from scipy.signal import convolve2d
 
 from device.clock import VirtualClock
+from device.config.head_file import load_head
+from device.config.scene import EyeSpec, ObjectSpec
 from device.errors import CameraMissing, CameraStalled, LightFault, SettingError, SpecError
-from device.scene import EyeSpec, ObjectSpec
-from device.sim.calibrate import simulated_calibration
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
-from device.sim.render import blurred, fitted
+from device.sim.render import convolved, crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.spec import load_head
-from device.values import Glow, Shot
+from device.values import ExposureSettings, Illumination
 
 HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
 
 
 def small_head(**sim):
-    """The simulated head with larger pixels; `sim` replaces keys of its [sim] table."""
+    """Return the simulated head with larger pixels; `sim` replaces keys of its [sim] table."""
     spec = load_head(HEAD)
     camera = spec.camera.model_copy(update={"rows": 270, "cols": 480, "pitch_um": 4 * spec.camera.pitch_um})
     return spec.model_copy(update={"camera": camera, "sim": spec.sim.model_copy(update=sim)})
@@ -33,7 +33,7 @@ def world():
     return World(small_head(), VirtualClock())
 
 
-def test_green_at_full_drive_reaches_the_peak_that_was_asked(world):
+def test_green_at_full_drive_reaches_peak_e(world):
     exposure_s = world.spec.camera.exposure_s
     assert world.electrons_per_s("green").max() * exposure_s == pytest.approx(15000, rel=1e-5)
     assert world.electrons_per_s("red").max() > 1.2 * world.electrons_per_s("green").max()
@@ -41,21 +41,21 @@ def test_green_at_full_drive_reaches_the_peak_that_was_asked(world):
 
 def test_a_preview_in_red_is_bright_and_not_saturated(world):
     camera, light = SimCamera(world), SimLight(world)
-    with light.on(Glow(world.spec.light.preview_colour)):
-        counts = camera.expose(Shot(world.spec.camera.preview_exposure_s)).counts
+    with light.on(Illumination(world.spec.light.preview_colour)):
+        counts = camera.expose(ExposureSettings(world.spec.camera.preview_exposure_s)).counts
     assert 0.2 * 4095 < counts.max() < 0.9 * 4095
 
 
 def test_a_dark_frame_holds_black_level_and_read_noise_only(world):
-    counts = SimCamera(world).expose(Shot(0.1)).counts.astype(np.float64)
+    counts = SimCamera(world).expose(ExposureSettings(0.1)).counts.astype(np.float64)
     camera = world.spec.camera
     assert counts.mean() == pytest.approx(camera.black_dn, abs=0.01)
     assert counts.max() <= camera.black_dn + 2
 
 
-def test_light_of_the_room_comes_without_the_lamp():
+def test_ambient_light_needs_no_lamp():
     lit = World(small_head(), VirtualClock(), ambient_e_per_s=5000.0)
-    counts = SimCamera(lit).expose(Shot(0.1)).counts
+    counts = SimCamera(lit).expose(ExposureSettings(0.1)).counts
     assert counts.mean() == pytest.approx(64 + 500 / lit.spec.camera.gain_e_per_dn, rel=0.01)
 
 
@@ -68,13 +68,13 @@ def test_the_blur_is_the_linear_convolution_cropped_about_the_middle(scene_shape
     shape = (24, 21)
     expected = np.zeros(shape)
     for (row, col), value in np.ndenumerate(whole):
-        there = (
+        target = (
             row - scene_shape[0] // 2 - psf_shape[0] // 2 + shape[0] // 2,
             col - scene_shape[1] // 2 - psf_shape[1] // 2 + shape[1] // 2,
         )
-        if 0 <= there[0] < shape[0] and 0 <= there[1] < shape[1]:
-            expected[there] = value
-    assert blurred([(scene, psf)], shape) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+        if 0 <= target[0] < shape[0] and 0 <= target[1] < shape[1]:
+            expected[target] = value
+    assert convolved([(scene, psf)], shape) == pytest.approx(expected, rel=1e-4, abs=1e-4)
 
 
 def test_a_point_in_the_scene_shows_the_caustic_around_its_own_pixel():
@@ -82,10 +82,10 @@ def test_a_point_in_the_scene_shows_the_caustic_around_its_own_pixel():
     psf[4, 4], psf[4, 6] = 0.75, 0.25
     scene = np.zeros((20, 20), np.float32)
     scene[10 + 3, 10 - 2] = 1
-    seen = blurred([(scene, psf)], (40, 50))
+    seen = convolved([(scene, psf)], (40, 50))
     assert seen[20 + 3, 25 - 2] == pytest.approx(0.75, abs=1e-5)
     assert seen[20 + 3, 25] == pytest.approx(0.25, abs=1e-5)
-    assert fitted(scene, (40, 50))[23, 23] == 1
+    assert crop_or_pad(scene, (40, 50))[23, 23] == 1
 
 
 def test_the_truth_lies_on_the_sensor_grid_around_its_middle(world):
@@ -98,7 +98,7 @@ def test_the_truth_lies_on_the_sensor_grid_around_its_middle(world):
     assert np.ptp(cols) + 1 == pytest.approx(world.geometry.px_per_deg * 33.4, abs=2)
 
 
-def test_a_scene_that_runs_past_the_sensor_still_lights_it():
+def test_light_from_beyond_the_sensor_edge_is_included():
     spec = small_head()
     narrow = spec.model_copy(update={"camera": spec.camera.model_copy(update={"rows": 100, "cols": 110})})
     wide, cut = World(spec, VirtualClock()), World(narrow, VirtualClock())
@@ -108,7 +108,7 @@ def test_a_scene_that_runs_past_the_sensor_still_lights_it():
     assert part / part.mean() == pytest.approx(middle / middle.mean(), rel=1e-3)
 
 
-def test_the_wrong_lamp_looks_wrong(world):
+def test_frames_differ_between_colours(world):
     green, red = world.electrons_per_s("green"), world.electrons_per_s("red")
     assert np.corrcoef(world.truth("green").ravel(), world.truth("red").ravel())[0, 1] < 0.99
     assert np.abs(green / green.max() - red / red.max()).max() > 0.02
@@ -124,15 +124,15 @@ def test_the_irradiance_is_computed_once(world):
     assert world.electrons_per_s("green") is world.electrons_per_s("green")
 
 
-def test_the_left_eye_is_another_picture():
+def test_left_eye_has_its_disc_on_the_other_side():
     left = World(small_head(), VirtualClock(), eye="OS")
     assert left.retina.disc[1] < left.retina.fovea[1]
 
 
-def test_the_calibration_is_what_a_factory_would_measure(world):
+def test_simulated_calibration_is_a_noisy_measurement_of_the_psf(world):
     calibration = simulated_calibration(world)
     psf = calibration.psfs[0].pixels
-    true = fitted(world.psf("green"), world.shape)
+    true = crop_or_pad(world.psf("green"), world.shape)
     assert psf.shape == world.shape
     assert psf.sum(dtype=np.float64) == pytest.approx(1, abs=1e-4)
     assert 0.999 < np.corrcoef(psf.ravel(), true.ravel())[0, 1] < 1 - 1e-9  # close, and not the truth itself
@@ -147,7 +147,7 @@ def test_a_sensor_smaller_than_the_caustic_can_be_calibrated():
     tiny = spec.model_copy(update={"camera": spec.camera.model_copy(update={"rows": 60, "cols": 75})})
     world = World(tiny, VirtualClock())
     psf = simulated_calibration(world).psfs[0].pixels
-    assert np.corrcoef(psf.ravel(), fitted(world.psf("green"), (60, 75)).ravel())[0, 1] > 0.999
+    assert np.corrcoef(psf.ravel(), crop_or_pad(world.psf("green"), (60, 75)).ravel())[0, 1] > 0.999
 
 
 def test_a_photograph_can_be_the_retina(tmp_path):
@@ -162,7 +162,7 @@ def test_a_photograph_can_be_the_retina(tmp_path):
     assert world.retina.vessels is None
 
 
-def test_a_photograph_that_is_none_is_refused(tmp_path):
+def test_a_file_that_is_no_picture_is_refused(tmp_path):
     (tmp_path / "eye.png").write_text("not a picture")
     with pytest.raises(SpecError, match="cannot be read"):
         World(small_head(object=ObjectSpec(kind="image", image=tmp_path / "eye.png")), VirtualClock()).truth("green")
@@ -174,55 +174,55 @@ def test_a_head_without_its_tables_is_refused(missing):
         World(small_head().model_copy(update={missing: None}), VirtualClock())
 
 
-def test_a_negative_seed_is_a_seed():
+def test_negative_seeds_are_valid():
     assert World(small_head(seed=-3), VirtualClock()).truth("green").any()
 
 
-def test_faults_become_the_errors_that_name_them():
+def test_faults_raise_their_errors():
     world = World(small_head(), VirtualClock())
     camera, light = SimCamera(world), SimLight(world)
     world.faults.add("camera.stalled")
     before = world.clock.now_s()
     with pytest.raises(CameraStalled):
-        camera.expose(Shot(0.1))
+        camera.expose(ExposureSettings(0.1))
     assert world.clock.now_s() - before > 0.1
     world.faults = {"camera.missing"}
     with pytest.raises(CameraMissing):
-        camera.expose(Shot(0.1))
+        camera.expose(ExposureSettings(0.1))
     with pytest.raises(CameraMissing):
         SimCamera(world)
     world.faults = {"light.fault"}
     with pytest.raises(LightFault):
-        light.on(Glow("green"))
-    assert light.glow is None
+        light.on(Illumination("green"))
+    assert light.illumination is None
     world.faults.clear()
-    assert camera.expose(Shot(0.1)).number == 1
+    assert camera.expose(ExposureSettings(0.1)).number == 1
 
 
 def test_a_lamp_that_breaks_before_the_context_begins_stays_dark():
     world = World(small_head(), VirtualClock())
     light = SimLight(world)
-    lit = light.on(Glow("green"))
+    lit = light.on(Illumination("green"))
     world.faults.add("light.fault")
     with pytest.raises(LightFault):
         lit.__enter__()
-    assert light.glow is None
+    assert light.illumination is None
 
 
-def test_leds_keep_their_colour_until_they_are_told_otherwise():
-    """The latch of the real chain: a lamp whose owner falls silent shines on, which is why there is a guardian."""
+def test_leds_keep_their_colour_without_new_commands():
+    """Latch of the real LED chain: without commands the lamp stays on, which is the reason for the guardian process."""
     world = World(small_head(), VirtualClock())
     camera, light = SimCamera(world), SimLight(world)
-    light.on(Glow("green")).__enter__()
+    light.on(Illumination("green")).__enter__()
     world.clock.sleep(3600)
-    assert camera.expose(Shot(0.01)).glow == Glow("green")
+    assert camera.expose(ExposureSettings(0.01)).illumination == Illumination("green")
     world.faults.add("light.silent")
     with pytest.raises(LightFault, match="hear"):
         light.off()
-    assert camera.expose(Shot(0.01)).glow == Glow("green")
+    assert camera.expose(ExposureSettings(0.01)).illumination == Illumination("green")
     world.faults.clear()
     light.off()
-    assert camera.expose(Shot(0.01)).glow is None
+    assert camera.expose(ExposureSettings(0.01)).illumination is None
 
 
 def test_a_fault_that_does_not_exist_is_refused():
@@ -236,7 +236,7 @@ def test_frames_are_marked_as_simulated_and_repeat_with_the_seed():
     frames = []
     for _ in range(2):
         world = World(small_head(), VirtualClock())
-        with SimLight(world).on(Glow("green")):
-            frames.append(SimCamera(world).expose(Shot(0.1)))
+        with SimLight(world).on(Illumination("green")):
+            frames.append(SimCamera(world).expose(ExposureSettings(0.1)))
     assert all(frame.simulated for frame in frames)
     assert np.array_equal(frames[0].counts, frames[1].counts)

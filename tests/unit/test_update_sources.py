@@ -1,4 +1,4 @@
-"""Fetching over real HTTPS: whole, cut and gone on with, given up, changed on its way; and what a channel may say."""
+"""Update sources over real HTTPS: complete, resumed, failed and altered downloads; channel, versions, settings."""
 
 import hashlib
 import json
@@ -12,24 +12,24 @@ from pathlib import Path
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import (
+from services.errors import (
     UpdateDamaged,
     UpdateFailed,
-    UpdateForeign,
     UpdateNoRoom,
-    UpdateNowhere,
+    UpdateNotFound,
     UpdateOlder,
     UpdateUnreachable,
+    UpdateUntrusted,
     UpdateWrongDevice,
-)  # fmt: skip
-from services.update.channel import Offer, opened
-from services.update.engine import Release
-from services.update.gate import number, refuse_wrong
-from services.update.journal import Journal
-from services.update.settings import UpdateSettings, load
-from services.update.sources import WAITS_S, Web, on_stick
-from tests.house import ROOT
-from tests.site import Site, identity, served, signed
+)
+from services.update.channel import Offer, verify_channel
+from services.update.preconditions import parse_version, refuse_unsuitable
+from services.update.rauc import Release
+from services.update.settings import UpdateSettings, load_settings
+from services.update.sources import BACKOFF_S, UpdateServer, find_bundle
+from services.update.state import StateFile
+from tests.project_files import ROOT
+from tests.site import Site, identity, serve, signed
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def site(keys: Path) -> Iterator[Site]:
-    with served(keys / "web.crt", keys / "web.key") as site:
+    with serve(keys / "web.crt", keys / "web.key") as site:
         yield site
 
 
@@ -61,157 +61,163 @@ def silent(share: float, what: str) -> None:
 CONTENT = bytes(range(256)) * 40_000
 
 
-def test_a_link_that_is_lost_twice_is_taken_up_where_it_was_lost(site: Site, keys: Path, tmp_path: Path) -> None:
+def test_download_resumes_after_two_lost_connections_with_backoff(site: Site, keys: Path, tmp_path: Path) -> None:
     site.files, site.cuts, clock = {"two.raucb": CONTENT}, [3_000_000, 4_000_000], VirtualClock()
-    fetched = Web(site.at, keys / "web.crt", clock).download(offer(CONTENT), tmp_path, silent)
+    fetched = UpdateServer(site.url, keys / "web.crt", clock).download(offer(CONTENT), tmp_path, silent)
     assert fetched.read_bytes() == CONTENT
-    assert site.asked == ["all", "bytes=3000000-", "bytes=7000000-"]
-    assert clock.now_s() == WAITS_S[0] + WAITS_S[1]
+    assert site.requested_ranges == ["all", "bytes=3000000-", "bytes=7000000-"]
+    assert clock.now_s() == BACKOFF_S[0] + BACKOFF_S[1]
 
 
-def test_a_link_that_stays_lost_is_given_up_and_what_arrived_is_kept(site: Site, keys: Path, tmp_path: Path) -> None:
-    site.files, site.cuts = {"two.raucb": CONTENT}, [5_000_000] + [0] * len(WAITS_S)
-    web = Web(site.at, keys / "web.crt", VirtualClock())
+def test_download_is_given_up_after_the_last_try_and_its_part_is_kept(site: Site, keys: Path, tmp_path: Path) -> None:
+    site.files, site.cuts = {"two.raucb": CONTENT}, [5_000_000] + [0] * len(BACKOFF_S)
+    web = UpdateServer(site.url, keys / "web.crt", VirtualClock())
     with pytest.raises(UpdateUnreachable, match="5000000 of 10240000") as caught:
         web.download(offer(CONTENT), tmp_path, silent)
     assert "goes on from there" in caught.value.remedy
     assert web.download(offer(CONTENT), tmp_path, silent).read_bytes() == CONTENT
-    assert site.asked[-1] == "bytes=5000000-"
+    assert site.requested_ranges[-1] == "bytes=5000000-"
 
 
-def test_a_server_that_cannot_go_on_begins_anew(site: Site, keys: Path, tmp_path: Path) -> None:
-    site.files, site.cuts, site.knows_ranges = {"two.raucb": CONTENT}, [5_000_000], False
-    web = Web(site.at, keys / "web.crt", VirtualClock())
+def test_download_restarts_if_the_server_has_no_ranges(site: Site, keys: Path, tmp_path: Path) -> None:
+    site.files, site.cuts, site.supports_ranges = {"two.raucb": CONTENT}, [5_000_000], False
+    web = UpdateServer(site.url, keys / "web.crt", VirtualClock())
     assert web.download(offer(CONTENT), tmp_path, silent).read_bytes() == CONTENT
 
 
-def test_what_is_not_what_the_channel_promised_is_removed(site: Site, keys: Path, tmp_path: Path) -> None:
+def test_download_with_another_sha256_is_removed(site: Site, keys: Path, tmp_path: Path) -> None:
     site.files = {"two.raucb": CONTENT[:-1] + b"x"}
     with pytest.raises(UpdateDamaged, match="SHA-256"):
-        Web(site.at, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent)
+        UpdateServer(site.url, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_power_cut_kept_by_its_length_only_is_fetched_anew(site: Site, keys: Path, tmp_path: Path) -> None:
-    """Zeros where the content was not written yet; who waited for hours for it is not told that the file is damaged."""
+def test_resumed_download_with_wrong_content_is_fetched_again(site: Site, keys: Path, tmp_path: Path) -> None:
+    """A power cut may leave zeros instead of content, which is no reason to report a damaged file."""
     (tmp_path / "two.raucb.part").write_bytes(bytes(4_000_000))
     site.files = {"two.raucb": CONTENT}
-    assert Web(site.at, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
-    assert site.asked == ["bytes=4000000-", "all"]
+    assert UpdateServer(site.url, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
+    assert site.requested_ranges == ["bytes=4000000-", "all"]
 
 
-def test_what_is_there_already_is_not_asked_for_again(site: Site, keys: Path, tmp_path: Path) -> None:
+def test_complete_download_is_not_requested_again(site: Site, keys: Path, tmp_path: Path) -> None:
     (tmp_path / "update.raucb").write_bytes(CONTENT)
     (tmp_path / "one.raucb.part").write_bytes(b"of an older version")
-    assert Web(site.at, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
-    assert (site.asked, list(tmp_path.glob("*.part"))) == ([], [])
+    assert UpdateServer(site.url, keys / "web.crt", VirtualClock()).download(offer(CONTENT), tmp_path, silent).exists()
+    assert (site.requested_ranges, list(tmp_path.glob("*.part"))) == ([], [])
 
 
-def test_a_server_that_nobody_vouches_for_hints_at_the_clock(site: Site, tmp_path: Path) -> None:
-    """The commonest cause on a device without a clock of its own: its certificate seems to be of another time."""
+def test_untrusted_certificate_has_a_remedy_about_the_clock(site: Site, tmp_path: Path) -> None:
+    """The usual cause on a device without a battery-backed clock: the certificate seems expired."""
     with pytest.raises(UpdateUnreachable) as caught:
-        Web(site.at, None, VirtualClock()).small("channel.cms")
+        UpdateServer(site.url, None, VirtualClock()).read_small_file("channel.cms")
     assert "date and time" in caught.value.remedy
 
 
-def test_a_file_that_is_not_there_is_said_with_its_address(site: Site, keys: Path) -> None:
+def test_missing_file_is_an_error_with_its_url(site: Site, keys: Path) -> None:
     with pytest.raises(UpdateUnreachable, match=r"channel\.cms: 404"):
-        Web(site.at, keys / "web.crt", VirtualClock()).small("channel.cms")
+        UpdateServer(site.url, keys / "web.crt", VirtualClock()).read_small_file("channel.cms")
 
 
-def test_a_channel_is_believed_if_our_signer_signed_it(keys: Path, tmp_path: Path) -> None:
-    said = offer(CONTENT).model_dump() | {"of a later release": 1}
-    channel = signed(keys, json.dumps(said).encode())
-    assert opened(channel, keys / "ca.crt") == offer(CONTENT)
+def test_channel_is_accepted_with_a_valid_signature_only(keys: Path, tmp_path: Path) -> None:
+    fields = offer(CONTENT).model_dump() | {"of a later release": 1}
+    channel = signed(keys, json.dumps(fields).encode())
+    assert verify_channel(channel, keys / "ca.crt") == offer(CONTENT)
     stranger = tmp_path / "stranger"
     subprocess.run([ROOT / "systemd" / "image" / "keys", stranger], check=True)
-    with pytest.raises(UpdateForeign):
-        opened(channel, stranger / "ca.crt")
+    with pytest.raises(UpdateUntrusted):
+        verify_channel(channel, stranger / "ca.crt")
     changed = channel.replace(b'"version": "2.0"', b'"version": "9.0"')
     assert changed != channel
     with pytest.raises(UpdateDamaged):
-        opened(changed, keys / "ca.crt")
+        verify_channel(changed, keys / "ca.crt")
     with pytest.raises(UpdateDamaged):
-        opened(b"<html>log in to this network</html>", keys / "ca.crt")
+        verify_channel(b"<html>log in to this network</html>", keys / "ca.crt")
     with pytest.raises(UpdateDamaged, match="nothing that can be used"):
-        opened(signed(keys, b'{"version": "2.0"}'), keys / "ca.crt")
+        verify_channel(signed(keys, b'{"version": "2.0"}'), keys / "ca.crt")
     with pytest.raises(UpdateDamaged):
-        opened(signed(keys, json.dumps(said | {"bundle": "../../etc/x.raucb"}).encode()), keys / "ca.crt")
+        verify_channel(signed(keys, json.dumps(fields | {"bundle": "../../etc/x.raucb"}).encode()), keys / "ca.crt")
 
 
-def test_versions_are_numbers_and_not_words(tmp_path: Path) -> None:
-    assert number("2.0") == number("2") < number("2.0.1") < number("2.10") < number("10")
+def test_versions_compare_as_numbers(tmp_path: Path) -> None:
+    assert (
+        parse_version("2.0")
+        == parse_version("2")
+        < parse_version("2.0.1")
+        < parse_version("2.10")
+        < parse_version("10")
+    )
     for word in ("", "2.0-rc1", "two", "1.2.3.4.5"):
         with pytest.raises(UpdateDamaged):
-            number(word)
+            parse_version(word)
     release = Release("here", "2.9", "1.0", "")
-    refuse_wrong(release, "here", "2.8.9", tmp_path)
+    refuse_unsuitable(release, "here", "2.8.9", tmp_path)
     with pytest.raises(UpdateOlder):
-        refuse_wrong(release, "here", "2.10", tmp_path)
+        refuse_unsuitable(release, "here", "2.10", tmp_path)
 
 
-def test_a_root_never_meets_the_kernel_of_another(tmp_path: Path) -> None:
-    """A device whose kernel has modules takes no version without its kernel; one without modules takes both."""
+def test_release_without_kernel_is_refused_where_the_kernel_has_modules(tmp_path: Path) -> None:
+    """Where the running kernel has modules, a release needs its own kernel; elsewhere both kinds are accepted."""
     with_kernel, without = (Release("here", "2.9", "1.0", "", has_kernel=one) for one in (True, False))
     for release in (with_kernel, without):
-        refuse_wrong(release, "here", "2.8", tmp_path)
+        refuse_unsuitable(release, "here", "2.8", tmp_path)
     (tmp_path / os.uname().release).mkdir()
-    refuse_wrong(with_kernel, "here", "2.8", tmp_path)
+    refuse_unsuitable(with_kernel, "here", "2.8", tmp_path)
     with pytest.raises(UpdateWrongDevice, match="has no kernel") as caught:
-        refuse_wrong(without, "here", "2.8", tmp_path)
+        refuse_unsuitable(without, "here", "2.8", tmp_path)
     assert "it brings its kernel" in caught.value.remedy
 
 
-def test_settings_refuse_what_they_do_not_know(tmp_path: Path) -> None:
-    shipped = load(ROOT / "systemd" / "image" / "update.toml")
+def test_settings_refuse_unknown_keys_and_invalid_values(tmp_path: Path) -> None:
+    shipped = load_settings(ROOT / "systemd" / "image" / "update.toml")
     assert shipped == UpdateSettings()
     for text in ("chanel = 'x'", "channel = 'http://insecure.example'", "lowest_battery = 2", "= nonsense"):
         (tmp_path / "update.toml").write_text(text)
         with pytest.raises(ValueError, match=r"update\.toml"):
-            load(tmp_path / "update.toml")
+            load_settings(tmp_path / "update.toml")
 
 
-def test_what_judges_a_version_loads_none_of_what_it_judges() -> None:
+def test_update_command_imports_no_numerics_driver_or_server() -> None:
     assert not {"numba", "scipy", "pyfftw", "fastapi", "device.head", "device.recon"} & loaded_by(
         "services.update.command"
     )
 
 
-def test_the_command_line_loads_neither_database_nor_web_server() -> None:
+def test_command_line_imports_neither_database_nor_web_server() -> None:
     assert not {"sqlalchemy", "alembic", "fastapi", "uvicorn", "picamera2"} & loaded_by("services.cli")
 
 
 def loaded_by(module: str) -> set[str]:
-    """Every module that is loaded once `module` is imported in a new process."""
+    """Return every module that is loaded once `module` is imported in a new process."""
     asks = f"import sys, {module}; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", asks], cwd=ROOT, check=True, capture_output=True, text=True)
     return set(found.stdout.split())
 
 
-def test_a_journal_that_cannot_be_written_is_said_and_hides_no_refusal(
+def test_unwritable_journal_is_logged_and_does_not_hide_a_refusal(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A limit on the length of files is what a full disk is: the old entry stays."""
-    journal = Journal(tmp_path)
+    """A limit on the file size stands for a full disk; the old entry stays."""
+    journal = StateFile(tmp_path)
     journal.write(state="installed", version="2.0")
     usual = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, usual[1]))
     try:
         with pytest.raises(UpdateNoRoom):
             journal.write(state="trying")
-        with pytest.raises(UpdateNowhere), journal.refusals():
-            raise UpdateNowhere("no stick")
+        with pytest.raises(UpdateNotFound), journal.record_refusals():
+            raise UpdateNotFound("no stick")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, usual)
     assert "cannot be written" in caplog.text
     assert journal.read().state == "installed"
     with pytest.raises(UpdateFailed):
-        Journal(tmp_path / "gone").write(state="trying")
+        StateFile(tmp_path / "gone").write(state="trying")
 
 
-def test_sticks_are_looked_at_one_folder_deep(tmp_path: Path) -> None:
-    with pytest.raises(UpdateNowhere):
-        on_stick(tmp_path)
+def test_usb_drives_are_searched_one_folder_deep(tmp_path: Path) -> None:
+    with pytest.raises(UpdateNotFound):
+        find_bundle(tmp_path)
     (tmp_path / "stick").mkdir()
     (tmp_path / "stick" / "two.raucb").write_bytes(b"")
-    assert on_stick(tmp_path) == on_stick(tmp_path / "stick") == tmp_path / "stick" / "two.raucb"
+    assert find_bundle(tmp_path) == find_bundle(tmp_path / "stick") == tmp_path / "stick" / "two.raucb"

@@ -1,4 +1,4 @@
-"""The values that travel: checked at birth, frozen, and read-only."""
+"""Value types: validated on construction, frozen, and read-only."""
 
 import dataclasses
 from datetime import UTC, datetime
@@ -12,69 +12,69 @@ from hypothesis import strategies as st
 from device.errors import FrameError, PsfError, SettingError
 from device.values import (
     Calibration,
-    Capture,
     Colour,
+    ExposureSettings,
     Frame,
     Geometry,
-    Glow,
+    Illumination,
     Psf,
     Reconstruction,
     Report,
     Sensor,
-    Shot,
     check_image_shape,
 )  # fmt: skip
+from services.records.capture import Capture
 
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
-DESIGNED = [  # DESIGN.md, "Fixed interfaces"
+DESIGNED = [  # public interface: keys of report.json
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
     "noise_dn", "residual", "quality", "warnings",
 ]  # fmt: skip
 
 
 def frame(counts: Any = COUNTS) -> Frame:
-    return Frame(counts, 0.1, 1, Glow("green"), simulated=True)
+    return Frame(counts, 0.1, 1, Illumination("green"), simulated=True)
 
 
 def psf(shape: tuple[int, ...] = (5, 6)) -> Any:
     return np.random.default_rng(0).random(shape).astype(np.float32)
 
 
-def test_the_fields_of_a_report_are_the_keys_that_were_fixed() -> None:
+def test_report_fields_are_the_public_keys() -> None:
     assert [field.name for field in dataclasses.fields(Report)] == DESIGNED
 
 
 @pytest.mark.parametrize("level", [0.0, -0.1, 1.01, float("nan"), float("inf")])
-def test_a_lamp_has_no_such_level(level: float) -> None:
+def test_invalid_lamp_level_is_refused(level: float) -> None:
     with pytest.raises(SettingError, match="lamp level"):
-        Glow("green", level)
+        Illumination("green", level)
 
 
 @pytest.mark.parametrize("exposure_s", [0.0, -1, 10.1, float("nan"), float("inf")])
-def test_there_is_no_such_exposure(exposure_s: float) -> None:
+def test_invalid_exposure_is_refused(exposure_s: float) -> None:
     with pytest.raises(SettingError, match="exposure"):
-        Shot(exposure_s)
+        ExposureSettings(exposure_s)
 
 
-def test_a_frame_cannot_be_changed_but_its_lender_may_use_the_buffer_again() -> None:
-    lent = COUNTS.copy()
-    taken = frame(lent)
+def test_frame_is_read_only_and_its_buffer_is_reusable() -> None:
+    buffer = COUNTS.copy()
+    taken = frame(buffer)
     with pytest.raises(ValueError, match="read-only"):
         taken.counts[0, 0] = 1
     with pytest.raises(dataclasses.FrozenInstanceError):
         taken.simulated = False  # type: ignore[misc]
-    lent[0, 0] = 99
+    buffer[0, 0] = 99
     assert taken.counts[0, 0] == 99
 
 
 @pytest.mark.parametrize("counts", [COUNTS.astype(np.float32), COUNTS.astype(np.int16), COUNTS.astype(np.uint8)])
-def test_a_frame_holds_counts_and_nothing_else(counts: Any) -> None:
+def test_frame_requires_uint16(counts: Any) -> None:
     with pytest.raises(FrameError, match="uint16"):
         frame(counts)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (0, 3), (3, 0), (3, 4, 1), (3, 4, 2), (3, 4, 4), (1, 3, 4, 3), (0, 0, 3)])
-def test_an_image_has_no_such_shape(shape: tuple[int, ...]) -> None:
+def test_invalid_image_shape_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(FrameError, match="rows and columns"):
         check_image_shape(shape)
     with pytest.raises(FrameError):
@@ -84,11 +84,11 @@ def test_an_image_has_no_such_shape(shape: tuple[int, ...]) -> None:
 
 
 @given(st.integers(1, 50), st.integers(1, 50), st.booleans())
-def test_every_other_shape_is_an_image(rows: int, cols: int, colour: bool) -> None:
+def test_valid_image_shapes_are_accepted(rows: int, cols: int, colour: bool) -> None:
     check_image_shape((rows, cols, 3) if colour else (rows, cols))
 
 
-def test_a_psf_sums_to_one_whatever_it_was_measured_in() -> None:
+def test_psf_is_normalised_to_sum_one() -> None:
     for scale in (1e-3, 1, 4095):
         made = Psf(psf() * np.float32(scale))
         assert made.pixels.sum(dtype=np.float64) == pytest.approx(1, rel=1e-4)
@@ -100,7 +100,7 @@ BAD = {"nan": np.nan, "infinite": np.inf}
 
 
 @pytest.mark.parametrize("value", BAD.values(), ids=BAD)
-def test_a_psf_with_what_is_no_number_is_refused(value: float) -> None:
+def test_psf_with_nan_or_infinity_is_refused(value: float) -> None:
     pixels = psf()
     pixels[2, 3] = value
     with pytest.raises(PsfError, match="holds 1 values that are not numbers"):
@@ -108,7 +108,7 @@ def test_a_psf_with_what_is_no_number_is_refused(value: float) -> None:
 
 
 @pytest.mark.parametrize("pixels", [np.zeros((4, 4)), -np.ones((4, 4)), np.array([[1.0, -3.0]])])
-def test_a_psf_that_brings_no_light_is_refused(pixels: Any) -> None:
+def test_psf_without_positive_sum_is_refused(pixels: Any) -> None:
     with pytest.raises(PsfError, match="positive sum"):
         Psf(pixels)
 
@@ -137,28 +137,28 @@ CHANGES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("what", CHANGES)
-def test_the_name_of_a_calibration_changes_with_whatever_was_measured(what: str) -> None:
+def test_calibration_id_changes_with_each_measured_value(what: str) -> None:
     before = Calibration((Psf(psf()),), Sensor())
     assert before.id == Calibration((Psf(psf()),), Sensor()).id
     assert len(before.id) == 16
     assert dataclasses.replace(before, **{what: CHANGES[what]}).id != before.id
 
 
-def test_a_calibration_is_seen_in_one_colour_by_what_was_measured_in_it() -> None:
+def test_calibration_for_one_colour_selects_its_psfs() -> None:
     every, near, far, red = (Psf(psf(), name, colour) for name, colour in COLOURED)
-    seen = {c: [p.name for p in Calibration((every, near, far, red), Sensor()).seen_in(c).psfs] for c in COLOURS}
+    seen = {c: [p.name for p in Calibration((every, near, far, red), Sensor()).for_colour(c).psfs] for c in COLOURS}
     assert seen == {"red": ["red"], "green": ["near", "far"], "blue": ["every"]}
-    assert Calibration((near, red), Sensor()).seen_in("blue").psfs == (near,)
+    assert Calibration((near, red), Sensor()).for_colour("blue").psfs == (near,)
     depths = Calibration((every, every), Sensor())
-    assert depths.seen_in("green").psfs is not None
-    assert depths.seen_in("green").id == depths.id
+    assert depths.for_colour("green").psfs is not None
+    assert depths.for_colour("green").id == depths.id
 
 
-def test_whose_colour_a_psf_is_belongs_to_the_name() -> None:
+def test_calibration_id_depends_on_the_psfs_colour() -> None:
     assert Calibration((Psf(psf()),), Sensor()).id != Calibration((Psf(psf(), colour="red"),), Sensor()).id
 
 
-def test_a_dark_frame_is_not_a_flat_frame_to_the_name() -> None:
+def test_calibration_id_distinguishes_dark_and_flat() -> None:
     dark = Calibration((Psf(psf()),), Sensor(), dark_dn=psf())
     flat = Calibration((Psf(psf()),), Sensor(), flat=psf())
     assert dark.id != flat.id
@@ -170,14 +170,14 @@ def test_the_papers_numbers() -> None:
     assert geometry.scale_per_dpt == pytest.approx(0.003375)
 
 
-def test_what_was_measured_of_a_dioptre_comes_before_the_drawings() -> None:
+def test_measured_scale_per_dioptre_overrides_the_nominal() -> None:
     geometry = Geometry(5.04, 6000, 0.75, measured_scale_per_dpt=0.0035)
     assert geometry.scale_per_dpt == 0.0035
     assert geometry.nominal_scale_per_dpt == pytest.approx(0.003375)
     assert Geometry(5.04, 6000, 0.75).scale_per_dpt == geometry.nominal_scale_per_dpt
 
 
-def test_the_names_of_captures_sort_by_time_and_say_the_eye() -> None:
-    names = [Capture.named(datetime(2026, 1, day, 9, 5, tzinfo=UTC), "OS", "ff") for day in (2, 10, 21)]
+def test_capture_ids_sort_by_time_and_name_the_eye() -> None:
+    names = [Capture.new_id(datetime(2026, 1, day, 9, 5, tzinfo=UTC), "OS", "ff") for day in (2, 10, 21)]
     assert names == sorted(names)
     assert names[0] == "20260102T090500-OS-ff"

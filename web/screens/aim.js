@@ -1,52 +1,52 @@
-// Aim: four tiles that drive the exam, and one big button that says in itself why it cannot be pressed.
+// Aim screen: slot tiles, and the shutter button, which shows why it is disabled.
 
-import { icon } from "../icons.js";
-import { allowsLight } from "../memory.js";
-import { chips, reasons, slotWords, tiles } from "../parts.js";
-import { shownStates, timeLeft } from "../states.js";
+import { icon } from "../components/icons.js";
+import { allowsLight } from "../core/state.js";
+import { chips, reasons, slotLabel, tiles } from "../components/components.js";
+import { visibleAlerts, timeLeft } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { has, t } from "../words.js";
+import { has, t } from "../i18n/translate.js";
 
-export function aim(state, act) {
-  const { eye, part } = slotWords(state, state.route.slot);
-  if (state.asking) return html`<h2 class="slot-title">${eye} · ${part}</h2> ${reasons(state, act)} ${tiles(state, act)}`;
+export function aim(state, actions) {
+  const { eye, part } = slotLabel(state, state.route.slot);
+  if (state.asking) return html`<h2 class="slot-title">${eye} · ${part}</h2> ${reasons(state, actions)} ${tiles(state, actions)}`;
   const answered = Object.values(state.visit?.slots ?? {}).every((slot) => slot.state !== "empty");
   const here = state.visit?.slots[state.route.slot];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
-    ${tiles(state, act)} ${state.later.aloud?.toSay(state) ?? nothing} ${chips(state, act)}
-    <div class="actions">${shutter(state, act)}</div>
+    ${tiles(state, actions)} ${state.modules.speech?.speechButtons(state) ?? nothing} ${chips(state, actions)}
+    <div class="actions">${shutter(state, actions)}</div>
     <div class="last finish">
       ${here?.capture
-        ? html`<button class="quiet" type="button" id="keep-old" @click=${act.keepOld}>${icon("check")} ${t("aim.keep")}</button>`
+        ? html`<button class="quiet" type="button" id="keep-old" @click=${actions.keepPrevious}>${icon("check")} ${t("aim.keep")}</button>`
         : nothing}
       ${here?.state === "could_not"
         ? nothing
-        : html`<button class="quiet" type="button" id="could-not" @click=${act.ask}>${icon("cross")} ${t("result.couldnot")}</button>`}
-      <button class=${answered ? "primary" : "quiet"} type="button" id="finish" @click=${act.finish}>
+        : html`<button class="quiet" type="button" id="could-not" @click=${actions.ask}>${icon("cross")} ${t("result.couldnot")}</button>`}
+      <button class=${answered ? "primary" : "quiet"} type="button" id="finish" @click=${actions.finish}>
         ${t(answered ? "result.finish" : "finish.now")}
       </button>
     </div>
   `;
 }
 
-function shutter(state, act) {
-  const { eye, part } = slotWords(state, state.route.slot);
-  const [name, word] = face(state);
+function shutter(state, actions) {
+  const { eye, part } = slotLabel(state, state.route.slot);
+  const [name, text] = shutterFace(state);
   return html`
-    <button class="primary shutter" type="button" id="shutter" aria-disabled=${name !== "camera"} @click=${act.take}>
-      ${icon(name)} <span>${word}<small>${eye} · ${part}</small></span>
+    <button class="primary shutter" type="button" id="shutter" aria-disabled=${name !== "camera"} @click=${actions.take}>
+      ${icon(name)} <span>${text}<small>${eye} · ${part}</small></span>
     </button>
   `;
 }
 
-function face(state) {
-  const { stop } = shownStates(state);
+function shutterFace(state) {
+  const { stop } = visibleAlerts(state);
   if (stop) {
     const key = `stop.${stop.code}`;
     const left = timeLeft(stop.until);
     return [stop.code === "link.lost" ? "nolink" : "warn", t(has(key) ? key : "stop.other") + (left ? ` – ${left}` : "")];
   }
-  if (state.doing === "busy") return ["wait", t("take.making")]; // two are in the making: a third would be refused
+  if (state.activity === "busy") return ["wait", t("take.making")]; // two captures are in progress; the server would refuse a third
   return allowsLight(state) ? ["camera", t("take")] : ["wait", t("take.making")];
 }

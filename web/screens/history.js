@@ -1,25 +1,27 @@
-// History: the people of a day, the pictures of a person, and two pictures compared with the same zoom. Loaded when first opened.
+// History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
+// on demand.
 
-import { zipOf } from "../api.js";
-import { people } from "./home.js";
-import { ending, openAgain } from "./outcome.js";
-import { icon } from "../icons.js";
-import { choice, numberWords, slotWords, thumb } from "../parts.js";
+import { visitZipUrl } from "../core/api.js";
+import { patientList } from "./home.js";
+import { outcomeTexts, reopenButton } from "./outcome.js";
+import { icon } from "../components/icons.js";
+import { choice, slotLabel, thumb } from "../components/components.js";
+import { displayNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { calendarDay, clockTime, dayName, t, today } from "../words.js";
+import { calendarDay, clockTime, isoDay, t, today } from "../i18n/translate.js";
 
-const KEEP = {
+const FILTERS = {
   all: () => true,
   open: ({ finished_at: end }) => !end,
   referred: ({ outcome }) => Boolean(outcome?.code.startsWith("refer")),
 };
 
-export function history(state, act) {
-  const { visits, onlyShow, route, status } = state;
-  const filters = status?.sending ? [...Object.keys(KEEP), "waiting"] : Object.keys(KEEP);
+export function history(state, actions) {
+  const { visits, listFilter, route, status } = state;
+  const filters = status?.sending ? [...Object.keys(FILTERS), "waiting"] : Object.keys(FILTERS);
   const day = route.day ?? today();
-  const listed = (visits ?? []).filter(KEEP[onlyShow]);
-  const step = (days) => () => act.go({ screen: "history", day: shifted(day, days) });
+  const listed = (visits ?? []).filter(FILTERS[listFilter]);
+  const step = (days) => () => actions.go({ screen: "history", day: shiftDay(day, days) });
   return html`
     <section class="history">
       <h2>${t("history.title")}</h2>
@@ -32,94 +34,94 @@ export function history(state, act) {
       </div>
       ${choice({
         label: t("history.title"),
-        value: onlyShow,
+        value: listFilter,
         options: filters.map((name) => [name, t(`show.${name}`)]),
-        choose: (name) => (name === "waiting" ? act.go({ screen: "send" }) : act.only(name)), // of all days
+        choose: (name) => (name === "waiting" ? actions.go({ screen: "send" }) : actions.setListFilter(name)), // the queue holds all days
       })}
-      ${listed.length ? people(listed, act.openFilm) : html`<p class="muted">${t("history.none")}</p>`}
+      ${listed.length ? patientList(listed, actions.openFilm) : html`<p class="muted">${t("history.none")}</p>`}
     </section>
   `;
 }
 
-const shifted = (day, days) => {
+const shiftDay = (day, days) => {
   const date = new Date(`${day}T12:00`);
   date.setDate(date.getDate() + days);
-  return dayName(date);
+  return isoDay(date);
 };
 
-// ---- one person's pictures
+// ---- pictures of one patient
 
-export function film(state, act) {
+export function film(state, actions) {
   const { visit, picked } = state;
   if (!visit) return nothing;
   const taken = Object.entries(visit.slots).flatMap(([slot, { captures }]) => captures.map((id) => ({ slot, id })));
   return html`
     <section class="film">
-      <h2>${t("film.title", { number: numberWords(visit.number) })}</h2>
-      ${visit.outcome ? html`<p>${ending(state).filter(Boolean).join(" · ")}</p>` : nothing}
-      ${taken.length ? html`<ul>${taken.map((one) => frame(state, act, one))}</ul>` : html`<p>${t("film.none")}</p>`}
+      <h2>${t("film.title", { number: displayNumber(visit.number) })}</h2>
+      ${visit.outcome ? html`<p>${outcomeTexts(state).filter(Boolean).join(" · ")}</p>` : nothing}
+      ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("film.none")}</p>`}
       <div class="ends">
         ${picked.length === 2
-          ? html`<button class="primary" type="button" id="compare" @click=${act.compare}>${t("film.compare")}</button>`
+          ? html`<button class="primary" type="button" id="compare" @click=${actions.compare}>${t("film.compare")}</button>`
           : taken.length > 1
             ? html`<p class="muted">${t("film.pick", { n: 2 - picked.length })}</p>`
             : nothing}
         ${visit.finished_at
-          ? openAgain(visit, act)
-          : html`<button type="button" @click=${() => act.resume(visit)}>
-              ${t("home.continue", { number: numberWords(visit.number) })}
+          ? reopenButton(visit, actions)
+          : html`<button type="button" @click=${() => actions.resume(visit)}>
+              ${t("home.continue", { number: displayNumber(visit.number) })}
             </button>`}
       </div>
-      ${taken.length ? away(state, act) : nothing}
+      ${taken.length ? exportControls(state, actions) : nothing}
     </section>
   `;
 }
 
-/** Which eye and place, and which of several tries. */
-function nameOf(state, id) {
+/** Return eye, field and, of several, the number of a capture. */
+function captureLabel(state, id) {
   const [slot, { captures }] = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id)) ?? [];
   if (!slot) return "";
-  return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotWords(state, slot), n: captures.indexOf(id) + 1 });
+  return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotLabel(state, slot), n: captures.indexOf(id) + 1 });
 }
 
-/** Of several tries: whether this is the one that counts. */
+/** Return whether this capture, of several, is the one in use. */
 const isUsed = ({ visit }, id) =>
   Object.values(visit?.slots ?? {}).some(({ capture, captures }) => capture === id && captures.length > 1);
-const used = (state, id) =>
+const usedMark = (state, id) =>
   isUsed(state, id) ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing;
 
-function frame(state, act, { slot, id }) {
+function captureItem(state, actions, { slot, id }) {
   const on = state.picked.includes(id);
   return html`<li>
-    <button type="button" class="open" data-id=${id} @click=${() => act.openPicture(slot, id)}>
-      <span class="thumb">${thumb(id, act)}</span> <span>${nameOf(state, id)}</span>
-      ${used(state, id)}
+    <button type="button" class="open" data-id=${id} @click=${() => actions.openPicture(slot, id)}>
+      <span class="thumb">${thumb(id, actions)}</span> <span>${captureLabel(state, id)}</span>
+      ${usedMark(state, id)}
     </button>
-    <button type="button" class="pick" aria-pressed=${on} @click=${() => act.pick(id)}>
+    <button type="button" class="pick" aria-pressed=${on} @click=${() => actions.pick(id)}>
       ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
     </button>
   </li>`;
 }
 
-function away({ visit, folders, copied, zipped }, act) {
-  const said = copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : "";
+function exportControls({ visit, folders, copied, zipped }, actions) {
+  const message = copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : "";
   return html`
     <div class="ends">
-      <a class="button" href=${zipOf(visit.id)} download @click=${act.zipped}>${t("film.zip")}</a>
-      <button type="button" id="copy" @click=${act.listFolders}>${t("film.copy")}</button>
+      <a class="button" href=${visitZipUrl(visit.id)} download @click=${actions.zipped}>${t("film.zip")}</a>
+      <button type="button" id="copy" @click=${actions.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
-        (stick) => html`<button type="button" data-folder=${stick.id} @click=${() => act.copyTo(stick)}>
+        (stick) => html`<button type="button" data-folder=${stick.id} @click=${() => actions.copyTo(stick)}>
           ${stick.name}
         </button>`,
       )}
     </div>
-    <p role="note">${zipped ? t("film.zipped") : said}</p>
+    <p role="note">${zipped ? t("film.zipped") : message}</p>
   `;
 }
 
-// ---- two pictures: side by side, or one over the other
+// ---- comparison: side by side, or one over the other
 
-export function compare(state, act) {
+export function compare(state, actions) {
   const { blink, redfree, loupe, route, front = 0 } = state;
   return html`
     <section class="compare" ?data-blink=${blink}>
@@ -131,36 +133,36 @@ export function compare(state, act) {
             [false, t("compare.side")],
             [true, t("compare.blink")],
           ],
-          choose: act.setBlink,
+          choose: actions.setBlink,
         })}
-        <button type="button" aria-pressed=${redfree} @click=${() => act.setRedfree(!redfree)}>${t("tool.redfree")}</button>
-        <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => act.setLoupe(!loupe)}>${t("tool.loupe")}</button>
+        <button type="button" aria-pressed=${redfree} @click=${() => actions.setRedfree(!redfree)}>${t("tool.redfree")}</button>
+        <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => actions.setLoupe(!loupe)}>${t("tool.loupe")}</button>
         ${blink
-          ? html`<button class="primary" type="button" id="swap" @click=${act.swap}>
-              ${t("compare.swap", { name: nameOf(state, front ? route.capture : route.other) })}
+          ? html`<button class="primary" type="button" id="swap" @click=${actions.swap}>
+              ${t("compare.swap", { name: captureLabel(state, front ? route.capture : route.other) })}
             </button>`
           : nothing}
       </div>
-      <div class="two">${[0, 1].map((i) => side(state, act, i))}</div>
+      <div class="two">${[0, 1].map((i) => comparedPicture(state, actions, i))}</div>
     </section>
   `;
 }
 
-function side(state, act, i) {
+function comparedPicture(state, actions, i) {
   const { route, status, blink, front = 0, redfree, loupe } = state;
   const id = [route.capture, route.other][i];
   const taken = state.compared.find((one) => one.id === id);
   return html`<figure class=${blink && i !== front ? "behind" : ""}>
-    <figcaption><b>${nameOf(state, id)}</b> ${taken ? clockTime(taken.taken_at) : nothing} ${used(state, id)}</figcaption>
+    <figcaption><b>${captureLabel(state, id)}</b> ${taken ? clockTime(taken.taken_at) : nothing} ${usedMark(state, id)}</figcaption>
     <eye-pic
-      aria-label=${nameOf(state, id)}
+      aria-label=${captureLabel(state, id)}
       .head=${status}
       .subject=${id}
       .redfree=${redfree}
       .loupe=${loupe}
-      .src=${act.finalOf(id)}
-      @looked=${act.linkZoom}
-      @loupe=${act.heardLoupe}
+      .src=${actions.finalSource(id)}
+      @looked=${actions.linkZoom}
+      @loupe=${actions.loupeChanged}
     ></eye-pic>
   </figure>`;
 }

@@ -1,31 +1,33 @@
-// Home: one big button, what is unfinished, how the day went, the language. Find: a number pad and today's people.
+// Home screen: new patient, unfinished visit, counts of the day, language. Find screen: number pad and today's
+// patients.
 
-import { icon } from "../icons.js";
-import { choice, numberWords, pad, personWords } from "../parts.js";
+import { icon } from "../components/icons.js";
+import { choice, numberPad, patientLabel } from "../components/components.js";
+import { displayNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { clockTime, LANGUAGES, t } from "../words.js";
+import { clockTime, LANGUAGES, t } from "../i18n/translate.js";
 
-export function home(state, act) {
+export function home(state, actions) {
   const { visits, counts, status } = state;
-  const left = (visits ?? []).find((visit) => !visit.finished_at);
+  const unfinished = (visits ?? []).find((visit) => !visit.finished_at);
   return html`
     <section class="home">
-      <button class="primary big" type="button" id="new" @click=${() => act.begin()}>${icon("person")} ${t("home.new")}</button>
-      ${left
-        ? html`<button class="big" type="button" id="continue" @click=${() => act.resume(left)}>
-            ${icon("next")} <span>${t("home.continue", { number: numberWords(left.number) })}</span>
+      <button class="primary big" type="button" id="new" @click=${() => actions.begin()}>${icon("person")} ${t("home.new")}</button>
+      ${unfinished
+        ? html`<button class="big" type="button" id="continue" @click=${() => actions.resume(unfinished)}>
+            ${icon("next")} <span>${t("home.continue", { number: displayNumber(unfinished.number) })}</span>
           </button>`
         : nothing}
       <div class="pair">
-        <button type="button" id="find" @click=${() => act.go({ screen: "find" })}>${t("home.find")}</button>
-        <button type="button" id="history" @click=${() => act.go({ screen: "history" })}>${t("home.history")}</button>
+        <button type="button" id="find" @click=${() => actions.go({ screen: "find" })}>${t("home.find")}</button>
+        <button type="button" id="history" @click=${() => actions.go({ screen: "history" })}>${t("home.history")}</button>
       </div>
-      ${counts ? day(counts) : nothing} ${status?.sending ? sending(status.sending, act) : nothing} ${languages(state, act)}
+      ${counts ? dayCounts(counts) : nothing} ${status?.sending ? sendingButton(status.sending, actions) : nothing} ${languages(state, actions)}
     </section>
   `;
 }
 
-function day({ done, to_finish: open, referred }) {
+function dayCounts({ done, to_finish: open, referred }) {
   return html`
     <p class="day">
       <b>${t("home.today")}</b> <span>${t("home.done", { n: done })}</span> <span>${t("home.open", { n: open })}</span>
@@ -34,61 +36,61 @@ function day({ done, to_finish: open, referred }) {
   `;
 }
 
-const sending = ({ sent, waiting }, act) =>
-  html`<button class="quiet" type="button" id="send" @click=${() => act.go({ screen: "send" })}>
+const sendingButton = ({ sent, waiting }, actions) =>
+  html`<button class="quiet" type="button" id="send" @click=${() => actions.go({ screen: "send" })}>
     ${icon(waiting ? "wait" : "check")} <span>${t("home.sent", { n: sent })} · ${t("home.waiting", { n: waiting })}</span>
   </button>`;
 
-function languages({ language }, act) {
+function languages({ language }, actions) {
   const draft = LANGUAGES[language]?.draft;
   const options = Object.entries(LANGUAGES).map(([tag, { name }]) => [tag, name]);
   return html`
     <section class="languages">
       <h2>${t("home.language")}</h2>
-      ${choice({ label: t("home.language"), value: language, options, choose: act.setLanguage })}
+      ${choice({ label: t("home.language"), value: language, options, choose: actions.setLanguage })}
       ${draft ? html`<p class="muted">${t("home.draft")}</p>` : nothing}
     </section>
   `;
 }
 
-export function find({ typed, visits }, act) {
-  const found = (visits ?? []).filter(({ number }) => number.includes(typed) || numberWords(number).includes(typed)).slice(0, 20);
+export function find({ typed, visits }, actions) {
+  const found = (visits ?? []).filter(({ number }) => number.includes(typed) || displayNumber(number).includes(typed)).slice(0, 20);
   const [one] = typed ? found : [];
   return html`
     <section class="find">
       <div>
         <h2>${t("find.title")}</h2>
         <p class="typed" aria-live="polite">${typed || "\u00a0"}</p>
-        ${pad(act.typeNumber)}
+        ${numberPad(actions.typeNumber)}
         ${one
-          ? html`<button class="primary" type="button" id="open-found" @click=${() => act.resume(one)}>
-              ${t("find.open.one", { number: numberWords(one.number) })}
+          ? html`<button class="primary" type="button" id="open-found" @click=${() => actions.resume(one)}>
+              ${t("find.open.one", { number: displayNumber(one.number) })}
             </button>`
           : html`<p class="no-match" aria-live="polite">${typed && visits ? t("find.nomatch", { number: typed }) : "\u00a0"}</p>`}
-        <button class=${one ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => act.begin(typed)}>
+        <button class=${one ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => actions.begin(typed)}>
           ${t("find.start", { number: typed })}
         </button>
         <p class="muted">${t("find.scan")}</p>
       </div>
       <div>
         <h2 ?hidden=${typed && !found.length}>${typed ? t("home.today.typed", { number: typed }) : t("home.today")}</h2>
-        ${found.length ? people(found, act.resume) : typed ? nothing : html`<p class="muted">${t("find.none")}</p>`}
+        ${found.length ? patientList(found, actions.resume) : typed ? nothing : html`<p class="muted">${t("find.none")}</p>`}
       </div>
     </section>
   `;
 }
 
-/** A referral needs care, pictures go on to somebody: a tick would say that it is done. */
-export const markOf = ({ code }) => (code.startsWith("refer") ? "warn" : "next");
+/** Icon of an outcome: a tick would suggest that nothing remains to be done. */
+export const outcomeIcon = ({ code }) => (code.startsWith("refer") ? "warn" : "next");
 
-export function people(visits, open) {
+export function patientList(visits, open) {
   return html`
     <ul class="people">
       ${visits.map((visit) => {
-        const [name, word] = visit.outcome ? [markOf(visit.outcome), `outcome.${visit.outcome.code}`] : ["wait", "find.open"];
+        const [name, word] = visit.outcome ? [outcomeIcon(visit.outcome), `outcome.${visit.outcome.code}`] : ["wait", "find.open"];
         return html`<li>
           <button type="button" data-visit=${visit.id} @click=${() => open(visit)}>
-            <span>${personWords(visit)}</span> <span class="muted">${clockTime(visit.begun_at)}</span>
+            <span>${patientLabel(visit)}</span> <span class="muted">${clockTime(visit.begun_at)}</span>
             <span class="end">${icon(name)} ${t(word)}</span>
           </button>
         </li>`;

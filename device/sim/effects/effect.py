@@ -1,19 +1,20 @@
-"""What an effect is: a name, a size that is told without rendering, and a change to a setup."""
+"""Interface of a simulated effect: a name, a size in closed form and a change to the optical setup."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-from device.sim.setup import Scene, Setup, Size
+from device.sim.optical_setup import OpticalSetup, Scene, Size
 
 
+@runtime_checkable
 class Effect(Protocol):
-    """One thing that light, eye or sensor do to a picture. A module with these names is one."""
+    """Physical effect of illumination, eye, optics or sensor on a frame."""
 
     @property
     def name(self) -> str:
-        """What it is called in plans and on the command line."""
+        """Name in plans and on the command line."""
 
     def size(self, scene: Scene) -> Size:
-        """How much it would change the picture of this scene: a closed form, nothing is rendered."""
+        """Return eta, the change of this scene's reconstruction over its noise, and the reason; nothing is rendered."""
 
-    def apply(self, setup: Setup) -> None:
-        """Change the setup; no change if the size is 0."""
+    def apply(self, setup: OpticalSetup) -> None:
+        """Add the effect to the setup, in place; an effect of size 0 does not change the rendered frame."""

@@ -21,7 +21,7 @@ CREATE TABLE captures (
 	taken_at TEXT NOT NULL, 
 	simulated INTEGER NOT NULL, 
 	calibration_id TEXT NOT NULL, 
-	report TEXT NOT NULL, 
+	report TEXT NOT NULL, visit TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.visit') WHEN 'text' THEN json_extract(report, '$.visit') END END) VIRTUAL, slot TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.slot') WHEN 'text' THEN json_extract(report, '$.slot') END END) VIRTUAL, verdict TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.verdict') WHEN 'object' THEN json_extract(report, '$.verdict') END END) VIRTUAL, laterality TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.laterality') WHEN 'object' THEN json_extract(report, '$.laterality') END END) VIRTUAL, 
 	PRIMARY KEY (id), 
 	CONSTRAINT eye_is_an_eye CHECK (eye IN ('OD', 'OS')), 
 	CONSTRAINT simulated_is_yes_or_no CHECK (simulated IN (0, 1)), 

@@ -1,4 +1,4 @@
-"""Killing a process that holds the lamp, and measuring how long the eye still has light."""
+"""Kill of a process that holds the lamp, and measurement of the time until the ring is off."""
 
 import signal
 import subprocess
@@ -6,68 +6,68 @@ import sys
 import time
 from dataclasses import dataclass
 
-from tests.ports.emulators.wires import Wires
+from tests.ports.emulators.wires import EmulatedBuses
 
 PATIENCE_S = 5.0
 STEP_S = 0.005
 
 
 @dataclass(frozen=True)
-class Death:
-    """How a victim died, whether the lamp was on at that moment, and how long it still was."""
+class KillResult:
+    """Result of a kill: signal or end, whether the lamp was on at that moment, and the time until it was off."""
 
     how: str
     was_lit: bool
     dark_after_s: float
 
 
-class Victim:
-    """A process that takes pictures with the emulated ring."""
+class LitProcess:
+    """Child process that takes pictures with the emulated ring."""
 
-    def __init__(self, wires: Wires, lease_s: float, end: str = "never") -> None:
+    def __init__(self, wires: EmulatedBuses, lease_s: float, end: str = "never") -> None:
         self._wires = wires
         command = [sys.executable, "-m", "tests.ports.emulators.victim", str(lease_s), end]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self._hear(b"ready")
+        self._expect_line(b"ready")
 
-    def _hear(self, word: bytes) -> None:
+    def _expect_line(self, word: bytes) -> None:
         assert self._process.stdout is not None
-        heard = self._process.stdout.readline().strip()
-        if heard != word:
-            raise RuntimeError(f"the victim said {heard!r} instead of {word!r}")
+        line = self._process.stdout.readline().strip()
+        if line != word:
+            raise RuntimeError(f"the victim printed {line!r} instead of {word!r}")
 
-    def die(self, how: signal.Signals, after_s: float) -> Death:
-        """Send a signal after a while, and wait for the dark."""
+    def kill(self, how: signal.Signals, after_s: float) -> KillResult:
+        """Send a signal after a delay, and wait until the ring is off."""
         time.sleep(after_s)
         self._process.send_signal(how)
         if how == signal.SIGKILL:
             self._process.wait()
-        return self._darkness(how.name)
+        return self._wait_until_dark(how.name)
 
-    def end(self, how: str) -> Death:
-        """Wait until it ends by itself with the lamp on, and then for the dark."""
-        self._hear(b"ending")
-        return self._darkness(how)
+    def await_end(self, how: str) -> KillResult:
+        """Wait until the process ends by itself with the lamp on, and then until the ring is off."""
+        self._expect_line(b"ending")
+        return self._wait_until_dark(how)
 
-    def _darkness(self, how: str) -> Death:
+    def _wait_until_dark(self, how: str) -> KillResult:
         died_s = time.monotonic()
-        was_lit = bool(self._before(died_s))
+        was_lit = bool(self._lit_before(died_s))
         while self._wires.lit:
             if time.monotonic() - died_s > PATIENCE_S:
-                return self._buried(Death(how, was_lit, float("inf")))
+                return self._reaped(KillResult(how, was_lit, float("inf")))
             time.sleep(STEP_S)
         dark_s = died_s
-        for one in reversed(self._wires.messages):  # the first of the dark messages at the end
+        for one in reversed(self._wires.messages):  # the first of the trailing off messages
             if one["lit"]:
                 break
             dark_s = one["at_s"]
-        return self._buried(Death(how, was_lit, max(0.0, dark_s - died_s) if was_lit else 0.0))
+        return self._reaped(KillResult(how, was_lit, max(0.0, dark_s - died_s) if was_lit else 0.0))
 
-    def _before(self, moment_s: float) -> dict:
+    def _lit_before(self, moment_s: float) -> dict:
         earlier = [one for one in self._wires.messages if one["at_s"] <= moment_s]
         return earlier[-1]["lit"] if earlier else {}
 
-    def _buried(self, death: Death) -> Death:
+    def _reaped(self, death: KillResult) -> KillResult:
         self._process.kill()
         self._process.wait()
         assert self._process.stdout is not None
@@ -76,13 +76,13 @@ class Victim:
 
 
 def guardians() -> int:
-    """How many guardians are still there."""
+    """Return the number of running guardian processes."""
     found = subprocess.run(["pgrep", "-c", "-f", "blank.py --device"], capture_output=True, text=True, check=False)
     return int(found.stdout or 0)
 
 
-def pause_until_alone() -> None:
-    """Give guardians of the dead the time to end."""
+def wait_for_guardians_to_end() -> None:
+    """Wait until the guardians of ended processes have ended."""
     until_s = time.monotonic() + PATIENCE_S
     while guardians() and time.monotonic() < until_s:
         time.sleep(STEP_S)

@@ -1,4 +1,4 @@
-"""Buffers for picamera2 where there is no dma-heap: anonymous files, through picamera2's own allocator seam."""
+"""Buffer allocator for picamera2 without a dma-heap: anonymous files, through picamera2's own allocator interface."""
 
 import os
 
@@ -6,11 +6,11 @@ import libcamera
 import picamera2.dma_heap
 from picamera2.allocators.allocator import Allocator
 
-picamera2.dma_heap.heapNames[:] = [os.devnull]  # picamera2 opens a heap once more when it closes, and uses it no more
+picamera2.dma_heap.heapNames[:] = [os.devnull]  # picamera2 opens a heap again when it closes, and does not use it
 
 
 class MemoryAllocator(Allocator):
-    """As picamera2's DmaAllocator, without a heap: buffers live as long as their configuration."""
+    """Equivalent of picamera2's DmaAllocator without a heap: buffers exist until the next configuration."""
 
     def __init__(self) -> None:
         super().__init__()

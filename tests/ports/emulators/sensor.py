@@ -1,4 +1,4 @@
-"""The sensor behind the emulated libcamera: it exposes a simulated world in real time, late and padded as real ones."""
+"""Emulated sensor behind the emulated libcamera: exposes a simulated world in real time, with latency and padding."""
 
 import mmap
 import time
@@ -8,19 +8,19 @@ from collections.abc import Callable
 import numpy as np
 
 from device.sim.world import World
-from device.values import Glow
+from device.values import Illumination
 
-DELAY = 2  # frames until a control that was asked for takes effect
+DELAY = 2  # frames until a requested control takes effect
 ROW_US = 14.8  # exposures are whole rows, rounded down
 SHARE_16 = 16
-Lamp = Callable[[float, float], list[tuple[Glow | None, float]]]
+Lamp = Callable[[float, float], list[tuple[Illumination | None, float]]]
 
 
 class Sensor:
-    """A monochrome sensor in a World whose own lamp stays off; `lamp` tells what shone between two moments, how long.
+    """Monochrome sensor in a World whose own lamp stays off; `lamp` returns the illumination between two moments.
 
     Faults are switched by `faults`: "stall" (no frame comes), "packed" (no unpacked format), "compressed" (a lossy
-    format is granted), "justified" (values on the other side of their words), "stale" (controls never land).
+    format is granted), "justified" (values on the other side of their words), "stale" (controls never take effect).
     """
 
     def __init__(self, world: World, lamp: Lamp, *, model: str = "imx296", bits: int = 12, wide: bool = False) -> None:
@@ -48,7 +48,7 @@ class Sensor:
         return {"R8", "R10", "R12", "R16", "R10_CSI2P", "R12_CSI2P", "MONO_PISP_COMP1"}
 
     def granted(self, asked: str) -> str:
-        """A Pi 5 rewrites every request: to words of 16 bits, or to its lossy compression."""
+        """Return the granted format: a Pi 5 replaces every request by 16-bit words or by its lossy compression."""
         unpacked = asked in self.formats and not asked.endswith("_CSI2P")
         if "compressed" in self.faults or (self.wide and not unpacked):
             return "MONO_PISP_COMP1"
@@ -57,7 +57,7 @@ class Sensor:
         return asked if asked in self.formats else self.formats[0]
 
     def stride(self, pixel_format: str) -> int:
-        """Bytes to a row, padded to 32."""
+        """Return the bytes of a row, padded to 32."""
         wide = self.world.shape[1] * (1 if "COMP" in pixel_format else 2)
         return -(-wide // 32) * 32 + 32
 
@@ -67,12 +67,12 @@ class Sensor:
         self.held = True
 
     def begin(self, first: dict[str, float]) -> None:
-        """Start: the first controls hold from the first frame."""
+        """Start: the first controls are in effect from the first frame."""
         self._now, self._coming = dict(first), deque([{}] * DELAY)
         self._free_s = time.monotonic()
 
     def expose(self, asked: dict[str, float], fd: int, stream) -> dict[str, object] | None:
-        """Fill a buffer with the next frame and say how it was taken; None: it never comes."""
+        """Fill a buffer with the next frame and return its metadata; None: the frame never arrives."""
         if "stall" in self.faults:
             return None
         self._coming.append({} if "stale" in self.faults else asked)
@@ -83,7 +83,7 @@ class Sensor:
         self._free_s = max(end_s, begin_s + self.shortest_frame_us * 1e-6)
         time.sleep(max(0.0, self._free_s - time.monotonic()))
         self.frames += 1
-        counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.seed, self.frames), None)
+        counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.scene.seed, self.frames), None)
         self._write(counts, fd, stream)
         return {
             "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": 1.0, "DigitalGain": 1.0,
@@ -106,5 +106,5 @@ class Sensor:
         with mmap.mmap(fd, stream.frame_size) as memory:
             words = np.frombuffer(memory, np.uint16).reshape(rows, stream.stride // 2)
             words[:, :cols] = counts
-            words[:, cols:] = 0xA5A5  # what is left of the last user: nobody may read it
+            words[:, cols:] = 0xA5A5  # padding, which must not be read
             del words

@@ -1,34 +1,36 @@
-"""What a lamp showed, and when: an emulated camera exposes whatever shone between two moments."""
+"""Record of a lamp's illumination over time, from which an emulated camera integrates its exposure."""
 
 import time
 
-from device.values import Glow
+from device.values import Illumination
 
 
 class Timeline:
-    """Stands where a SimLight expects its world; remembers every change (monotonic seconds)."""
+    """Replacement of a SimLight's world that records every change with its time (monotonic seconds)."""
 
     def __init__(self) -> None:
         self.faults: set[str] = set()
-        self._changes: list[tuple[float, Glow | None]] = [(0.0, None)]
+        self._changes: list[tuple[float, Illumination | None]] = [(0.0, None)]
 
     @property
-    def glow(self) -> Glow | None:
+    def illumination(self) -> Illumination | None:
         return self._changes[-1][1]
 
-    @glow.setter
-    def glow(self, glow: Glow | None) -> None:
+    @illumination.setter
+    def illumination(self, glow: Illumination | None) -> None:
         self._changes.append((time.monotonic(), glow))
 
-    def broken(self, part: str) -> bool:
+    def has_fault(self, part: str) -> bool:
         return part in self.faults
 
-    def __call__(self, begin_s: float, end_s: float) -> list[tuple[Glow | None, float]]:
+    def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
         return segments(self._changes, begin_s, end_s)
 
 
-def segments(changes: list[tuple[float, Glow | None]], begin_s: float, end_s: float) -> list[tuple[Glow | None, float]]:
-    """Which glow lasted how long between two moments."""
+def segments(
+    changes: list[tuple[float, Illumination | None]], begin_s: float, end_s: float
+) -> list[tuple[Illumination | None, float]]:
+    """Return each illumination between two moments with its duration, s."""
     ends = [at_s for at_s, _ in changes[1:]] + [float("inf")]
     spans = ((glow, min(end, end_s) - max(at_s, begin_s)) for (at_s, glow), end in zip(changes, ends, strict=True))
     return [(glow, span) for glow, span in spans if span > 0]

@@ -1,8 +1,8 @@
-"""A process that takes pictures with the real ring until it dies: `python -m tests.ports.emulators.victim LEASE_S END`.
+"""Process that takes pictures with the real ring until it ends: `python -m tests.ports.emulators.victim LEASE_S END`.
 
-Its phases are an exam's: aiming in red, a pause, the lit exposure, the dark one, the making. END is how it ends by
-itself inside a lit phase, if at all: "hang", "raise", "exit", "heir" (killed, while a child holds all its files), or
-"never".
+Its phases are those of an exam: aiming in red, a pause, the lit exposure, the dark exposure, the reconstruction. END is
+how it ends by itself inside a lit phase: "hang", "raise", "exit", "heir" (killed, while a child holds all its files),
+or "never".
 """
 
 import itertools
@@ -11,10 +11,10 @@ import signal
 import sys
 import time
 
+from device.config.head_file import ChainSpec
 from device.drivers.guardian import Guardian
 from device.drivers.ring import Apa102Ring
-from device.spec import ChainSpec
-from device.values import Glow
+from device.values import Illumination
 
 AIM_S, PAUSE_S, PICTURE_S, MAKE_S = 0.05, 0.02, 0.1, 0.03
 ENDS_AT_ROUND = 3
@@ -25,7 +25,10 @@ def main(lease_s: float, end: str) -> None:
     ring = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s)
     os.write(1, b"ready\n")
     for turn in itertools.count():
-        for glow, lit_s, dark_s in ((Glow("red", 0.4), AIM_S, PAUSE_S), (Glow("green"), PICTURE_S, PICTURE_S + MAKE_S)):
+        for glow, lit_s, dark_s in (
+            (Illumination("red", 0.4), AIM_S, PAUSE_S),
+            (Illumination("green"), PICTURE_S, PICTURE_S + MAKE_S),
+        ):
             with ring.on(glow):
                 time.sleep(lit_s)
                 if turn == ENDS_AT_ROUND and glow.colour == "green":
@@ -34,7 +37,7 @@ def main(lease_s: float, end: str) -> None:
 
 
 def finish(end: str) -> None:
-    """End as told, with the lamp on."""
+    """End in the given way, with the lamp on."""
     os.write(1, b"ending\n")
     if end == "hang":
         time.sleep(3600)

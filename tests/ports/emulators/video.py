@@ -1,4 +1,4 @@
-"""An emulated /dev/video0 that sees a simulated world: the calls that the V4L2 driver makes into the kernel."""
+"""Emulated /dev/video0 that exposes a simulated world: the system calls of the V4L2 driver."""
 
 import ctypes
 import errno
@@ -15,15 +15,15 @@ from device.sim.world import World
 PAGE = mmap.PAGESIZE
 
 
-def refuse(number: int) -> OSError:
+def os_error(number: int) -> OSError:
     return OSError(number, os.strerror(number))
 
 
 class EmulatedVideo:
-    """A `Transport` with one camera behind it. Its frames lie in an anonymous file, with garbage in the margin.
+    """A `Transport` with one camera; its frames are in an anonymous file, with random bytes in the row padding.
 
-    `grants` is the format that it insists on; faults: "camera.missing" and "camera.stalled" of the world, `silent`
-    (until it is opened again), `stamped` False (no monotonic time), `streams` False (it is no camera).
+    `grants` is the only format that it grants; faults: "camera.missing" and "camera.stalled" of the world, `silent`
+    (until it is reopened), `stamped` False (no monotonic timestamps), `streams` False (no streaming capability).
     """
 
     def __init__(self, world: World, grants: str = "Y12 ") -> None:
@@ -39,8 +39,8 @@ class EmulatedVideo:
         self.memory = -1
 
     def open(self, path: str) -> int:
-        if self.world.broken("camera.missing"):
-            raise refuse(errno.ENOENT)
+        if self.world.has_fault("camera.missing"):
+            raise os_error(errno.ENOENT)
         self.silent, self.queue = False, []
         self.memory = os.memfd_create("video")
         os.truncate(self.memory, 8 * self.length)
@@ -53,14 +53,14 @@ class EmulatedVideo:
         return mmap.mmap(fd, length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset)
 
     def wait(self, fd: int, limit_s: float) -> bool:
-        if self.silent or not self.queue or self.world.broken("camera.stalled"):
+        if self.silent or not self.queue or self.world.has_fault("camera.stalled"):
             time.sleep(limit_s)
             return False
         return True
 
     def ioctl(self, fd: int, request: int, argument: ctypes.Structure) -> None:
-        if self.world.broken("camera.missing"):
-            raise refuse(errno.ENODEV)
+        if self.world.has_fault("camera.missing"):
+            raise os_error(errno.ENODEV)
         match request, argument:
             case v4l2.QUERYCAP, v4l2.Capability():
                 argument.card = b"emulated"
@@ -79,18 +79,18 @@ class EmulatedVideo:
 
     def _control(self, request: int, control: v4l2.Control) -> None:
         if control.id not in self.controls:
-            raise refuse(errno.EINVAL)
+            raise os_error(errno.EINVAL)
         if request == v4l2.S_CTRL:
             self.controls[control.id] = control.value
         control.value = self.controls[control.id]
 
     def _frame(self, buffer: v4l2.Buffer) -> None:
-        """Expose now, in real time, and write the counts as the granted format has them."""
+        """Expose now, in real time, and write the counts in the granted format."""
         begin_s, exposure_s = time.perf_counter(), self.controls[v4l2.EXPOSURE_100US] * 1e-4
         electrons = self.world.electrons(exposure_s)
         time.sleep(exposure_s)
         self.frames += 1
-        counts = self.world.sensor.read(electrons, (self.world.seed, 9, self.frames))
+        counts = self.world.sensor.read(electrons, (self.world.scene.seed, 9, self.frames))
         raw = np.random.default_rng(self.frames).integers(0, 256, (self.rows, self.stride), np.uint8)
         words = counts.astype(np.uint8 if self.width == 1 else np.uint16)
         raw[:, : self.width * self.cols] = words.view(np.uint8)

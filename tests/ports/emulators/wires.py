@@ -1,4 +1,4 @@
-"""The emulated buses from the side of the tests: started once, broken on command, read as what the LEDs showed."""
+"""Test side of the emulated buses: started once, faults set on command, LED states read from the log."""
 
 import atexit
 import json
@@ -8,7 +8,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from device.values import Glow
+from device.values import Illumination
 from tests.ports.emulators.timeline import segments
 
 SERVE = Path(__file__).parent / "bus" / "serve.py"
@@ -16,8 +16,8 @@ COLOURS = ("red", "green", "blue")
 FULL = 255
 
 
-class Wires:
-    """SPI and I2C of a Raspberry Pi; `ring` is how many LEDs full light has."""
+class EmulatedBuses:
+    """SPI and I2C of a Raspberry Pi; `ring` is the number of LEDs at full light."""
 
     def __init__(self, ring: int = 8) -> None:
         if "umockdev" not in os.environ.get("LD_PRELOAD", ""):
@@ -33,13 +33,13 @@ class Wires:
         self._log = self.folder / "spi.jsonl"
         self._read, self._seen = 0, []
 
-    def break_(self, *faults: str) -> None:
-        """What is broken from now on; nothing, if nothing is named."""
+    def set_faults(self, *faults: str) -> None:
+        """Set the active faults; without arguments, clear them."""
         (self.folder / "faults").write_text("\n".join(faults), encoding="ascii")
 
     @property
     def messages(self) -> list[dict]:
-        """All that came over SPI so far: `at_s`, `hz`, `bytes`, `lit` after it."""
+        """Return all SPI messages so far: `at_s`, `hz`, `bytes`, `lit` after the message."""
         text = self._log.read_text(encoding="ascii") if self._log.exists() else ""
         whole = text[: text.rfind("\n") + 1]
         self._seen += [json.loads(line) for line in whole[self._read :].splitlines()]
@@ -48,18 +48,18 @@ class Wires:
 
     @property
     def lit(self) -> dict[str, list[int]]:
-        """The LEDs that shine now."""
+        """Return the LEDs that are lit now."""
         return self.messages[-1]["lit"] if self.messages else {}
 
-    def __call__(self, begin_s: float, end_s: float) -> list[tuple[Glow | None, float]]:
-        """What the ring showed between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
+    def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
+        """Return the ring's illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
         changes = [(0.0, None)] + [(one["at_s"], self._glow(one["lit"])) for one in self.messages]
         return segments(changes, begin_s, end_s)
 
-    def _glow(self, lit: dict[str, list[int]]) -> Glow | None:
+    def _glow(self, lit: dict[str, list[int]]) -> Illumination | None:
         sums = [sum(levels[channel] for levels in lit.values()) for channel in range(3)]
         most = max(sums)
-        return Glow(COLOURS[sums.index(most)], min(1.0, most / (FULL * self.ring))) if most else None
+        return Illumination(COLOURS[sums.index(most)], min(1.0, most / (FULL * self.ring))) if most else None
 
     def _end(self) -> None:
         self._process.kill()
@@ -69,6 +69,6 @@ class Wires:
 
 
 @cache
-def wires() -> Wires:
-    """The one pair of buses of this process."""
-    return Wires()
+def emulated_buses() -> EmulatedBuses:
+    """Return the buses of this process, started on the first call."""
+    return EmulatedBuses()

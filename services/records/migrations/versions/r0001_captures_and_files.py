@@ -1,6 +1,6 @@
-"""The first shelf: captures, and the files of each.
+"""Create the tables of captures and of their files.
 
-There is no way down: an update that is rolled back leaves the tables as they are (see ../../README.md).
+There is no downgrade: a rollback of an update leaves the tables as they are (see ../../README.md).
 """
 
 import sqlalchemy as sa
@@ -13,7 +13,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make both tables."""
+    """Create both tables."""
     _make_captures()
     op.create_table(
         "files",

@@ -1,4 +1,4 @@
-"""The book of light: what each eye got, and the time by which it ages."""
+"""Create the tables of the dose ledger: dose of each eye, and the observed time by which doses expire."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make both tables, empty."""
+    """Create both tables, empty."""
     op.create_table(
         "light_doses",
         sa.Column("eye", sa.Text, primary_key=True),

@@ -1,4 +1,4 @@
-"""Persons, their visits and answers, and the requests that were done; nothing that was there changes."""
+"""Create the tables of patients, visits, answers, slots and idempotency keys; present tables stay unchanged."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -10,7 +10,7 @@ depends_on = None
 
 
 def upgrade() -> None:
-    """Make the tables, empty."""
+    """Create the tables, empty."""
     _make_persons()
     _make_visits()
     _make_slots()

@@ -1,4 +1,4 @@
-"""What was sent of the visits, and what became of sending the others; a visit that was there waits to be sent."""
+"""Add the upload queue: column `visits.sent` and table `sendings`; finished visits are in the queue from then on."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -12,7 +12,7 @@ UNSENT = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
 
 
 def upgrade() -> None:
-    """Add the column with its index, and make the table, empty."""
+    """Add the column with its index, and create the table, empty."""
     op.add_column("visits", sa.Column("sent", sa.Text))
     op.create_index("visits_to_send", "visits", ["finished_at"], sqlite_where=sa.text(UNSENT))
     op.create_table(

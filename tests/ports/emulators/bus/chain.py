@@ -1,18 +1,18 @@
-"""A chain of APA102 LEDs as it is wired: what arrives is latched, and stays for as long as there is power."""
+"""Emulated chain of APA102 LEDs: received data are latched for as long as there is power."""
 
 START = bytes(4)
 FULL = 31
 
 
 class Chain:
-    """`count` LEDs; `dead` ones stay dark; `power` off darkens all and forgets."""
+    """Chain of `count` LEDs; `dead` ones stay dark; a new Chain models a power cycle."""
 
     def __init__(self, count: int = 64) -> None:
         self.levels: list[tuple[int, int, int]] = [(0, 0, 0)] * count
         self.dead: set[int] = set()
 
     def take(self, wire: bytes) -> None:
-        """Shift a message in: a frame reaches as many LEDs as it holds, and the rest keep what they had."""
+        """Shift in a message: a frame reaches as many LEDs as it holds, and the others keep their levels."""
         begin = wire.find(START)
         if begin < 0:
             return
@@ -27,5 +27,5 @@ class Chain:
 
     @property
     def lit(self) -> dict[int, tuple[int, int, int]]:
-        """The LEDs that shine now, with their red, green and blue."""
+        """Return the lit LEDs with their red, green and blue levels."""
         return {index: levels for index, levels in enumerate(self.levels) if any(levels)}

@@ -1,8 +1,8 @@
-"""Models of the chips on the I2C bus: a register pointer and what stands behind it."""
+"""Emulated I2C chips: a register pointer with the registers or memory that it addresses."""
 
 
 class Words:
-    """Registers of 16 bits, the high byte first: TMP117, MAX17048."""
+    """Chip with 16-bit registers, high byte first: TMP117, MAX17048."""
 
     def __init__(self, registers: dict[int, int]) -> None:
         self.registers, self._at = dict(registers), 0
@@ -18,7 +18,7 @@ class Words:
 
 
 class Eeprom:
-    """A 24LC32: 4096 bytes behind an address of 16 bits; writing wraps round inside a page of 32 bytes."""
+    """24LC32: 4096 bytes with a 16-bit address; a write wraps round inside a page of 32 bytes."""
 
     def __init__(self) -> None:
         self.bytes, self._at = bytearray(b"\xff" * 4096), 0

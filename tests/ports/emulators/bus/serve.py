@@ -1,10 +1,10 @@
-"""The buses of a Raspberry Pi behind umockdev, in a process of its own: `/usr/bin/python3 serve.py FOLDER`.
+"""Emulated SPI and I2C buses behind umockdev, in a process of its own: `/usr/bin/python3 serve.py FOLDER`.
 
-Prints the root that UMOCKDEV_DIR must name. Every message on SPI is written to FOLDER/spi.jsonl with its moment
-(CLOCK_MONOTONIC, seconds), its bytes and the LEDs that shine after it, every message on I2C to FOLDER/i2c.jsonl with
-its chip, its direction and its bytes. FOLDER/faults holds what is broken, one word to a line:
-"spi.short" (half a message arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is
-dead), "power" (brown-out: the chain loses its latch), "memory.blank" (the head's memory is as from the shop).
+Prints the root that UMOCKDEV_DIR must name. Each SPI message is logged in FOLDER/spi.jsonl with its time
+(CLOCK_MONOTONIC, seconds), its bytes and the LEDs that are lit after it; each I2C message in FOLDER/i2c.jsonl with its
+chip, direction and bytes. FOLDER/faults lists the active faults, one word to a line: "spi.short" (half a message
+arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is dead), "power" (brown-out:
+the chain loses its latch), "memory.blank" (the EEPROM is as delivered).
 """
 
 import json
@@ -40,7 +40,7 @@ def faults():
 
 
 class Bus(UMockdev.IoctlBase):
-    """Answers always: a request without an answer would hang whoever asked."""
+    """Bus that answers every request: an unanswered ioctl would block the caller for ever."""
 
     def do_handle_ioctl(self, client):
         try:
@@ -52,11 +52,17 @@ class Bus(UMockdev.IoctlBase):
 
 
 class Spi(Bus):
-    """The controller's settings, and the chain that listens."""
+    """SPI controller with its settings and the connected chain."""
 
     def __init__(self):
         super().__init__()
-        self.settings = {1: 0, 2: 0, 3: 8, 4: 125_000_000, 5: 0}  # mode, order, bits, hertz as a Pi's tree says, mode32
+        self.settings = {
+            1: 0,
+            2: 0,
+            3: 8,
+            4: 125_000_000,
+            5: 0,
+        }  # mode, bit order, bits, hertz as in a Pi's device tree, mode32
         self.chain = Chain()
         self.log = (FOLDER / "spi.jsonl").open("a", encoding="ascii")
 
@@ -93,14 +99,14 @@ class Spi(Bus):
         return True
 
     def take(self, wire):
-        broken = faults()
-        if "spi.cut" in broken:
+        active_faults = faults()
+        if "spi.cut" in active_faults:
             return -1
-        if "power" in broken:
+        if "power" in active_faults:
             self.chain = Chain()
             return len(wire)
-        self.chain.dead = {int(name[4:]) for name in broken if name.startswith("led.")}
-        arrived = wire[: len(wire) // 2] if "spi.short" in broken else wire
+        self.chain.dead = {int(name[4:]) for name in active_faults if name.startswith("led.")}
+        arrived = wire[: len(wire) // 2] if "spi.short" in active_faults else wire
         self.chain.take(arrived)
         seen = {"at_s": time.monotonic(), "hz": self.settings[4], "bytes": len(arrived), "lit": self.chain.lit}
         self.log.write(json.dumps(seen | {"mode": self.settings[1], "hex": arrived.hex()}) + "\n")
@@ -109,7 +115,7 @@ class Spi(Bus):
 
 
 class I2c(Bus):
-    """Plain messages and the word reads of SMBus."""
+    """I2C adapter with plain messages and the word reads of SMBus."""
 
     def __init__(self, chips):
         super().__init__()
@@ -135,10 +141,10 @@ class I2c(Bus):
         return -1, ENOTTY
 
     def chip(self, address):
-        broken = faults()
-        if "memory.blank" in broken:
+        active_faults = faults()
+        if "memory.blank" in active_faults:
             self.chips[0x50] = Eeprom()
-        return None if "i2c.silent" in broken else self.chips.get(address)
+        return None if "i2c.silent" in active_faults else self.chips.get(address)
 
     def messages(self, arg):
         head = arg.resolve(0, 16)
@@ -165,8 +171,8 @@ class I2c(Bus):
             return -1, ENXIO
         if size == 3:  # a word, the low byte first
             block = data.resolve(8, 34)
-            said = bytes([command]) + (b"" if reads else bytes(block.retrieve())[:2])
-            chip.write(self.note(self.address, "write", said))
+            written = bytes([command]) + (b"" if reads else bytes(block.retrieve())[:2])
+            chip.write(self.note(self.address, "write", written))
             if reads:
                 block.update(0, list(self.note(self.address, "read", chip.read(2))))
             return 0, 0
@@ -176,7 +182,7 @@ class I2c(Bus):
 testbed = UMockdev.Testbed.new()
 testbed.add_from_string(DEVICES)
 testbed.attach_ioctl("/dev/spidev0.0", Spi())
-# 25.0 C; 77.5 % and 3.88 V; 4096 bytes that were never written
+# 25.0 C; 77.5 % and 3.88 V; a blank EEPROM of 4096 bytes
 chips = {0x48: Words({0: 0x0C80, 15: 0x0117}), 0x36: Words({2: 0xC200, 4: 0x4D80}), 0x50: Eeprom()}
 testbed.attach_ioctl("/dev/i2c-1", I2c(chips))
 print(testbed.get_root_dir(), flush=True)

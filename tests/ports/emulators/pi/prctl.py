@@ -1,1 +1,1 @@
-"""Stands for python-prctl, which picamera2 imports for its video encoders only."""
+"""Stub of python-prctl, which picamera2 imports for its video encoders only."""

@@ -1,8 +1,8 @@
-"""Stands for the display's module, which picamera2 imports and this project never uses."""
+"""Stub of the display module, which picamera2 imports and this project never uses."""
 
 
 class PixelFormat:
-    """Nothing is ever shown."""
+    """Stub: each attribute is its own name."""
 
     def __getattr__(self, name):
         return name

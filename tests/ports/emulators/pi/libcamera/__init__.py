@@ -1,4 +1,4 @@
-"""Stands for libcamera's Python binding: enough for an unmodified picamera2, over a sensor that somebody plugs in.
+"""Emulation of libcamera's Python binding: enough for an unmodified picamera2, over an emulated sensor.
 
 libcamera.plugged      the sensors that are attached now (see `sensor.Sensor`)
 """
@@ -38,11 +38,11 @@ plugged = []
 
 
 class FrameBufferAllocator:
-    """Nobody asks for it: buffers come from the allocator that picamera2 is given."""
+    """Unused: buffers come from the allocator passed to picamera2."""
 
 
 class CameraManager:
-    """The cameras, and the ready requests behind a file descriptor that wakes whoever waits."""
+    """Cameras, and the queue of completed requests with an eventfd that wakes its reader."""
 
     _one = None
 
@@ -61,11 +61,11 @@ class CameraManager:
     def cameras(self):
         for sensor in plugged:
             if sensor not in self._cameras:
-                self._cameras[sensor] = Camera(sensor, self.tell, len(self._cameras))
+                self._cameras[sensor] = Camera(sensor, self.complete, len(self._cameras))
         return [self._cameras[sensor] for sensor in plugged]
 
-    def tell(self, request):
-        """A request is complete."""
+    def complete(self, request):
+        """Queue a completed request and signal the eventfd."""
         with self._lock:
             self._ready.append(request)
         os.eventfd_write(self.event_fd, 1)
@@ -81,10 +81,10 @@ class CameraManager:
 
 
 class Camera:
-    """One camera: configurations, requests, and a thread that fills them while it is started."""
+    """One camera: configurations, requests, and a thread that fills them while the camera is started."""
 
-    def __init__(self, sensor, tell, number):
-        self.sensor, self._tell = sensor, tell
+    def __init__(self, sensor, complete, number):
+        self.sensor, self._complete = sensor, complete
         self.id = f"/base/soc/i2c0mux/i2c@1/sensor@{number:05}"  # picamera2's first camera is the last of these
         self._queue, self._wake, self._running = deque(), threading.Condition(), False
         self._thread = None
@@ -125,7 +125,7 @@ class Camera:
         return CameraConfiguration(streams, self._settle)
 
     def _settle(self, stream):
-        """What is granted may not be what was asked: formats, sizes and strides are the sensor's."""
+        """Adjust a stream to the sensor: granted formats, sizes and strides may differ from the request."""
         asked = str(stream.pixel_format), stream.size.to_tuple()
         if not str(stream.pixel_format).startswith(("R", "S", "MONO")):
             stream.stride = stream.size.width * 4
@@ -161,7 +161,7 @@ class Camera:
         self._thread.join()
         for request in self._queue:
             request.status = Request.Status.Cancelled
-            self._tell(request)
+            self._complete(request)
         self._queue.clear()
 
     def _run(self):
@@ -172,11 +172,11 @@ class Camera:
                     return
                 request = self._queue.popleft()
             asked = {control.name: value for control, value in request.controls.items()}
-            told = self.sensor.expose(asked, request.buffers[self._raw.stream].planes[0].fd, self._raw)
-            if told is None:  # the sensor has stalled: the request never comes back
+            metadata = self.sensor.expose(asked, request.buffers[self._raw.stream].planes[0].fd, self._raw)
+            if metadata is None:  # the sensor has stalled: the request never comes back
                 continue
             for buffer in request.buffers.values():
                 buffer.metadata.planes[0].bytes_used = buffer.planes[0].length
-            request.metadata = {getattr(controls, name): value for name, value in told.items()}
+            request.metadata = {getattr(controls, name): value for name, value in metadata.items()}
             request.status = Request.Status.Complete
-            self._tell(request)
+            self._complete(request)

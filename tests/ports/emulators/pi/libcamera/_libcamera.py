@@ -1,4 +1,4 @@
-"""The vocabulary of libcamera that picamera2 speaks: sizes, formats, controls, requests. No behaviour beyond it."""
+"""Value types of libcamera that picamera2 uses: sizes, formats, controls, requests; no further behaviour."""
 
 from enum import Enum, IntEnum
 from types import SimpleNamespace
@@ -126,7 +126,7 @@ class SensorConfiguration:
 
 
 class StreamFormats:
-    """Which sizes each pixel format comes in."""
+    """Sizes available for each pixel format."""
 
     def __init__(self, sizes):
         self._sizes = sizes

@@ -1,4 +1,4 @@
-"""The controls that the emulated sensors have."""
+"""Controls of the emulated sensors."""
 
 from enum import IntEnum
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""The properties that the emulated sensors have."""
+"""Properties of the emulated sensors."""
 
 from enum import IntEnum
 from types import SimpleNamespace

@@ -1,0 +1,152 @@
+"""Atomic and durable file writes (write, fsync of the file, rename, fsync of the folder), and file locks (flock).
+
+`write_atomically` replaces one file; the steps of a longer write are separate functions, and `replace_durably` is the
+last one. Each step is on the disk before the next begins, so a power cut leaves the old or the new state.
+"""
+
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+RESERVE_BYTES = 200_000_000  # left free for logs and updates of the operating system, which else may not boot
+# EFBIG is a limit on the length of one file: for the operator the same as a full disk.
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the file system of `folder` for unprivileged users, bytes; RESERVE_BYTES included."""
+    return shutil.disk_usage(folder).free
+
+
+def has_room(need_bytes: int, free_bytes: int, reserve_bytes: int = RESERVE_BYTES) -> bool:
+    """Return whether `need_bytes` fit into the free space beside the reserve; true if they fit exactly."""
+    return free_bytes >= need_bytes + reserve_bytes
+
+
+def is_full(error: OSError) -> bool:
+    """Return true if an error of the operating system means a full disk, quota or file size limit."""
+    return error.errno in _FULL
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and its missing parents durably: the parent of each new folder is synced; no-op if it exists."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        fsync_folder(folder.parent)
+
+
+def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Make a new folder with `files`, content and file names durable on return.
+
+    The folder's own name is durable only after `fsync_folder` of its parent. FileExistsError if the folder exists.
+    """
+    folder.mkdir()
+    for name, content in files.items():
+        write_file(folder / name, content)
+    fsync_folder(folder)
+
+
+def write_file(path: Path, content: bytes, mode: int | None = None) -> None:
+    """Write a new file and fsync it; its name is durable only after `fsync_folder`. FileExistsError if it exists.
+
+    `mode`: permission bits of the file, independent of the umask; None: those of an ordinary new file.
+    """
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else mode)
+    with open(descriptor, "wb") as file:
+        if mode is not None:
+            os.fchmod(descriptor, mode)
+        file.write(content)
+        file.flush()
+        os.fsync(descriptor)
+
+
+def write_atomically(path: Path, content: bytes, mode: int | None = None) -> None:
+    """Write or replace a file durably: after a power cut it has the old or the new content. `mode` as in `write_file`.
+
+    After an OSError `path` is unchanged, unless the last step, the fsync of the folder, failed.
+    """
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)  # left by a power cut
+    try:
+        write_file(part, content, mode)
+        part.rename(path)
+    except OSError:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise
+    fsync_folder(path.parent)
+
+
+def replace_durably(source: Path, target: Path) -> None:
+    """Rename a file or folder to `target` durably; it replaces a file, or an empty folder, of that name.
+
+    The content of `source` is on the disk already. The folder of `target` is synced before the folder of `source`.
+    """
+    source.rename(target)
+    fsync_folder(target.parent)
+    if source.parent != target.parent:
+        fsync_folder(source.parent)
+
+
+def fsync_file(path: Path) -> None:
+    """Fsync the content of a file, of which another program or function wrote all bytes."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def fsync_folder(folder: Path) -> None:
+    """Fsync a folder, so that a power cut cannot undo a rename or new name in it."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def quarantine(stray: Path, quarantine_folder: Path) -> str:
+    """Move a file or folder into `quarantine_folder` under a free name, and return that name.
+
+    The name is the old one without a leading "." and without ".part", with "-2", "-3", ... if it is taken. The caller
+    syncs both parent folders.
+    """
+    plain = stray.name.removeprefix(".").removesuffix(".part")
+    name, number = plain, 1
+    while (quarantine_folder / name).exists():
+        number += 1
+        name = f"{plain}-{number}"
+    stray.rename(quarantine_folder / name)
+    return name
+
+
+def size_bytes(place: Path) -> int:
+    """Return the size of a file, or the total size of all files below a folder, bytes; symbolic links not followed."""
+    return sum(path.lstat().st_size for path in (place, *place.rglob("*")) if not path.is_dir())
+
+
+def remove(place: Path) -> None:
+    """Remove a file, or a folder with its content."""
+    if place.is_dir() and not place.is_symlink():
+        shutil.rmtree(place)
+    else:
+        place.unlink()
+
+
+@contextmanager
+def file_lock(lock: Path, wait: bool = True) -> Iterator[None]:
+    """Hold an exclusive lock (flock) on the file `lock`, a mutex across threads and processes.
+
+    Without `wait`: BlockingIOError if the lock is held elsewhere. OSError if the file cannot be opened. The kernel
+    releases the lock of a killed process. The file is opened for each lock because flock belongs to the open file
+    description: threads that share one would not exclude each other.
+    """
+    with lock.open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield

@@ -1,0 +1,201 @@
+"""Calibration checks from ordinary captures: does the active calibration still fit this head.
+
+    assess_capture     turns one capture, a lit frame and its dark frame, into a CaptureAssessment
+    check              turns the recent captures into findings
+    raise_on_failure   raises the error of a failed finding, with which a new capture is refused
+
+One capture may show a blink or a moving eye; so two of the last three must agree before pictures are refused. The
+sources of the limits are in device/calibration/decisions/.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from math import hypot
+from statistics import median
+
+import numpy as np
+
+from device.calibration.archive import Provenance
+from device.calibration.calibration_validity import check_age
+from device.calibration.monitoring.dark_frame import DarkFrameAssessment, assess_dark_frame
+from device.calibration.monitoring.finding import Finding
+from device.errors import CalibrationExpired, CalibrationStale
+from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
+from device.values import Calibration, Counts
+
+RECENT_CAPTURES = 3  # number of recent captures that decide
+MIN_FAILED_CAPTURES = 2  # number of them that must fail before pictures are refused
+
+MAX_SCORE_SD = 0.15  # a frame with a larger score sd is too dark or empty, and is not used for the PSF
+LEAST_SCORE = 0.6
+MAX_SHIFT_DEG = 0.5
+MAX_WIDTH_CHANGE = 0.009
+HOT_HINT_SHARE, MOST_HOT = (
+    1e-4,
+    1e-3,
+)  # share of pixels; unmarked, they cost 0.05 and 0.35 of correlation (NUMERICS.md 6.1)
+BLACK_DN = 1.5  # in addition to one doubling of the dark current
+MAX_NOISE_RATIO = 1.5  # ratio to the calibration
+
+SITTING_GAP = timedelta(minutes=10)
+MIN_SITTINGS = 8
+POPULATION_SD_DPT, SLACK_DPT = 2.5, 1.0  # sd of the mean sphere in a population, and tolerance of the relay
+
+CALIBRATE_REMEDY = CalibrationStale.default_remedy
+REPEAT_REMEDY = "Take another picture. If that says so too, none is taken any more until the head is calibrated."
+
+
+@dataclass(frozen=True)
+class CaptureAssessment:
+    """Assessment of one capture; `statement` is its PSF match, None if not tested or if the lit frame has no light."""
+
+    taken_at: datetime
+    dark: DarkFrameAssessment
+    statement: PsfMatchResult | None
+
+
+@dataclass(frozen=True)
+class ExposurePair:
+    """Lit frame and dark frame, counts (rows, cols), with their date and time and their exposure, s."""
+
+    taken_at: datetime
+    lit: Counts
+    dark: Counts
+    exposure_s: float
+
+
+def assess_capture(
+    calibration: Calibration, provenance: Provenance | None, witness: PsfMatchTest | None, exposures: ExposurePair,
+    between: Callable[[], None] = lambda: None,
+) -> CaptureAssessment:  # fmt: skip
+    """Return the assessment of one capture; `witness` is the PSF match test (None: the PSF is not tested).
+
+    `between` is called every few milliseconds and may abort the assessment by raising an exception.
+    """
+    seen = assess_dark_frame(calibration, provenance, exposures.dark, exposures.exposure_s, between)
+    between()
+    return CaptureAssessment(
+        exposures.taken_at, seen, witness(exposures.lit, exposures.dark, between) if witness is not None else None
+    )
+
+
+def check(
+    calibration: Calibration, provenance: Provenance | None, assessments: Sequence[CaptureAssessment],
+    spheres_dpt: Sequence[tuple[datetime, float]], now: datetime,
+) -> tuple[Finding, ...]:  # fmt: skip
+    """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
+    recent = sorted(assessments, key=lambda one: one.taken_at)
+    statements = [one.statement for one in recent if one.statement is not None and one.statement.sd <= MAX_SCORE_SD]
+    fitting = [one for one in statements if one.upper_limit >= LEAST_SCORE][-RECENT_CAPTURES:]
+    found = [check_age(provenance, now)] if provenance is not None else []
+    if statements:
+        found.append(_psf_finding(statements[-RECENT_CAPTURES:]))
+    if fitting:
+        found += _field_findings(fitting)
+    if (persons := _sitting_spheres_dpt(spheres_dpt)) and len(persons) >= MIN_SITTINGS:
+        found.append(_scale_finding(persons))
+    if recent:
+        found += _dark_findings(calibration, [one.dark for one in recent[-RECENT_CAPTURES:]])
+    return tuple(found)
+
+
+def raise_on_failure(findings: Sequence[Finding]) -> None:
+    """Raise CalibrationExpired (age) or CalibrationStale (all others) for the first finding that fails, if any."""
+    for one in findings:
+        if not one.fails:
+            continue
+        message = f"{one.name}: {one.value:.3g} {one.unit}".rstrip() + f" (limit {one.limit:.3g})"
+        if one.name == "age":
+            raise CalibrationExpired(f"the calibration is too old, {message}")
+        raise CalibrationStale(f"the calibration no longer fits this head, {message}")
+
+
+def _psf_finding(statements: Sequence[PsfMatchResult]) -> Finding:
+    """Return the PSF finding of the last captures: failed if two do not match, a hint if only the newest does not."""
+    doubts = sum(one.upper_limit < LEAST_SCORE for one in statements)
+    value = median(one.upper_limit for one in statements)
+    if doubts >= MIN_FAILED_CAPTURES:
+        return Finding("psf", False, value, LEAST_SCORE, "of 1", CALIBRATE_REMEDY)
+    if statements[-1].upper_limit < LEAST_SCORE:
+        return Finding("psf", False, statements[-1].upper_limit, LEAST_SCORE, "of 1", REPEAT_REMEDY, hint=True)
+    return Finding("psf", True, value, LEAST_SCORE, "of 1")
+
+
+def _field_findings(statements: Sequence[PsfMatchResult]) -> list[Finding]:
+    """Return the findings on shift (degrees) and size (%) of the lit field: lamp, diffuser or sensor may have moved."""
+    down, right = (median(one.field_offset_deg[axis] for one in statements) for axis in (0, 1))
+    wider = median(one.field_radius_change_ratio for one in statements)
+    return [
+        _hint(
+            "shift",
+            hypot(down, right),
+            MAX_SHIFT_DEG,
+            "deg",
+            "The field is off its place: see whether the lamp, the "
+            "diffuser or the sensor sits loose, or whether eyes are held off the axis.",
+        ),
+        _hint(
+            "width",
+            100 * abs(wider),
+            100 * MAX_WIDTH_CHANGE,
+            "%",
+            "The field has another size: the distance from the "
+            "diffuser to the sensor may have changed. Dioptres and micrometres are wrong by that share.",
+        ),
+    ]
+
+
+def _scale_finding(persons: Sequence[float]) -> Finding:
+    """Return the finding on the median refraction of many patients: near zero, unless the relay has moved."""
+    limit_dpt = SLACK_DPT + 3 * 1.25 * POPULATION_SD_DPT / len(persons) ** 0.5  # 1.25: a median's spread over a mean's
+    return _hint(
+        "scale", abs(median(persons)), limit_dpt, "dpt",
+        "Most eyes seem to have the same refraction: the relay may have moved. Look at a model eye.",
+    )  # fmt: skip
+
+
+def _sitting_spheres_dpt(spheres_dpt: Sequence[tuple[datetime, float]]) -> list[float]:
+    """Return the median sphere, dpt, of each sitting: captures at most 10 minutes apart count as one patient."""
+    sittings: list[list[float]] = []
+    last: datetime | None = None
+    for taken_at, sphere_dpt in sorted(spheres_dpt):
+        if last is None or taken_at - last > SITTING_GAP:
+            sittings.append([])
+        sittings[-1].append(sphere_dpt)
+        last = taken_at
+    return [median(one) for one in sittings]
+
+
+def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment]) -> list[Finding]:
+    """Return the findings on hot pixels, black level and, where the calibration has it, noise of the dark frames."""
+    pixels = calibration.psfs[0].pixels.size
+    seen = np.unique(np.concatenate([one.hot for one in darks]), return_counts=True)[1]
+    hot = float((seen >= min(MIN_FAILED_CAPTURES, len(darks))).sum()) / pixels
+    off_dn = abs(median(one.black_off_dn for one in darks))
+    warmth_dn = median(one.dark_current_dn for one in darks)
+    found = [
+        _hot_pixel_finding(hot),
+        _hint("black level", off_dn, BLACK_DN + warmth_dn, "DN", "The dark is not as dark as it was. Every picture "
+                "has a dark frame of its own, so it stays true; but shade the head, let it cool, and look again."),
+    ]  # fmt: skip
+    noises = [one.noise_ratio for one in darks if one.noise_ratio is not None]
+    if noises:
+        remedy = "The sensor is noisier than it was: shade the head, let it cool, and look again."
+        found.append(_hint("dark noise", median(noises), MAX_NOISE_RATIO, "times", remedy))
+    return found
+
+
+def _hot_pixel_finding(share: float) -> Finding:
+    """Return the finding on the share of hot pixels: a failure above MOST_HOT, a hint above HOT_HINT_SHARE."""
+    if share > MOST_HOT:
+        return Finding("hot pixels", False, 100 * share, 100 * MOST_HOT, "%", CALIBRATE_REMEDY)
+    return _hint(
+        "hot pixels", 100 * share, 100 * HOT_HINT_SHARE, "%", "More pixels shine in the dark. Plan a calibration."
+    )
+
+
+def _hint(name: str, value: float, limit: float, unit: str, remedy: str) -> Finding:
+    """Return a finding that is ok up to the limit and a hint beyond it."""
+    beyond = value > limit
+    return Finding(name, not beyond, value, limit, unit, remedy if beyond else "", hint=beyond)

@@ -1,0 +1,220 @@
+"""Head file: specification of one optical head and its parts in TOML, validated and frozen."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from device.config.radiometry import RadiometrySpec
+from device.config.scene import SimSpec
+from device.config.sensors import sensor_profile
+from device.config.toml_file import Table, load_toml
+from device.errors import SpecError
+from device.values import Geometry
+
+
+class CameraSpec(Table):
+    """Sensor: driver backend, pixels, and conversion of counts.
+
+    `sensor` names a preset of `device/config/sensor_presets`, or a TOML file beside the head file, which supplies the
+    keys that this table omits; the value is then the file's name without `.toml`. `row_us` is the row time; `black_dn`
+    the count of a pixel without light.
+    """
+
+    backend: Literal["sim", "replay", "picamera2", "v4l2"]
+    sensor: str | None = None
+    rows: int = Field(ge=1, le=8192)
+    cols: int = Field(ge=1, le=8192)
+    pitch_um: float = Field(gt=0, le=100)
+    bit_depth: int = Field(default=12, ge=8, le=16)
+    black_dn: float = Field(default=64.0, ge=0)
+    full_well_e: float = Field(gt=0)
+    read_noise_e: float = Field(ge=0)
+    exposure_s: float = Field(default=0.1, gt=0, le=10)
+    preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
+    device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
+    row_us: float = Field(default=30.0, gt=0, le=1000)
+    upright: bool = False  # checked by hand: pictures are upright and not mirrored (hardware/assembly.md)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_sensor_profile(cls, values: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        """Add the values of the sensor preset for keys that the table omits; ValueError for an unknown or invalid one.
+
+        The path of a preset is relative to the head file's folder, if the validation context names it.
+        """
+        name = values.get("sensor")
+        if name is None:
+            return values
+        folder = Path() if info.context is None else Path(info.context["folder"])
+        profile = sensor_profile(str(name), folder).model_dump()
+        supplied = {key: value for key, value in profile.items() if key in cls.model_fields}
+        return {**supplied, **values, "sensor": Path(str(name)).name.removesuffix(".toml")}
+
+    @property
+    def white_dn(self) -> int:
+        """Highest count of the converter."""
+        return int(2**self.bit_depth) - 1
+
+    @property
+    def gain_e_per_dn(self) -> float:
+        """Electrons per count if the full well reaches the highest count."""
+        return self.full_well_e / (self.white_dn - self.black_dn)
+
+
+class ChainSpec(Table):
+    """Matrix of APA102 LEDs on SPI and its ring; by default SparkFun's LuMini 8 x 8.
+
+    `axis` is where the light path crosses the matrix, (row, column) from the bottom left, seen from the LED side;
+    default: its middle. `ring_mm` +- `tolerance_mm` is the ring's diameter. `leds` lists the ring's LEDs instead;
+    `trims` are their relative levels, above 0 and up to 1, which equalise them.
+    """
+
+    device: str = Field(default="/dev/spidev0.0", pattern=r"^/dev/spidev\d+\.\d+$")
+    rows: int = Field(default=8, ge=1, le=16)
+    cols: int = Field(default=8, ge=1, le=16)
+    pitch_mm: float = Field(default=3.175, gt=0, le=20)
+    axis: tuple[float, float] | None = None
+    ring_mm: float = Field(default=10.04, gt=0, le=100)
+    tolerance_mm: float = Field(default=0.2, gt=0, le=10)
+    leds: tuple[int, ...] | None = Field(default=None, min_length=1)
+    trims: tuple[float, ...] | None = None
+    most_lit: int = Field(default=16, ge=1)  # at 20 mA each: limit of the head's supply
+
+    @model_validator(mode="after")
+    def _check_ring(self) -> "ChainSpec":
+        """Raise ValueError if LED numbers or trims do not fit the matrix, `most_lit` or each other."""
+        if self.leds is not None:
+            if max(self.leds) >= self.rows * self.cols or min(self.leds) < 0 or len(set(self.leds)) < len(self.leds):
+                raise ValueError(f"leds are different numbers from 0 to {self.rows * self.cols - 1}")
+            if len(self.leds) > self.most_lit:
+                raise ValueError(f"{len(self.leds)} leds are more than most_lit = {self.most_lit}")
+        if self.trims is not None and (self.leds is None or len(self.trims) != len(self.leds)):
+            raise ValueError("trims are as many as leds")
+        if self.trims is not None and not all(0 < trim <= 1 for trim in self.trims):
+            raise ValueError("trims are above 0 and at most 1")
+        return self
+
+
+class LightSpec(Table):
+    """LED ring: colours for the picture and for aiming, and `max_on_s`, the longest time the guard leaves it on."""
+
+    backend: Literal["sim", "replay", "apa102"]
+    chain: ChainSpec | None = None
+    pupil_mm: float | None = Field(default=None, gt=0, le=10)  # selects the chain's widest ring that fits into it
+    colour: Literal["red", "green", "blue"] = "green"
+    preview_colour: Literal["red", "green"] = "red"
+    max_on_s: float = Field(default=1.0, gt=0, le=30)
+    radiometry: RadiometrySpec | None = None
+
+
+class BusSpec(Table):
+    """I2C addresses of the chips, None if absent; limits for a picture: highest temperature, least battery fraction."""
+
+    backend: Literal["sim", "smbus"]
+    device: str = Field(default="/dev/i2c-1", pattern=r"^/dev/i2c-\d+$")
+    thermometer: int | None = Field(default=None, ge=0x08, le=0x77)  # TMP117
+    battery: int | None = Field(default=None, ge=0x08, le=0x77)  # MAX17048
+    memory: int | None = Field(default=None, ge=0x08, le=0x77)  # 24LC32
+    warmest_c: float = Field(default=55.0, gt=0, le=100)
+    emptiest: float = Field(default=0.05, ge=0, lt=1)
+
+
+class GpioSpec(Table):
+    """GPIO lines: heartbeat of the lamp's gate (hardware/dead-man.md), and shutter button."""
+
+    backend: Literal["sim", "gpiod"]
+    chip: str = Field(default="/dev/gpiochip0", pattern=r"^/dev/gpiochip\d+$")
+    heartbeat: int | None = Field(default=None, ge=0, le=63)
+    button: int | None = Field(default=None, ge=0, le=63)
+
+
+class OpticsSpec(Table):
+    """Light path from the eye to the sensor, by default the paper's: "Optical design" and "Hardware design"."""
+
+    iris_um: float = Field(default=3200.0, gt=0)
+    diffuser_to_sensor_um: float = Field(default=6000.0, gt=0)
+    angular_magnification: float = Field(default=0.75, gt=0)
+    field_deg: float = Field(default=33.4, gt=0, le=90)  # beyond, a degree is no longer a number of pixels (Geometry)
+    wavelength_um: float = Field(default=0.55, gt=0.3, lt=1.2)
+    bandwidth_um: float = Field(default=0.04, ge=0, lt=0.2)
+    slope_fwhm_deg: float = Field(default=0.5, gt=0, lt=20)
+    correlation_um: float = Field(default=70.0, gt=0)
+
+    def geometry(self, pitch_um: float) -> Geometry:
+        """Return the scale between degrees at the eye and pixels of a sensor with that pixel pitch."""
+        return Geometry(pitch_um, self.diffuser_to_sensor_um, self.angular_magnification)
+
+
+class ReplaySpec(Table):
+    """Files of a replayed head: raws in turn, one PSF or a stack, dark and flat frame; paths relative to the TOML."""
+
+    raws: tuple[Path, ...] = Field(min_length=1)
+    psfs: tuple[Path, ...] = Field(min_length=1)
+    black_dn: float = 0.0
+    dark: Path | None = None
+    flat: Path | None = None
+
+
+class CalibrationTable(Table):
+    """Archive of the calibrations (`diffuscope calibrate`), relative to the head file; the active one is used.
+
+    `imported` permits a PSF that was not measured on this head (`diffuscope calibrations import-psf`).
+    """
+
+    archive: Path
+    imported: bool = False
+
+    @field_validator("archive")
+    @classmethod
+    def _relative_to_head_file(cls, archive: Path, info: ValidationInfo) -> Path:
+        """Return the path resolved relative to the head file's folder, if the validation context names it."""
+        return archive if info.context is None else Path(info.context["folder"]) / archive
+
+
+class InstrumentSpec(Table):
+    """Specification of a whole head, one field per table of its file; `sim` and `replay` are for these backends."""
+
+    name: str = Field(min_length=1)
+    camera: CameraSpec
+    light: LightSpec
+    optics: OpticsSpec | None = None
+    bus: BusSpec | None = None
+    gpio: GpioSpec | None = None
+    calibration: CalibrationTable | None = None
+    sim: SimSpec | None = None
+    replay: ReplaySpec | None = None
+
+
+def load_head(path: Path) -> InstrumentSpec:
+    """Return the head in a TOML file (`hardware/heads/*.toml`); SpecError for a missing table or an invalid value."""
+    spec = load_toml(path, InstrumentSpec)
+    if spec.light.backend == "apa102" and spec.camera.backend != "replay" and spec.optics is None:
+        raise SpecError(f"{path}: a head needs the table [optics]")
+    if "sim" in (spec.camera.backend, spec.light.backend) and (spec.sim is None or spec.optics is None):
+        raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
+    if spec.light.backend == "apa102" and spec.light.chain is None:
+        raise SpecError(f"{path}: a ring of APA102 LEDs needs the table [light.chain]")
+    if spec.camera.backend == "replay" and spec.replay is None:
+        raise SpecError(f"{path}: a replayed head needs the table [replay]")
+    for key in ("exposure_s", "preview_exposure_s"):
+        if getattr(spec.camera, key) >= spec.light.max_on_s:
+            raise SpecError(
+                f"{path}: camera.{key} = {getattr(spec.camera, key):g} is not shorter than "
+                f"light.max_on_s = {spec.light.max_on_s:g}, so the guard would end every exposure"
+            )
+    _refuse_pupil_beside_iris(path, spec)
+    return spec
+
+
+def _refuse_pupil_beside_iris(path: Path, spec: InstrumentSpec) -> None:
+    """Raise SpecError for a simulated pupil so far off the axis that its image misses the iris and no light passes."""
+    if spec.sim is None or spec.optics is None:
+        return
+    eye, iris_um = spec.sim.eye, spec.optics.iris_um * spec.optics.angular_magnification
+    most_um = (eye.pupil_um + iris_um) / 2
+    if eye.decentred_um >= most_um:
+        raise SpecError(
+            f"{path}: sim.eye.decentred_um = {eye.decentred_um:g}: no light of a pupil of {eye.pupil_um:g} um meets "
+            f"the iris; allowed: below {most_um:g}"
+        )

@@ -1,0 +1,449 @@
+"""Image files: read TIFF, PNG, npy, npz and DNG, write TIFF and npy; FrameError or PsfError for no valid image.
+
+Layouts of an array, by the number of its axes; `frames_of` returns the frames of each:
+
+    (rows, cols)                       one frame
+    (rows, cols, 1) or (rows, cols, 3) one frame, grey or colour
+    (n, rows, cols)                    n grey frames; n is at most the smaller side
+    (n, rows, cols, 1 or 3)            n frames, grey or colour: the layout of LenslessPiCam
+
+A raw is one frame; n PSFs are a stack (refraction or depth).
+"""
+
+import json
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from tokenize import TokenError
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import UnidentifiedImageError
+from PIL.PngImagePlugin import PngImageFile
+
+from device.config.bayer import PATTERNS, Bayer
+from device.errors import FrameError, PsfError, SettingError
+from device.values import Image, Mask, Psf
+
+SUFFIXES = (".tif", ".tiff", ".png", ".npy")  # of the images of a recording's folder
+MIN_SATURATED_PIXELS = 8  # so few pixels may reach the maximum by chance
+MEASURE_PSF = "Give an image of one point of light in a dark room, neither saturated nor processed."
+READABLE = (*SUFFIXES, ".npz", ".dng")
+Pixels = NDArray[Any]
+MAX_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
+_DNG_RAW = (tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW)
+_RGB_16_BIT = b"\x10\x02"  # bytes 24 and 25 of a PNG: depth and colour type
+MAX_COMPRESSION_RATIO = 1100  # maximum compression ratio of a deflated black frame (zlib: 1032)
+_DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
+    ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError, AssertionError,
+    NotImplementedError,    UnidentifiedImageError, tifffile.TiffFileError,
+    Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """Content of an image file: its frames, each (rows, cols) or (rows, cols, 3), in the stored type.
+
+    `bayer` and `black_dn` are the colour filter pattern and the black level that a DNG states; None if not stated.
+    """
+
+    frames: tuple[Pixels, ...]
+    bayer: Bayer | None = None
+    black_dn: float | None = None
+
+
+def read_image(path: Path) -> Pixels:
+    """Return the pixels of an image file, (rows, cols) or (rows, cols, 3), in the stored integer or float type.
+
+    An opaque alpha channel of a PNG is dropped. FrameError for a file that is missing, empty, truncated, too large, not
+    an image, or that holds several frames.
+    """
+    return only_frame(read_image_file(path).frames, str(path))
+
+
+def read_image_file(path: Path) -> ImageFile:
+    """Return all frames of an image file, and the colour filter pattern of a DNG; FrameError as for `read_image`.
+
+    Of an npz with several arrays, `FILE.npz:NAME` selects one.
+    """
+    path, name = _named_array(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FrameError(
+            f"{path} cannot be read: {error.strerror}", "Give the path of a readable image file."
+        ) from error
+    if not data:
+        raise FrameError(f"{path} is empty", "Copy the file again; the copy was interrupted.")
+    if path.suffix.lower() == ".dng":
+        return _read_dng(path, data)
+    return ImageFile(frames_of(_decode(path, data, name), str(path)))
+
+
+def only_frame(frames: tuple[Pixels, ...], name: str) -> Pixels:
+    """Return the frame of an image that has one; FrameError for a stack."""
+    if len(frames) > 1:
+        raise FrameError(
+            f"{name} holds {len(frames)} frames of the shape {frames[0].shape}, and one frame is read",
+            "Save the frame that is meant as a file of its own.",
+        )
+    return frames[0]
+
+
+def frames_of(array: Pixels, name: str) -> tuple[Pixels, ...]:
+    """Return the frames of an array in one of the layouts of this module; FrameError for another shape or type."""
+    if array.dtype.kind not in "ufi" or array.size > 3 * MAX_PIXELS:
+        raise FrameError(f"{name} holds {array.size} values of type {array.dtype}, which is no raw image")
+    if array.ndim in (3, 4) and array.shape[-1] == 4:
+        raise FrameError(
+            f"{name} has a fourth channel (shape {array.shape}), and only three can be colours",
+            "Save it without the fourth channel: (rows, cols) or (rows, cols, 3).",
+        )
+    match array.shape:
+        case (rows, cols):
+            shaped = array[None]
+        case (rows, cols, 1):
+            shaped = array[None, :, :, 0]
+        case (rows, cols, 3):
+            shaped = array[None]
+        case (n, rows, cols, 1 | 3) if 1 <= n <= min(rows, cols):
+            shaped = array[..., 0] if array.shape[3] == 1 else array
+        case (n, rows, cols) if 1 <= n <= min(rows, cols) and cols > 4:
+            shaped = array
+        case _:
+            rows = cols = 0
+    if min(rows, cols) < 1:
+        raise FrameError(
+            f"{name}: an image has rows and columns, and three channels or none; this has the shape {array.shape}",
+            "Save it as (rows, cols) or (rows, cols, 3); a stack of PSFs as (n, rows, cols).",
+        )
+    return tuple(shaped)
+
+
+def _named_array(path: Path) -> tuple[Path, str | None]:
+    """Return the path and the array's name of `FILE.npz:NAME`; other paths are returned with None."""
+    file, mark, name = str(path).rpartition(".npz:")
+    return (Path(file + ".npz"), name) if mark else (path, None)
+
+
+def _decode(path: Path, data: bytes, name: str | None) -> Pixels:
+    """Return the pixels in the bytes of a file, decoded by its suffix; FrameError if damaged or of unknown suffix."""
+    try:
+        match path.suffix.lower():
+            case ".npy":
+                return np.asarray(np.load(BytesIO(data), allow_pickle=False))
+            case ".npz":
+                return _decode_npz(path, data, name)
+            case ".tif" | ".tiff":
+                return _decode_tiff(data)
+            case ".png":
+                return _decode_png(path, data)
+    except FrameError:
+        raise
+    except _DECODER_ERRORS as error:
+        raise FrameError(
+            f"{path} is not a whole {path.suffix[1:]} image: {_one_line(error)}",
+            "Copy or export the file again; its content does not fit its ending.",
+        ) from error
+    raise FrameError(
+        f"{path}: the ending '{path.suffix}' is not one of {', '.join(READABLE)}",
+        "Convert it without loss, for example to tiff or npy.",
+    )
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, UnidentifiedImageError):
+        return "it begins like no image"
+    return " ".join(str(error).split()) or "too large"
+
+
+def _decode_npz(path: Path, data: bytes, name: str | None) -> Pixels:
+    """Return the only array of an npz, or the named one; FrameError lists the names, ValueError if it is too large."""
+    with zipfile.ZipFile(BytesIO(data)) as archive:
+        claimed_bytes = sum(member.file_size for member in archive.infolist())
+    if claimed_bytes > MAX_COMPRESSION_RATIO * len(data) or claimed_bytes > 24 * MAX_PIXELS:
+        raise ValueError(f"{len(data)} bytes cannot hold the {claimed_bytes} that it promises")
+    with np.load(BytesIO(data), allow_pickle=False) as arrays:
+        names = list(arrays.files)
+        if name is None and len(names) == 1:
+            name = names[0]
+        if name not in names:
+            held, first = ", ".join(names) or "no array", names[0] if names else "NAME"
+            raise FrameError(f"{path} holds {held}", f"Name the array that is meant, as in {path.name}:{first}.")
+        return np.asarray(arrays[name])
+
+
+def _decode_tiff(data: bytes) -> Pixels:
+    """Return the pixels of a TIFF; ValueError for a header that claims more data than the file or MAX_PIXELS allow.
+
+    Decoding such a file would take minutes and all memory. Channels stored as planes are moved to the last axis.
+    """
+    with tifffile.TiffFile(BytesIO(data)) as tiff:
+        series = tiff.series[0]
+        claimed_bytes = series.nbytes
+        if claimed_bytes > MAX_COMPRESSION_RATIO * len(data) or series.size > 3 * MAX_PIXELS:
+            raise ValueError(f"{len(data)} bytes cannot hold the {claimed_bytes} that it promises")
+        pixels = np.asarray(tiff.asarray())
+        planes = series.axes.find("S")
+        return np.moveaxis(pixels, planes, -1) if 0 <= planes < pixels.ndim - 1 else pixels
+
+
+def _decode_png(path: Path, data: bytes) -> Pixels:
+    """Return the pixels of a PNG; FrameError for 16 bits with an alpha channel and for transparent pixels."""
+    _refuse_16_bit_alpha_png(path, data)
+    if data[24:26] == _RGB_16_BIT:
+        return _decode_16_bit_colour_png(data)
+    with Pillow.open(BytesIO(data)) as picture:
+        picture.load()
+        if picture.has_transparency_data and picture.convert("RGBA").getchannel("A").getextrema() != (255, 255):
+            raise FrameError(f"{path} has transparent pixels, which are no counts", "Save it without transparency.")
+        modes = {"P": "RGB", "LA": "L", "PA": "RGB", "RGBA": "RGB"}
+        return np.asarray(picture.convert(modes[picture.mode]) if picture.mode in modes else picture)
+
+
+def _read_dng(path: Path, data: bytes) -> ImageFile:
+    """Return the mosaic of an uncompressed DNG with its pattern and black level; FrameError for another DNG."""
+    try:
+        with tifffile.TiffFile(BytesIO(data)) as tiff:
+            pages = [inner for page in tiff.pages for inner in (page, *(page.pages or ()))]
+            raws = [page for page in pages if isinstance(page, tifffile.TiffPage) and page.photometric in _DNG_RAW]
+            if not raws:
+                raise FrameError(f"{path} holds no raw image", "Give the DNG as the camera wrote it, or a tiff or npy.")
+            page = max(raws, key=lambda page: page.size)
+            _refuse_packed_dng(path, page)
+            letters = "".join("rgb"[int(value)] for value in _dng_values(page, "CFAPattern") if value in (0, 1, 2))
+            black = _dng_values(page, "BlackLevel")
+            frames = frames_of(np.asarray(page.asarray()), str(path))
+            known = next((known for known in PATTERNS if known == letters), None)
+            return ImageFile(frames, known, sum(black) / len(black) if black else None)
+    except FrameError:
+        raise
+    except _DECODER_ERRORS as error:
+        raise FrameError(
+            f"{path} is not a whole dng image: {_one_line(error)}", "Copy the file again; its content is damaged."
+        ) from error
+
+
+def _refuse_packed_dng(path: Path, page: tifffile.TiffPage) -> None:
+    """Raise FrameError for a DNG that is compressed, or whose counts are not whole bytes: both need another decoder."""
+    plain = page.compression == tifffile.COMPRESSION.NONE
+    if not plain or page.bitspersample not in (8, 16):
+        kind = "packed" if plain else f"compressed (method {int(page.compression)})"
+        raise FrameError(
+            f"{path} is a {kind} DNG of {page.bitspersample} bits; only plain 8 and 16 bits are read",
+            "Convert it to an uncompressed 16-bit DNG, or save its mosaic as tiff or npy.",
+        )
+
+
+def _dng_values(page: tifffile.TiffPage, name: str) -> list[float]:
+    """Return the values of a tag, fractions divided; empty if the page has no such tag."""
+    tag = page.tags.get(name)
+    if tag is None:
+        return []
+    value = tag.value
+    values = [float(one) for one in (value if isinstance(value, tuple | bytes | list) else (value,))]
+    if tag.dtype in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
+        return [top / bottom for top, bottom in zip(values[::2], values[1::2], strict=True)]
+    return values
+
+
+def _decode_16_bit_colour_png(data: bytes) -> Pixels:
+    """Return the uint16 pixels of a 16-bit RGB PNG, (rows, cols, 3).
+
+    Pillow has no such image: its mode RGB takes the first byte of each value. The second byte is the result of a second
+    decoding with the byte order of the values exchanged.
+    """
+    halves = []
+    for order in ("RGB;16B", "RGB;16L"):
+        with Pillow.open(BytesIO(data)) as picture:
+            assert isinstance(picture, PngImageFile)
+            picture.tile = [tile._replace(args=order) for tile in picture.tile]
+            picture.load()
+            halves.append(np.asarray(picture).astype(np.uint16))
+    return (halves[0] << np.uint16(8)) | halves[1]
+
+
+def _refuse_16_bit_alpha_png(path: Path, data: bytes) -> None:
+    """Raise FrameError for a 16-bit PNG with an alpha channel: the decoder would silently keep 8 bits per channel."""
+    depth, colour = data[24:25], data[25:26]  # of the header, which the format fixes
+    if data[1:4] == b"PNG" and depth == b"\x10" and colour in b"\x04\x06":
+        raise FrameError(f"{path} holds 16-bit colour, which a png here cannot bring whole", "Save it as tiff or npy.")
+
+
+def is_marked_simulated(path: Path) -> bool:
+    """Return true if a TIFF's description marks it as simulated, as in every raw of the simulator; else false."""
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            facts = json.loads(tiff.pages.first.description)
+    except (*_DECODER_ERRORS, AttributeError):  # not a tiff, or one without such a description
+        return False
+    return isinstance(facts, dict) and facts.get("simulated") is True
+
+
+def write_linear(path: Path, picture: Image) -> None:
+    """Write a linear float32 picture as `.npy`, `.tif` or `.tiff`, by the suffix; SettingError for another suffix."""
+    match path.suffix.lower():
+        case ".npy":
+            np.save(path, picture)
+        case ".tif" | ".tiff":
+            tifffile.imwrite(path, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
+        case other:
+            raise SettingError(f"{path}: linear pictures are written as .npy or .tiff, not '{other}'")
+
+
+@dataclass(frozen=True)
+class Raw:
+    """Raw image for the solver: uint16 counts or float32, (rows, cols) or (rows, cols, 3).
+
+    `white_dn` is the saturation level (infinite for float) and `bad` the mask of invalid pixels, (rows, cols). `shift`
+    is the number of bits by which left-justified data were shifted right, `stored_bits` the bits of one stored value.
+    """
+
+    pixels: NDArray[np.uint16] | NDArray[np.float32]
+    white_dn: float
+    bad: Mask
+    shift: int
+    stored_bits: int
+
+
+def as_raw(array: Pixels, name: str = "this image") -> Raw:
+    """Return pixels of any integer or float type as `Raw`; FrameError for negative or more than 16-bit integers.
+
+    12-bit data in 16-bit words are often left-justified by 4 bits. Then almost every count is a multiple of 16: counts
+    are shifted right, and the few that are no multiple become bad pixels. NaN and infinite values become 0 and bad.
+    """
+    if array.dtype.kind == "f":
+        invalid = ~np.isfinite(array)
+        return Raw(
+            np.where(invalid, 0, array).astype(np.float32), float("inf"), _any_channel(invalid), 0, 8 * array.itemsize
+        )
+    if array.dtype.kind == "i" and array.size and array.min() < 0:
+        raise FrameError(
+            f"{name} holds negative whole numbers, which no sensor counts",
+            "Save the counts as the camera gave them, or the difference of two frames as float.",
+        )
+    if array.max() > 65535:
+        raise FrameError(f"{name} counts up to {array.max()}, more than 16 bits", "Give counts of at most 16 bits.")
+    counts = array.astype(np.uint16)
+    shift, stray = _justification(counts)
+    counts = counts >> np.uint16(shift)
+    bad = _any_channel(stray)
+    top = int(counts[~bad].max()) if not bad.all() else 0
+    bits = next(bits for bits in (8, 10, 12, 14, 16) if top < 2**bits)
+    return Raw(counts, float(2**bits - 1), bad, shift, 8 * array.itemsize)
+
+
+def _any_channel(mask: Mask) -> Mask:
+    """Return the (rows, cols) mask of pixels with at least one channel set in `mask`, (rows, cols) or with channels."""
+    return mask if mask.ndim == 2 else np.logical_or.reduce(mask, axis=2)
+
+
+def _justification(counts: NDArray[np.uint16]) -> tuple[int, Mask]:
+    """Return the left shift of the data in bits (8, 6, 4, 2 or 0), and the mask of values that do not fit it."""
+    lit = int(np.count_nonzero(counts))  # zeros fit every justification and are no evidence
+    for shift in (8, 6, 4, 2):
+        stray = (counts & np.uint16(2**shift - 1)) != 0
+        if stray.sum() <= 1e-4 * lit and (counts[~stray] >> shift).max(initial=0) > 255:
+            return shift, stray
+    return 0, np.zeros(counts.shape, np.bool_)
+
+
+def as_psf(array: Pixels, name: str) -> Psf:
+    """Return a measured PSF image as a Psf: justification undone, invalid pixels zeroed, pedestal subtracted, sum 1.
+
+    A pedestal of mass beta makes every picture (1 + beta) times too bright away from its mean (NUMERICS.md 3.5, item
+    6). Therefore the median of the border pixels is subtracted. Negative values stay: clipping would add mass again.
+    The channels of a colour PSF are averaged. PsfError for NaN, infinite values, negative integers, an even or
+    saturated image, or a sum <= 0.
+    """
+    return _cleaned(psf_counts(array, name), name)
+
+
+def clean_channels(raw: Raw, name: str) -> tuple[Psf, ...]:
+    """Return the PSF of each channel of `psf_counts`, cleaned as by `as_psf`; one PSF for a grey PSF.
+
+    Three equal channels are a grey PSF.
+    """
+    pixels = raw.pixels
+    if pixels.ndim == 2:
+        return (_cleaned(raw, name),)
+    if np.array_equal(pixels[..., 0], pixels[..., 1]) and np.array_equal(pixels[..., 0], pixels[..., 2]):
+        return (_cleaned(replace(raw, pixels=pixels[..., 0]), name),)
+    return tuple(_cleaned(replace(raw, pixels=pixels[..., c]), name) for c in range(3))
+
+
+def psf_counts(array: Pixels, name: str) -> Raw:
+    """Return the pixels of a PSF image as `Raw`; PsfError if they are not numbers, or negative counts."""
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise PsfError(f"{name} holds values that are not numbers (NaN or infinite)", MEASURE_PSF)
+    try:
+        return as_raw(array, name)
+    except FrameError as error:
+        raise PsfError(error.message, error.remedy) from error
+
+
+def saturated_share(psf: Psf, raw: Raw, white_dn: float | None = None) -> float:
+    """Return the share of light in more than 8 pixels at the converter's limit (floats: at the maximum); else 0.0.
+
+    `raw` holds the counts of the PSF, `white_dn` its saturation level if that is known.
+    """
+    brightest = raw.pixels if raw.pixels.ndim == 2 else raw.pixels.max(axis=2)
+    white = min(raw.white_dn, float("inf") if white_dn is None else white_dn)
+    top = (brightest >= min(white, float(brightest.max()))) if np.isinf(white) else brightest >= white
+    if np.count_nonzero(top) <= MIN_SATURATED_PIXELS:
+        return 0.0
+    return float(psf.pixels[top].sum(dtype=np.float64))
+
+
+def _cleaned(raw: Raw, name: str) -> Psf:
+    """Return the PSF of counts, averaged over the channels, without pedestal and invalid pixels; see `as_psf`."""
+    top = raw.pixels.max()
+    if top > 0 and raw.pixels.min() == top:
+        what = "saturated" if top >= raw.white_dn else "even"
+        raise PsfError(f"{name} is {what}: every pixel has the value {top:g}", MEASURE_PSF)
+    pixels = raw.pixels.astype(np.float32)
+    if pixels.ndim == 3:
+        pixels = pixels.mean(axis=2)
+    good = ~raw.bad
+    edge = max(1, min(pixels.shape) // 50)
+    border = np.ones(pixels.shape, np.bool_)
+    border[edge:-edge, edge:-edge] = False
+    pedestal = float(np.median(pixels[border & good])) if (border & good).any() and min(pixels.shape) > 8 else 0.0
+    pixels = np.where(good, pixels - np.float32(pedestal), np.float32(0))
+    try:
+        return Psf(pixels, name)
+    except PsfError as error:
+        raise PsfError(error.message, MEASURE_PSF) from error
+
+
+def require_same_shape(psfs: tuple[Psf, ...], shape: tuple[int, int]) -> None:
+    """Raise PsfError for PSFs of another shape than the raw: another camera mode has another scale."""
+    for psf in psfs:
+        require_raw_shape(psf.name, psf.shape, shape)
+
+
+def require_raw_shape(name: str, psf: tuple[int, int], raw: tuple[int, int]) -> None:
+    """Raise PsfError if a PSF, `name`, has other rows or columns than the raw."""
+    if psf != raw:
+        raise PsfError(
+            f"{name} has {psf[0]} x {psf[1]} pixels, the raw {raw[0]} x {raw[1]}",
+            "Turn the PSF by a quarter, as the raw is stored."
+            if psf == raw[::-1]
+            else "Give the PSF that was measured in the same camera mode as the raw.",
+        )
+
+
+def read_psf(path: Path) -> Psf:
+    """Return the PSF in an image file, cleaned by `as_psf`; PsfError for a file that is no image or no PSF."""
+    try:
+        array = read_image(path)
+    except FrameError as error:
+        raise PsfError(error.message, error.remedy) from error
+    return as_psf(array, path.name)

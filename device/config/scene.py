@@ -1,0 +1,179 @@
+"""Scene of a simulated head: table [sim] with object, eye, light, sensor and calibration.
+
+Every default is the absence of an effect, so a scene file holds only its effects.
+"""
+
+from math import hypot
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+
+from device import plugins
+from device.config.toml_file import Table, check_table
+
+WIDEST_GAZE_DEG = 30.0
+T = TypeVar("T", bound=Table)
+
+
+class ObjectSpec(Table):
+    """Object of a scene. Lengths on a screen or print are measured on its surface, at the eye's focal length.
+
+    `retina` is drawn from the scene's seed with these numbers of lesions; `image` is a photograph; `dots` are a lattice
+    of discs; `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
+    one disc of `dot_um`. All are moved by `at_deg` (right, down). `size_deg` is the width of a drawn retina or
+    photograph; None: as wide as the field needs.
+    """
+
+    kind: Literal["retina", "image", "dots", "ruler", "point"] = "retina"
+    haemorrhages: int = Field(default=0, ge=0, le=1000)
+    microaneurysms: int = Field(default=0, ge=0, le=1000)
+    exudates: int = Field(default=0, ge=0, le=1000)
+    image: Path | None = None
+    dot_um: float = Field(default=275.0, gt=0, le=5000)
+    dots_apart_um: float = Field(default=2000.0, gt=0, le=20000)
+    half_size_um: tuple[float, float] = (12000.0, 6000.0)  # of the lattice: right, down
+    polarity: Literal["positive", "negative"] = "positive"
+    length_um: float = Field(default=15000.0, gt=0, le=50000)
+    ticks_um: float = Field(default=1000.0, gt=0, le=10000)
+    stroke_um: float = Field(default=220.0, gt=0, le=5000)
+    at_deg: tuple[float, float] = (0.0, 0.0)
+    size_deg: float | None = Field(default=None, gt=0, lt=120)
+
+    @field_validator("image")
+    @classmethod
+    def _relative_to_scene_file(cls, image: Path | None, info: ValidationInfo) -> Path | None:
+        """Return the path resolved relative to the scene file; ValueError if there is no such file."""
+        path = image if image is None or info.context is None else info.context["folder"] / image
+        if path is not None and not path.is_file():
+            raise ValueError(f"there is no image {path}; give the path of a photograph")
+        return path
+
+    @model_validator(mode="after")
+    def _check_image(self) -> "ObjectSpec":
+        """Raise ValueError unless the key `image` is given for kind "image", and only for it."""
+        if self.kind == "image" and self.image is None:
+            raise ValueError('kind = "image" needs the key image, the path of a photograph')
+        if self.kind != "image" and self.image is not None:
+            raise ValueError(f'the key image goes with kind = "image", not with "{self.kind}"')
+        return self
+
+
+class EyeSpec(Table):
+    """Eye in front of the instrument, and the surface that it shows.
+
+    `shown_by`: `screen` is self-luminous; `print` is paper lit by the ring; `model eye` and `human eye` have a lit
+    fundus. Refraction (M, J0, J45) as wavefront: positive M is myopia. A `flat` surface is the paper's screen, a
+    `curved` one follows the eye's focus. `axial_um` is the distance of the pupil from the relay's focus, `decentred_um`
+    its distance from the axis.
+    """
+
+    shown_by: Literal["screen", "print", "model eye", "human eye"] = "model eye"
+    surface: Literal["curved", "flat"] = "curved"
+    focal_length_um: float = Field(default=25000.0, ge=10000, le=60000)
+    m_dpt: float = Field(default=0.0, ge=-20, le=20)
+    j0_dpt: float = Field(default=0.0, ge=-6, le=6)
+    j45_dpt: float = Field(default=0.0, ge=-6, le=6)
+    pupil_um: float = Field(default=7700.0, ge=1000, le=9000)
+    decentred_um: float = Field(default=0.0, ge=0, le=5000)
+    axial_um: float = Field(default=0.0, ge=-20000, le=20000)
+    walks: bool = False  # beam walk over the iris at wide angles, as the paper measured (OPTICS.md 1.4)
+    gaze_deg: tuple[float, float] = (0.0, 0.0)  # right, down
+    drift_deg_per_s: float = Field(default=0.0, ge=0, le=200)
+
+    @field_validator("gaze_deg")
+    @classmethod
+    def _check_gaze(cls, gaze_deg: tuple[float, float]) -> tuple[float, float]:
+        """Raise ValueError for a gaze of more than 30 degrees."""
+        if hypot(*gaze_deg) > WIDEST_GAZE_DEG:
+            raise ValueError(f"a gaze of {gaze_deg} is {hypot(*gaze_deg):.1f} deg off; allowed: {WIDEST_GAZE_DEG:g}")
+        return gaze_deg
+
+
+class LightFlaws(Table):
+    """Flaws of the illumination: ambient and stray light, corneal reflex, unequal LEDs, ring offset, falloff."""
+
+    ambient: float = Field(default=0.0, ge=0, le=10)  # light without the lamp, share of the mean signal
+    stray: float = Field(default=0.0, ge=0, le=10)  # even light with the lamp, share of the mean signal
+    polariser_leak: float = Field(default=0.0, ge=0, le=1)  # of the corneal reflex, through crossed polarisers
+    ring_um: float = Field(default=9500.0, gt=0, le=20000)  # diameter of the LED ring, before the relay
+    led_spread: float = Field(default=0.0, ge=0, le=1)  # from one LED of the ring to the next
+    ring_offset_um: float = Field(default=0.0, ge=-50000, le=50000)  # of the ring from the pupil's conjugate plane
+    dead_led: int | None = Field(default=None, ge=0, le=255)  # this LED of the ring stays dark
+    falloff: bool = False  # Lambert and the eye's cos^3 towards the field's edge (OPTICS.md 3.5)
+    vignette_deg: float | None = Field(default=None, gt=0, le=180)  # angle of exp(-1), in addition to falloff
+
+
+class SensorFlaws(Table):
+    """Flaws of the sensor: PRNU, DSNU, dark current, hot pixels, nonlinearity, rolling shutter, Bayer mosaic."""
+
+    prnu: float = Field(default=0.0, ge=0, le=0.2)  # spread of the pixels' response
+    dsnu_e: float = Field(default=0.0, ge=0, le=1000)
+    dark_e_per_s: float = Field(default=0.0, ge=0, le=1e5)  # at 25 C
+    dark_doubling_c: float = Field(default=7.0, gt=0, le=100)
+    hot_pixels: float = Field(default=0.0, ge=0, le=0.05)  # their share
+    nonlinearity: float = Field(default=0.0, ge=-0.2, le=0.2)  # quadratic, at full well
+    line_s: float = Field(default=0.0, ge=0, le=1e-3)  # from one row to the next, of a rolling shutter
+    bayer: bool = False  # a colour sensor under one colour of light
+
+
+class CalibrationSpec(Table):
+    """Conditions of the simulated PSF measurement: refraction of the eye, source size, diffuser distance (or None)."""
+
+    m_dpt: float = Field(default=0.0, ge=-20, le=20)
+    j0_dpt: float = Field(default=0.0, ge=-6, le=6)
+    j45_dpt: float = Field(default=0.0, ge=-6, le=6)
+    source_um: float = Field(default=0.0, ge=0, le=2000)  # of the dot, on the screen
+    diffuser_to_sensor_um: float | None = Field(default=None, gt=0)
+
+
+def _require_installed(effect: str) -> str:
+    """Return the name of an effect of an installed package; ValueError if no package declares it. Nothing is loaded."""
+    known = plugins.installed(plugins.EFFECTS)
+    if effect not in known:
+        raise ValueError(
+            f"no installed package has the effect '{effect}' (installed: {', '.join(known) or 'none'}); install the "
+            f"package that declares it under {plugins.EFFECTS}, or remove this table"
+        )
+    return effect
+
+
+def _require_tables(effects: object) -> object:
+    """Return the tables of effects unchanged; ValueError unless each is a table, which may be empty."""
+    for name, table in effects.items() if isinstance(effects, dict) else [("NAME", effects)]:
+        if not isinstance(table, dict):
+            raise ValueError(f"an effect of a plug-in has a table [sim.effects.{name}], not {table!r}")
+    return effects
+
+
+EffectTables = Annotated[
+    dict[Annotated[str, AfterValidator(_require_installed)], dict[str, object]], BeforeValidator(_require_tables)
+]
+
+
+class SimSpec(Table):
+    """Scene: object, eye, light, sensor and calibration of a simulated head.
+
+    `peak_e` is the charge of the brightest pixel in one exposure in green at full drive, electrons. `effects` has a
+    table for each effect of a plug-in that the scene uses, [sim.effects.NAME]; the plug-in checks its keys.
+    """
+
+    seed: int = 1
+    peak_e: float = Field(default=15000.0, gt=0, le=1e7)
+    object: ObjectSpec = ObjectSpec()
+    eye: EyeSpec = EyeSpec()
+    light: LightFlaws = LightFlaws()
+    sensor: SensorFlaws = SensorFlaws()
+    calibration: CalibrationSpec = CalibrationSpec()
+    effects: EffectTables = Field(default_factory=dict)
+
+    def __hash__(self) -> int:
+        """Return the hash of all values as JSON: the tables of effects are mappings, which have none of their own."""
+        return hash(self.model_dump_json())
+
+    def effect_settings(self, name: str, kind: type[T]) -> T:
+        """Return the table [sim.effects.NAME] as a `kind`, with its defaults if the scene has no such table.
+
+        SpecError for an unknown key or a value out of its range.
+        """
+        return check_table(self.effects.get(name, {}), kind, f"sim.effects.{name}")

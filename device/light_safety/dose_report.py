@@ -1,0 +1,17 @@
+"""Light figures of one exposure, for its report."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class DoseReport:
+    """Light of one exposure: its dose, the dose of each eye in 24 h, the limit (all J/cm2), eyes above the warning.
+
+    None and empty where the report of an earlier release has no figure.
+    """
+
+    dose_j_per_cm2: float | None = None
+    dose_24h_j_per_cm2: Mapping[str, float] = field(default_factory=dict)
+    dose_stop_j_per_cm2: float | None = None
+    dose_high: tuple[str, ...] = ()

@@ -1,0 +1,194 @@
+"""Retinal light hazard: weighted irradiances and doses, against the limits of `limits.toml` (ISO 15004-2)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from math import exp, floor, log
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from device.config.radiometry import FIELD_DEG, WAIST_CM2, RadiometrySpec
+from device.config.toml_file import Table, load_toml
+from device.errors import LightLimit, SpecError
+from device.optics.illumination import LED, LEDS, TRANSMISSION_TO_EYE, photon_budget
+from device.values import Colour, Illumination
+
+LIMITS = Path(__file__).with_name("limits.toml")
+LED_POWER_UNCERTAINTY = 2.0  # uncertainty factor of the LEDs' power (device/optics/illumination.py)
+
+
+class _Source(Table):
+    """Source of a number: edition and clause of the standard; `checked`: compared with the purchased standard."""
+
+    edition: str = Field(min_length=1)
+    clause: str = Field(min_length=1)
+    checked: bool
+
+
+class _Rate(_Source):
+    limit: float = Field(gt=0)
+    share: float = Field(gt=0, le=1)
+
+
+class _Micro(_Rate):
+    unit: Literal["uW/cm2"]
+
+
+class _Watts(_Rate):
+    unit: Literal["W/cm2"]
+
+
+class _Dose(_Rate):
+    unit: Literal["J/cm2"]
+    warn_share: float = Field(gt=0, le=1)
+    window_h: float = Field(ge=24)
+
+
+class Weight(_Source):
+    """Spectral weight over wavelength (`nm`, ascending), interpolated linearly in the logarithm of the weight."""
+
+    nm: tuple[float, ...] = Field(min_length=2)
+    weight: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _is_a_function(self) -> "Weight":
+        if len(self.nm) != len(self.weight) or any(b <= a for a, b in pairwise(self.nm)) or min(self.weight) <= 0:
+            raise ValueError("nm must rise, and every nm have a weight above 0")
+        return self
+
+    def at(self, wavelength_um: float) -> float:
+        """Return the weight at a wavelength, um; SpecError outside the table."""
+        nm = round(1000 * wavelength_um, 6)
+        for (low, at_low), (high, at_high) in pairwise(zip(self.nm, self.weight, strict=True)):
+            if low <= nm <= high:
+                return exp(log(at_low) + (log(at_high) - log(at_low)) * (nm - low) / (high - low))
+        raise SpecError(f"light of {nm:g} nm has no weight between {self.nm[0]:g} and {self.nm[-1]:g} nm")
+
+
+class Limits(Table):
+    """Limits of `limits.toml`; the properties are this instrument's limits: standard value times permitted share."""
+
+    photochemical_irradiance: _Micro
+    photochemical_dose: _Dose
+    thermal_irradiance: _Watts
+    waist_irradiance: _Watts
+    photochemical_weight: Weight
+    thermal_weight: Weight
+
+    @property
+    def photochemical_w_per_cm2(self) -> float:
+        """Return the limit of the A-weighted retinal irradiance, W/cm2."""
+        return self.photochemical_irradiance.limit * self.photochemical_irradiance.share * 1e-6
+
+    @property
+    def thermal_w_per_cm2(self) -> float:
+        """Return the limit of the R-weighted retinal irradiance, W/cm2."""
+        return self.thermal_irradiance.limit * self.thermal_irradiance.share
+
+    @property
+    def waist_w_per_cm2(self) -> float:
+        """Return the limit of the irradiance in the waist of the beam, W/cm2."""
+        return self.waist_irradiance.limit * self.waist_irradiance.share
+
+    @property
+    def stop_j_per_cm2(self) -> float:
+        """Return the largest permitted A-weighted retinal dose of an eye within `window_s`, J/cm2."""
+        return self.photochemical_dose.limit * self.photochemical_dose.share
+
+    @property
+    def warn_j_per_cm2(self) -> float:
+        """Return the dose of an eye within `window_s` above which a picture's report warns, J/cm2."""
+        return self.photochemical_dose.limit * self.photochemical_dose.warn_share
+
+    @property
+    def window_s(self) -> float:
+        """Return how long a dose counts, s (at least 24 h)."""
+        return self.photochemical_dose.window_h * 3600
+
+
+def light_limits(path: Path = LIMITS) -> Limits:
+    """Return the limits in `limits.toml`; SpecError if the file is missing or damaged: there is no default."""
+    return load_toml(path, Limits)
+
+
+@dataclass(frozen=True)
+class Beam:
+    """Unweighted irradiances at the eye from the ring at full drive in one colour; guard factors are included."""
+
+    wavelength_um: float
+    retina_w_per_cm2: float
+    waist_w_per_cm2: float
+
+
+Radiometry = Mapping[Colour, Beam]
+NO_LIGHT: Radiometry = {colour: Beam(led.wavelength_um, 0.0, 0.0) for colour, led in LED.items()}  # for a recording
+
+
+def radiometry(measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS) -> Radiometry:
+    """Return the beam of each colour: as measured, times the guard factor; if unmeasured, the worst case."""
+    found: dict[Colour, Beam] = {}
+    for colour in LED:
+        spec = measured.beam(colour) if measured else None
+        if measured is None or spec is None:
+            found[colour] = worst_beam(colour, field_deg, leds)
+        else:
+            scale = measured.guard_factor / 1000
+            found[colour] = Beam(spec.wavelength_um, scale * spec.retina_mw_per_cm2, scale * spec.waist_mw_per_cm2)
+    return found
+
+
+def worst_beam(colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS) -> Beam:
+    """Return the worst-case beam of an unmeasured colour: lossless optics, and LEDs brighter by the uncertainty factor.
+
+    `retina` holds the light of all `leds` LEDs, `waist` that of one LED: the LEDs are further apart than the disc of 1
+    mm over which the waist irradiance is averaged.
+    """
+    budget = photon_budget(colour, pitch_um=1.0, field_deg=field_deg)
+    scale = LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE / 1000
+    return Beam(
+        LED[colour].wavelength_um,
+        scale * budget.retina_mw_per_cm2 * leds / LEDS,
+        scale * budget.cornea_mw / LEDS / WAIST_CM2,
+    )
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """Calculation of irradiances and doses of an illumination of this head, and the check against the limits."""
+
+    beams: Radiometry
+    limits: Limits
+
+    def photochemical_w_per_cm2(self, glow: Illumination) -> float:
+        """Return the A-weighted irradiance of the retina, W/cm2."""
+        beam = self.beams[glow.colour]
+        return glow.level * beam.retina_w_per_cm2 * self.limits.photochemical_weight.at(beam.wavelength_um)
+
+    def thermal_w_per_cm2(self, glow: Illumination) -> float:
+        """Return the R-weighted irradiance of the retina, W/cm2."""
+        beam = self.beams[glow.colour]
+        return glow.level * beam.retina_w_per_cm2 * self.limits.thermal_weight.at(beam.wavelength_um)
+
+    def waist_w_per_cm2(self, glow: Illumination) -> float:
+        """Return the irradiance in the waist of the beam, unweighted, W/cm2."""
+        return glow.level * self.beams[glow.colour].waist_w_per_cm2
+
+    def dose_j_per_cm2(self, glow: Illumination, duration_s: float) -> float:
+        """Return the A-weighted retinal dose of an illumination of this duration, J/cm2."""
+        return self.photochemical_w_per_cm2(glow) * max(0.0, duration_s)
+
+    def refuse(self, glow: Illumination) -> None:
+        """Raise LightLimit, with the permitted level, if an illumination exceeds any of the three irradiance limits."""
+        limits = self.limits
+        times = max(
+            self.photochemical_w_per_cm2(glow) / limits.photochemical_w_per_cm2,
+            self.thermal_w_per_cm2(glow) / limits.thermal_w_per_cm2,
+            self.waist_w_per_cm2(glow) / limits.waist_w_per_cm2,
+        )
+        if times > 1:
+            raise LightLimit(
+                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
+                f"Dim it to {floor(1000 * glow.level / times) / 10:g} % or less, or have the head's light measured.",
+            )

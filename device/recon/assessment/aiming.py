@@ -1,0 +1,119 @@
+"""Aiming guidance: one instruction for the operator, from the frames of the live picture."""
+
+from dataclasses import dataclass
+from math import hypot
+from typing import Literal
+
+import numpy as np
+
+from device.recon.assessment.frame_quality import LEAST_COVERAGE, LEAST_WIDE, MOST_WIDE, ONE_SIDED, FrameFigures
+from device.recon.assessment.image_quality import LEAST_THROUGH, MOST_SATURATED
+from device.values import Image
+
+AimCode = Literal["ready", "noeye", "closer", "back", "left", "right", "up", "down", "still", "dark", "bright"]
+MIN_DISPLAY_S = 0.7  # minimum display time of an instruction, so that it can be read
+LEAST_E_PER_UM2 = 0.1  # of a live frame, which gets less light than a picture
+MOST_DEG_PER_SHOT = 0.5  # of motion during one exposure: the size of the finest resolved detail
+MAX_FRAME_GAP_S = 1.0  # longest interval between two frames for an estimate of the speed
+FIELD_MARGIN = 0.85
+VESSELS = (4, 20)  # cycles across the picture: lower is illumination, higher is noise
+
+
+@dataclass(frozen=True)
+class Aim:
+    """One instruction code for the operator, and the lit share of the field, 0 to 1 (0 for `noeye` or if unknown)."""
+
+    code: AimCode
+    fill: float
+
+
+class AimingGuide:
+    """Aiming instructions from a sequence of live frames: position of the light, and motion. Not thread-safe.
+
+    Directions are those of the picture: "right" means that the light of the pupil is on the right, and the camera must
+    move there. "closer" and "back" follow the simulated relay: a pupil beyond its focus spreads the light on the
+    sensor. `shot_s` is the exposure time of a capture in seconds, `deg_per_sample` the width of a sample of the
+    pictures; with None motion is ignored.
+    """
+
+    def __init__(self, shot_s: float, deg_per_sample: float | None) -> None:
+        self._most_deg_per_s, self._deg_per_sample = MOST_DEG_PER_SHOT / shot_s, deg_per_sample
+        self._before: Image | None = None
+        self._before_s = self._since_s = float("-inf")
+        self.aim = Aim("noeye", 0.0)
+
+    def __call__(self, reading: FrameFigures, picture: Image | None, now_s: float) -> Aim:
+        """Return the instruction after one more frame, exposed at `now_s` on the instrument's clock.
+
+        The code changes at most once in MIN_DISPLAY_S. `reading` holds the figures of the frame, `picture` is its
+        coarse picture, None without a known field.
+        """
+        code = _instruction(reading, self._speed_deg_per_s(reading, picture, now_s) > self._most_deg_per_s)
+        fill = 0.0 if code == "noeye" else min(max(reading.coverage or 0.0, 0.0), 1.0)
+        if code != self.aim.code and now_s - self._since_s < MIN_DISPLAY_S:
+            code = self.aim.code
+        elif code != self.aim.code:
+            self._since_s = now_s
+        self.aim = Aim(code, round(fill, 2))
+        return self.aim
+
+    def eye_was_visible(self, now_s: float) -> bool:
+        """Return True if the last live frame showed an eye, and is less than MAX_FRAME_GAP_S before `now_s`."""
+        return self._before is not None and now_s - self._before_s < MAX_FRAME_GAP_S
+
+    def _speed_deg_per_s(self, reading: FrameFigures, picture: Image | None, now_s: float) -> float:
+        """Return the speed of the picture in degrees per second since the previous frame; 0 if unknown."""
+        before, before_s = self._before, self._before_s
+        is_eye = picture is not None and reading.through is not None and reading.through >= LEAST_THROUGH
+        self._before, self._before_s = (picture.copy() if picture is not None and is_eye else None), now_s
+        step_s = now_s - before_s
+        if before is None or self._before is None or self._deg_per_sample is None or not 0 < step_s < MAX_FRAME_GAP_S:
+            return 0.0
+        return moved_samples(before, self._before) * self._deg_per_sample / step_s
+
+
+def _instruction(seen: FrameFigures, is_moving: bool) -> AimCode:
+    """Return the code of the first rule that applies: dark, bright, no eye, direction, distance, motion, ready."""
+    if seen.light_e_per_um2 is not None and seen.light_e_per_um2 < LEAST_E_PER_UM2 and seen.saturated == 0:
+        return "noeye" if seen.through is None or seen.through < LEAST_THROUGH else "dark"
+    if seen.saturated > MOST_SATURATED:
+        return "bright"
+    if seen.through is not None and seen.through < LEAST_THROUGH:
+        return "noeye"
+    if (direction := _direction(seen)) is not None:
+        return direction
+    return "still" if is_moving else "ready"
+
+
+def _direction(seen: FrameFigures) -> AimCode | None:
+    """Return the direction in which the camera must move, sideways before "closer" or "back"; None if none."""
+    right, down = seen.off_x or 0.0, seen.off_y or 0.0
+    if hypot(right, down) > ONE_SIDED:
+        if abs(right) > abs(down):
+            return "right" if right > 0 else "left"
+        return "down" if down > 0 else "up"
+    if seen.wide is not None and seen.wide > MOST_WIDE:
+        return "closer"
+    if seen.wide is not None and seen.wide < LEAST_WIDE:
+        return "back"
+    return "closer" if seen.coverage is not None and seen.coverage < LEAST_COVERAGE else None
+
+
+def moved_samples(before: Image, now: Image) -> float:
+    """Return the length in samples of the shift between two pictures: the correlation peak in the band of vessels."""
+    rows, cols = before.shape
+    cycles = np.hypot(np.fft.fftfreq(rows, 1 / rows)[:, None], np.fft.rfftfreq(cols, 1 / cols)[None])
+    band = (cycles > VESSELS[0]) & (cycles < VESSELS[1])
+    cross = np.fft.rfft2(_detail(before)) * np.conj(np.fft.rfft2(_detail(now))) * band
+    row, col = np.unravel_index(int(np.argmax(np.fft.irfft2(cross, before.shape))), before.shape)
+    return hypot(min(row, rows - row), min(col, cols - col))
+
+
+def _detail(picture: Image) -> Image:
+    """Return the picture minus its mean, tapered to 0 before the field edge: the edge does not move with the eye."""
+    rows, cols = (np.linspace(-1, 1, size) for size in picture.shape)
+    away = np.hypot(rows[:, None], cols[None])
+    window = 0.5 - 0.5 * np.cos(np.pi * np.clip((FIELD_MARGIN - away) / 0.25, 0, 1))
+    mean = float((picture * window).sum()) / float(window.sum())
+    detail: Image = ((picture - mean) * window).astype(np.float32)
+    return detail

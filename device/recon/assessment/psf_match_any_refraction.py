@@ -1,0 +1,124 @@
+"""PSF match test for an eye of any refraction: does a frame come through the stored PSF (calibration monitor).
+
+The power spectrum of a frame is that of the retina times |H|^2. The retina's power is independent of the fine structure
+of |H|^2: in a narrow ring of frequencies the frame's power follows |H|^2 in proportion to its mean if the PSF is right.
+
+    score = sum of cov(|Y|^2, |H|^2) / sum of g var(|H|^2)    over rings, each weighted by its information
+
+is near 1 for the right PSF and near 0 for a wrong one. Y is the tapered frame itself: a residual from which a picture
+blurred by the stored PSF was subtracted contains the structure of that PSF, and raises the score of any PSF to about
+one half. NUMERICS.md 8.3.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from device.recon.assessment.field_edge import FieldEdgeFit
+from device.recon.estimation.refraction import LEAST_FREQUENCIES, RefractionEstimator, Search
+from device.recon.model.kernels import Pixels
+from device.recon.model.preprocessing import Linear
+from device.values import Image
+
+NEAR = 5  # samples: side of the square of neighbours whose mean fills a missing sample
+RING = 250  # frequencies: narrower than the fringes of the field's edge, and enough for a covariance
+
+Between = Callable[[], None]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PsfMatchResult:
+    """Result for one frame: the score and its standard deviation, the eye's mean sphere M, and the field displacement.
+
+    M is in dpt, positive for myopia. `field_offset_deg` is the displacement of the illuminated field's centre from the
+    sensor's in degrees (down, right); `field_radius_change_ratio` the relative excess of its radius over the
+    calibrated.
+    """
+
+    score: float
+    sd: float
+    sphere_dpt: float
+    field_offset_deg: tuple[float, float]
+    field_radius_change_ratio: float
+
+    @property
+    def upper_limit(self) -> float:
+        """Upper limit of the score, two standard deviations above it; a dim frame must not count as a wrong PSF."""
+        return self.score + 2 * self.sd
+
+
+class PsfMatchTest:
+    """PSF match test of the frames of one head, with the plans of its `RefractionEstimator`."""
+
+    def __init__(self, refractor: RefractionEstimator) -> None:
+        self._refractor, self._likelihood = refractor, refractor.likelihood
+        bands = self._likelihood.bands
+        band = bands.whole
+        order = np.argsort(np.hypot(band.rows, band.cols))
+        self._rings = np.array_split(order, max(1, order.size // RING))
+        self._rim = FieldEdgeFit(self._likelihood.model, bands.low, bands.high, self._likelihood.taper)
+
+    def __call__(self, counts: Pixels, dark: Pixels | None, between: Between = lambda: None) -> PsfMatchResult | None:
+        """Return the result for a frame (rows, cols) in counts; None without light or with too few usable frequencies.
+
+        `between` is called every few milliseconds; its exceptions end the test.
+        """
+        refractor, likelihood = self._refractor, self._likelihood
+        if likelihood.bands.whole.where.size < LEAST_FREQUENCIES:
+            return None
+        frame = likelihood.frame(counts, dark, refractor.defects(counts, dark))
+        if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
+            return None
+        likelihood.residual(frame, 0.0)
+        noise = likelihood.noise_power(frame)
+
+        def unlikelihood(m_dpt: float) -> float:
+            between()
+            return likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole)
+
+        search = Search(unlikelihood)
+        sphere_dpt = search.descend(search.grid_search(refractor.step_dpt), refractor.step_dpt / 4)
+        unlikelihood(sphere_dpt)  # sets the |H|^2 of the band
+        score, sd = self._score(_filled(frame) - np.float32(likelihood.residual(frame, sphere_dpt)), noise)
+        likelihood.model.refocus(likelihood.otf(likelihood.grid, sphere_dpt))
+        edge, per_deg = self._rim.fit(frame.y, between), refractor.geometry.px_per_deg / likelihood.grid.n
+        return PsfMatchResult(
+            score,
+            sd,
+            sphere_dpt,
+            (edge.offset_samples[0] / per_deg, edge.offset_samples[1] / per_deg),
+            edge.radius_change_ratio,
+        )
+
+    def _score(self, y: Image, noise: float) -> tuple[float, float]:
+        band, fft = self._likelihood.bands.whole, self._likelihood.fft
+        np.multiply(y, self._likelihood.taper, out=fft.space)
+        seen = np.abs(fft.forward().ravel()[band.where].astype(np.complex128)) ** 2
+        power = band.power.astype(np.float64)
+        found = expected = certainty = 0.0
+        for ring in self._rings:
+            energy, speckle = seen[ring], power[ring] - power[ring].mean()
+            mean = float(energy.mean())
+            level = max(mean - noise, 0.0) / float(power[ring].mean())
+            spread = float(speckle @ speckle) / mean**2
+            found += float(speckle @ energy) / mean**2
+            expected += level * spread
+            certainty += spread
+        if expected <= 0:
+            return 0.0, float("inf")
+        return found / expected, certainty**0.5 / expected
+
+
+def _filled(frame: Linear) -> Image:
+    """Return the frame with its missing samples (`good` 0) set to the mean of the known samples in a square of NEAR."""
+    holes = frame.good == 0
+    if not holes.any():
+        return frame.y
+    there = np.where(holes, np.float32(0), np.float32(1))
+    near = ndimage.uniform_filter(frame.y * there, NEAR) / np.maximum(ndimage.uniform_filter(there, NEAR), 1e-3)
+    filled: Image = np.where(holes, near, frame.y)
+    return filled

@@ -1,0 +1,34 @@
+"""Noise model of a sample: shot, read and quantisation noise, from the calibration or from the stopband of the OTF."""
+
+from dataclasses import dataclass
+
+from device.values import Sensor
+
+LEAST_DN2 = 1e-20  # lower limit against a division by 0 for a black frame; float frames may be tiny
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of one sample in DN^2: `per_dn` times its value above dark, plus `floor_dn2`."""
+
+    per_dn: float
+    floor_dn2: float
+
+    def variance_dn2(self, value_dn: float) -> float:
+        """Return the variance in DN^2 of a sample of `value_dn` above dark."""
+        return self.per_dn * max(value_dn, 0.0) + self.floor_dn2
+
+    @classmethod
+    def of(cls, sensor: Sensor, n: int, measured_dn2: float, mean_dn: float) -> "Noise":
+        """Return the noise of means over n x n pixels (NUMERICS.md 2.1).
+
+        It comes from gain and read noise if the gain is known. Otherwise it comes from `measured_dn2`, the variance of
+        a sample from the stopband of the OTF, at the mean light `mean_dn` above dark: four fifths of it are attributed
+        to shot noise, so that bright samples have less weight than dark ones, as on any sensor limited by shot noise.
+        """
+        pixels = n * n
+        if sensor.gain_e_per_dn is not None:
+            read_dn = (sensor.read_noise_e or 0.0) / sensor.gain_e_per_dn
+            return cls(1 / sensor.gain_e_per_dn / pixels, (read_dn**2 + 1 / 12) / pixels)
+        shot = 0.8 * measured_dn2 if mean_dn > 0 else 0.0
+        return cls(shot / mean_dn if mean_dn > 0 else 0.0, max(measured_dn2 - shot, LEAST_DN2))

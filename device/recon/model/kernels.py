@@ -1,0 +1,398 @@
+"""Compiled single-pass kernels over pixels and frequencies, each in place of several numpy passes; cached on disk.
+
+At 1080 x 1920 a planned FFT pair takes about 15 ms on one core of a laptop; each numpy pass over the frame costs 1 to 3
+ms of memory traffic. Fusing them keeps counts-to-picture below 1.5 FFT pairs (`make bench`).
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from device.values import Image, Mask
+
+Single = np.float32
+Series = NDArray[np.float64]
+Box = tuple[int, int, int, int]
+Axes = tuple[Image, Image]
+Sums = tuple[float, float, float, float, float]
+Spectrum = NDArray[np.complex64]
+Pixels = NDArray[np.uint16] | NDArray[np.float32]
+Places = NDArray[np.int64]
+
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
+
+
+@_jit
+def linearise(
+    counts: Pixels,
+    dark: Pixels,
+    bend_per_dn: float,
+    gain: Image,
+    white_dn: float,
+    first: tuple[int, int],
+    n: int,
+    out: Image,
+    good: Image,
+) -> tuple[int, int, float]:
+    """Convert counts to linear DN from pixel `first` on, n x n to one: out = mean of s(counts - dark) * gain.
+
+    The mean is over good pixels. s is the inverse of the sensor's nonlinearity b: s (1 + b s) = counts - dark, to the
+    third order. `gain` is 1/flat, and 0 for bad pixels; NaN counts and counts at or above `white_dn` are left out too.
+    A `dark` or a `gain` of one row holds for all rows. `good` becomes the good share of each block, 0 to 1; `out` of a
+    block without a good pixel becomes 0. Return the numbers of saturated and of good pixels, and the sum of the light
+    on the good ones in DN.
+    """
+    rows, cols = out.shape
+    wide = cols * n
+    total, used, offset = np.empty(wide, np.float32), np.empty(wide, np.float32), np.empty(wide, np.float32)
+    saturated = good_pixels = light = np.float64(0)
+    bend = np.float32(bend_per_dn)
+    for i in range(rows):
+        if n == 1:
+            total, used = out[i], good[i]
+        total[:], used[:] = 0, 0
+        for a in range(first[0] + i * n, first[0] + i * n + n):
+            begin, end = first[1], first[1] + wide
+            if len(dark) > 1 or a == first[0]:  # a separate loop: inside the loop below it halves the speed
+                offset[:] = dark[a % len(dark)][begin:end]
+            gain_row = gain[a % len(gain)][begin:end]
+            saturated += _add_row(counts[a][begin:end], offset, gain_row, bend, np.float32(white_dn), total, used)
+        row = _bin_row(total, used, n, out[i], good[i])
+        good_pixels += row[0]
+        light += row[1]
+    return int(saturated), int(good_pixels), float(light)
+
+
+@_jit
+def _add_row(
+    counts: Pixels, dark: Image, gain: Image, bend: Single, white_dn: Single, total: Image, used: Image
+) -> Single:
+    zero, one, two, lowest = np.float32(0), np.float32(1), np.float32(2), np.float32(-3e38)
+    saturated = zero
+    for b in range(total.size):  # selects instead of branches: eight pixels to an instruction
+        value = np.float32(counts[b])
+        ok = (value < white_dn) & (value > lowest) & (gain[b] > zero)
+        saturated += one if value >= white_dn else zero
+        light = value - dark[b]
+        bent = bend * light
+        total[b] += light * (one - bent * (one - two * bent)) * gain[b] if ok else zero
+        used[b] += one if ok else zero
+    return saturated
+
+
+@_jit
+def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tuple[Single, Single]:
+    zero, one = np.float32(0), np.float32(1)
+    good_pixels = light = zero
+    if n == 1:  # `total` and `used` are `out` and `good` themselves
+        for j in range(good.size):
+            good_pixels += good[j]
+            light += out[j]
+        return good_pixels, light
+    for j in range(out.size):
+        v = u = zero
+        for b in range(j * n, j * n + n):
+            v += total[b]
+            u += used[b]
+        out[j] = v / max(u, one)
+        good[j] = u / np.float32(n * n)
+        good_pixels += u
+        light += v
+    return good_pixels, light
+
+
+@_jit
+def exclude_pixels(
+    counts: Pixels, dark: Image, bend_per_dn: float, gain: Image, white_dn: float, first: tuple[int, int], n: int,
+    places: Places, out: Image, good: Image,
+) -> tuple[int, float]:  # fmt: skip
+    """Remove the pixels `places` (flat indices) from the result of `linearise`; return their number and light in DN.
+
+    The other arguments are those of `linearise`; `out` and `good` are updated in place. Pixels that it left out, and
+    pixels outside the window, are skipped. `places` must not hold a pixel twice.
+    """
+    rows, cols = out.shape
+    bend, white, lowest = np.float32(bend_per_dn), np.float32(white_dn), np.float32(-3e38)
+    one, two, all_px = np.float32(1), np.float32(2), np.float32(n * n)
+    lost, light = 0, np.float64(0)
+    for place in places:
+        a, b = place // counts.shape[1], place % counts.shape[1]
+        i, j = (a - first[0]) // n, (b - first[1]) // n
+        value, weight = np.float32(counts[a, b]), gain[a % len(gain), b]
+        is_good = (value < white) & (value > lowest) & (weight > 0)
+        if a < first[0] or b < first[1] or i >= rows or j >= cols or not is_good:
+            continue
+        value -= dark[a % len(dark), b]
+        bent = bend * value
+        value *= (one - bent * (one - two * bent)) * weight
+        used = np.round(good[i, j] * all_px)
+        out[i, j] = (out[i, j] * used - value) / (used - one) if used > one else np.float32(0)
+        good[i, j] = (used - one) / all_px
+        lost += 1
+        light += value
+    return lost, light
+
+
+@_jit
+def flat_fit_sums(y: Image, flat: Image, good: Image) -> Sums:
+    """Return the sums for the fit y = a flat + b: <y,f>, <y,1>, <f,f>, <f,1>, <1,1>, each weighted by `good`."""
+    yf = y1 = ff = f1 = n = np.float64(0)
+    rows, cols = y.shape
+    for i in range(rows):
+        ryf = ry1 = rff = rf1 = rn = np.float32(0)  # float32 within a row, float64 over the rows
+        for j in range(cols):
+            w = good[i, j]
+            f = flat[i, j] * w
+            ryf += y[i, j] * f
+            ry1 += y[i, j] * w
+            rff += flat[i, j] * f
+            rf1 += f
+            rn += w
+        yf += ryf
+        y1 += ry1
+        ff += rff
+        f1 += rf1
+        n += rn
+    return yf, y1, ff, f1, n
+
+
+@_jit
+def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[int, int], out: Image) -> None:
+    """Write (y - a flat - b) * good, the residual of the flat model, into `out` from sample `at` on."""
+    a32, b32 = np.float32(a), np.float32(b)
+    rows, cols = y.shape
+    for i in range(rows):
+        for j in range(cols):
+            out[at[0] + i, at[1] + j] = (y[i, j] - a32 * flat[i, j] - b32) * good[i, j]
+
+
+MIN_GRADIENT_POWER = 1e-6  # added to |D|^2 as a divisor; smaller than |D|^2 of one cycle across any frame
+
+
+@_jit
+def wiener(
+    spectrum: Spectrum, otf: Spectrum, gradient: Axes, slope: float, floor: float, psf_term: float, scale: float
+) -> None:
+    """Apply a Wiener filter in place: multiply by scale conj(H) / (|H|^2 + slope |D|^2 + floor + psf_term / |D|^2).
+
+    `gradient` holds |D|^2 as a row part and a column part, to which MIN_GRADIENT_POWER is added.
+    """
+    rows, cols = spectrum.shape
+    slope32, floor32, term32, scale32 = np.float32(slope), np.float32(floor), np.float32(psf_term), np.float32(scale)
+    for i in range(rows):
+        for j in range(cols):
+            h = otf[i, j]
+            steep = gradient[0][i] + gradient[1][j] + np.float32(MIN_GRADIENT_POWER)
+            power = h.real * h.real + h.imag * h.imag
+            weight = scale32 * steep / ((power + slope32 * steep + floor32) * steep + term32)  # one division
+            s = spectrum[i, j]
+            spectrum[i, j] = complex(
+                (s.real * h.real + s.imag * h.imag) * weight, (s.imag * h.real - s.real * h.imag) * weight
+            )
+
+
+@_jit
+def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
+    """Write (x + a) mask into `out` inside `box` (top, bottom, left, right): add the flat model again.
+
+    `out` is not changed outside the box.
+    """
+    a32 = np.float32(a)
+    top, bottom, left, right = box
+    for i in range(top, bottom):
+        for j in range(left, right):
+            out[i, j] = (x[i, j] + a32) * mask[i, j]
+
+
+@_jit
+def cross_validation(
+    power: Series, prior: Series, delta: Series, energies: Series, candidates: Series, scores: Series
+) -> None:
+    """Write the generalised cross-validation score n sum(phi^2 |Y|^2) / (sum phi)^2 of each mu to `scores`.
+
+    phi = reg / (|H|^2 + reg), reg = mu R + delta; `power` is |H|^2, `prior` is R, `energies` |Y|^2, all for n
+    frequencies; `candidates` holds the values of mu.
+    """
+    for k in range(candidates.size):
+        misfit = freedom = 0.0
+        for i in range(power.size):
+            reg = candidates[k] * prior[i] + delta[i]
+            phi = reg / (power[i] + reg)
+            misfit += phi * phi * energies[i]
+            freedom += phi
+        scores[k] = power.size * misfit / (freedom * freedom)
+
+
+@_jit
+def interpolate_cubic(
+    image: Image, first: NDArray[np.int64], weights: Image, offset: tuple[int, int], box: Box, out: Image
+) -> None:
+    """Fill `box` (top, bottom, left, right) of `out` by cubic interpolation, from 4 x 4 samples of `image` per pixel.
+
+    `first` and `weights` are those of `cubic_weights`, for n x n pixels per sample. Pixel (i, j) of `out` lies in
+    sample ((i + offset[0]) // n, (j + offset[1]) // n) of the image.
+    """
+    n = first.size
+    rows, cols = image.shape
+    top, bottom, left, right = box
+    begin, end = left + offset[1], right + offset[1]
+    low, high = max(begin // n - 2, 0), min((end - 1) // n + 3, cols)  # the columns used by the box
+    row_up = np.zeros(cols + 4, np.float32)  # one interpolated row with two repeated samples at each end
+    for i in range(top, bottom):
+        p = (i + offset[0]) % n
+        k = (i + offset[0]) // n + first[p]
+        a, b = image[min(max(k, 0), rows - 1)], image[min(max(k + 1, 0), rows - 1)]
+        c, d = image[min(max(k + 2, 0), rows - 1)], image[min(max(k + 3, 0), rows - 1)]
+        wa, wb, wc, wd = weights[p]
+        for j in range(low, high):
+            row_up[j + 2] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+        row_up[:2], row_up[cols + 2 :] = row_up[2], row_up[cols + 1]
+        line = out[i]
+        for q in range(n):
+            va, vb, vc, vd = weights[q]
+            shift = first[q] + 2
+            for k in range((begin - q + n - 1) // n, (end - q + n - 1) // n):
+                m = min(max(k + shift, 0), cols)
+                line[k * n + q - offset[1]] = (
+                    va * row_up[m] + vb * row_up[m + 1] + vc * row_up[m + 2] + vd * row_up[min(m + 3, cols + 3)]
+                )
+
+
+@_jit
+def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Image) -> None:
+    """Write the mean light of the four neighbours of each pixel to `mean`, and its own light minus that mean to `off`.
+
+    `places` are flat indices into the image without its one-pixel border. Light is counts - dark in DN.
+    """
+    inner = counts.shape[1] - 2
+    light = np.empty(5, np.float32)
+    for k in range(places.size):
+        i, j = 1 + places[k] // inner, 1 + places[k] % inner
+        for m in range(5):
+            a, b = i + (m == 1) - (m == 2), j + (m == 3) - (m == 4)
+            light[m] = np.float32(counts[a, b]) - dark[a % len(dark), b]
+        mean[k] = np.float32(0.25) * (light[1] + light[2] + light[3] + light[4])
+        off[k] = light[0] - mean[k]
+
+
+@_jit
+def mark_suspects(
+    counts: Pixels, dark: Image, slope_dn: float, floor_dn2: float, white_dn: float, least_dn: float, out: Mask
+) -> int:
+    """Mark in `out` (rows, cols) the pixels that reach `white_dn`, or have less than `least_dn` above dark, or differ
+    from the mean m of their four neighbours by more than sqrt(slope_dn m + floor_dn2).
+
+    Return their number. A dark of one row holds for all rows. NaN is not marked: `linearise` leaves it out. In the
+    first and last row the pixel itself replaces the missing neighbour; in the first and last column only `white_dn` and
+    `least_dn` apply.
+    """
+    rows, cols = counts.shape
+    slope, floor, white, least = np.float32(slope_dn), np.float32(floor_dn2), np.float32(white_dn), np.float32(least_dn)
+    above, here, below = np.zeros(cols, np.float32), np.zeros(cols, np.float32), np.zeros(cols, np.float32)
+    _light(counts[0], dark[0], here)
+    above[:] = here
+    total = 0
+    for i in range(rows):
+        if i + 1 < rows:
+            _light(counts[i + 1], dark[(i + 1) % len(dark)], below)
+        else:
+            below[:] = here
+        _mark_row(counts[i], above, here, below, slope, floor, white, least, out[i])
+        found = 0
+        for j in range(cols):
+            found += out[i, j]
+        total += found
+        above, here, below = here, below, above
+    return total
+
+
+@_jit
+def _light(counts: Pixels, dark: Image, out: Image) -> None:
+    for j in range(out.size):
+        out[j] = np.float32(counts[j]) - dark[j]
+
+
+@_jit
+def _mark_row(
+    counts: Pixels, above: Image, here: Image, below: Image, slope: Single, floor: Single, white: Single, least: Single,
+    out: Mask,
+) -> None:  # fmt: skip
+    quarter, zero = np.float32(0.25), np.float32(0)
+    last = out.size - 1
+    for j in range(1, last):  # selects instead of branches, as in `_add_row`
+        mean = quarter * (here[j - 1] + here[j + 1] + above[j] + below[j])
+        off = here[j] - mean
+        is_outlier = off * off > slope * max(mean, zero) + floor
+        out[j] = is_outlier | (np.float32(counts[j]) >= white) | (here[j] < least)
+    for j in (0, last):
+        out[j] = (np.float32(counts[j]) >= white) | (here[j] < least)
+
+
+@_jit
+def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, out: Image) -> int:
+    """Copy the light of the good pixels at Chebyshev distance `reach` from (i, j) to `out`; return their number."""
+    rows, cols = counts.shape
+    n = 0
+    for a in range(max(i - reach, 0), min(i + reach, rows - 1) + 1):
+        for b in range(max(j - reach, 0), min(j + reach, cols - 1) + 1):
+            if max(abs(a - i), abs(b - j)) == reach and not bad[a, b]:
+                out[n] = np.float32(counts[a, b]) - dark[a % len(dark), b]
+                n += 1
+    return n
+
+
+@_jit
+def outliers(
+    counts: Pixels, dark: Image, known: Mask, places: Places, slope_dn: float, floor_dn2: float,
+    ranges: tuple[float, float], is_outlier: Mask,
+) -> int:  # fmt: skip
+    """Mark in `is_outlier` which pixels `places` (flat indices) differ from a ring around them; return their number.
+
+    Marks are only set, never cleared; pixels in `known` are skipped and not counted. A ring is the 8 pixels at distance
+    1 (k = 0) or the 16 at distance 2 (k = 1), without `known` defects. A pixel differs when it is off the median of one
+    of the rings by more than the noise, sqrt(slope_dn median + floor_dn2), plus `ranges[k]` times the range of the ring
+    without its 1 + k highest and 1 + k lowest values. Rings of at most 2 k + 4 values are skipped.
+    """
+    ring = np.empty(16, np.float32)
+    found = 0
+    for m in range(places.size):
+        i, j = places[m] // counts.shape[1], places[m] % counts.shape[1]
+        if known[i, j]:
+            continue
+        light = np.float32(counts[i, j]) - dark[i % len(dark), j]
+        for k in range(2):
+            n = _ring(counts, dark, known, i, j, k + 1, ring)
+            if n > 2 * k + 4:
+                ordered = np.sort(ring[:n])
+                middle = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
+                spread = ordered[n - 2 - k] - ordered[1 + k]
+                noise = np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
+                is_outlier[m] |= abs(light - middle) > noise + ranges[k] * spread
+        found += is_outlier[m]
+    return found
+
+
+@_jit
+def ring_excess(
+    image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float
+) -> tuple[float, float]:
+    """Return the smallest pair `ranges` with which `outliers` marks no pixel of at least `least` in this image.
+
+    The two outermost rows and columns are not tested. `zero_row` is a row of zeros, `no_mask` a mask (rows, cols) of
+    False.
+    """
+    rows, cols = image.shape
+    ring, worst = np.empty(16, np.float32), np.zeros(2, np.float64)
+    for i in range(2, rows - 2):
+        for j in range(2, cols - 2):
+            if image[i, j] < least:
+                continue
+            for k in range(2):
+                n = _ring(image, zero_row, no_mask, i, j, k + 1, ring)
+                known = np.sort(ring[:n])
+                middle = 0.5 * (known[(n - 1) // 2] + known[n // 2])
+                spread = known[n - 2 - k] - known[1 + k]
+                excess = abs(image[i, j] - middle) - np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
+                if excess > 0:
+                    worst[k] = max(worst[k], excess / max(spread, np.float32(1e-30)))
+    return worst[0], worst[1]

@@ -1,0 +1,106 @@
+"""One simulated exposure with its ground truth, in memory or as files with the plan of its effects."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from PIL import Image as Pictures
+
+from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec
+from device.errors import StoreError
+from device.sim.camera import SimCamera
+from device.sim.eyes import EffectSelector
+from device.sim.light import SimLight
+from device.sim.plan import Decision, decide
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
+from device.sim.world import World
+from device.values import Calibration, Counts, ExposureSettings, Illumination, Image, Mask
+
+
+@dataclass(frozen=True)
+class SimulatedExposure:
+    """One exposure of a simulated head with its ground truth, all (rows, cols) of its sensor.
+
+    `truth` is the reflectance of the object; `vessels` is its vessel mask, None if not known.
+    """
+
+    counts: Counts
+    truth: Image
+    vessels: Mask | None
+    calibration: Calibration
+
+
+def simulate_exposure(spec: InstrumentSpec) -> SimulatedExposure:
+    """Return a lit frame in the picture's colour with ground truth; SpecError for a spec without [optics] or [sim]."""
+    world = World(spec, VirtualClock())
+    colour = spec.light.colour
+    world.electrons_per_s(colour)  # now, not while the lamp is lit
+    with SimLight(world).on(Illumination(colour)):
+        counts = SimCamera(world).expose(ExposureSettings(spec.camera.exposure_s)).counts
+    mask = world.retina.vessels
+    vessels = None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5
+    return SimulatedExposure(counts, world.truth(colour), vessels, simulated_calibration(world))
+
+
+def simulate(spec: InstrumentSpec, folder: Path, choose: EffectSelector = decide) -> World:
+    """Expose one lit frame in the picture's colour, write it with its ground truth, and return its simulated world.
+
+    Files and StoreError as in `write`. SpecError for a spec without [optics] or [sim].
+    """
+    world, counts = expose(spec, choose)
+    write(world, counts, folder)
+    return world
+
+
+def expose(spec: InstrumentSpec, choose: EffectSelector = decide) -> tuple[World, Counts]:
+    """Return the simulated world of a scene, and one lit frame in the picture's colour: counts, (rows, cols).
+
+    SpecError for a spec without [optics] or [sim].
+    """
+    world = World(spec, VirtualClock(), choose=choose)
+    shot = ExposureSettings(spec.camera.exposure_s)
+    with SimLight(world).on(Illumination(spec.light.colour)):
+        return world, SimCamera(world).expose(shot).counts
+
+
+def write(world: World, counts: Counts, folder: Path) -> None:
+    """Write a frame of a simulated world with its ground truth.
+
+    Files: raw.tiff, uint16; truth.npy (reflectance) and psf.tiff (noise-free PSF of this eye), float32 on the sensor
+    grid (rows, cols); vessels.png if the vessels are known; plan.json. StoreError if the folder cannot be written.
+    """
+    colour = world.spec.light.colour
+    plan = plan_as_json(world.plan, world.setup(colour).spent_ms)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(folder / "raw.tiff", counts, description=json.dumps({"simulated": True}))
+        np.save(folder / "truth.npy", world.truth(colour))
+        tifffile.imwrite(folder / "psf.tiff", crop_or_pad(world.psf(colour), world.shape))
+        _write_vessels(world, folder / "vessels.png")
+        (folder / "plan.json").write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"{folder} cannot be written: {error}", "Give a folder that can be written.") from error
+
+
+def plan_as_json(plan: tuple[Decision, ...], spent_ms: dict[str, float]) -> dict[str, dict[str, Any]]:
+    """Return by effect name: simulated or not, eta, the text that explains eta, and the computing time in ms."""
+    return {
+        one.name: {
+            "simulated": one.simulated, "eta": one.eta, "why": one.why,
+            "cost_ms": round(spent_ms.get(one.name, 0.0), 1) if one.simulated else 0.0,
+        }
+        for one in plan
+    }  # fmt: skip
+
+
+def _write_vessels(world: World, path: Path) -> None:
+    """Write the vessel mask on the sensor grid as a PNG of 0 and 255; nothing if the vessels are not known."""
+    mask = world.retina.vessels
+    if mask is not None:
+        on_sensor = crop_or_pad(mask.astype(np.float32), world.shape) > 0
+        Pictures.fromarray(on_sensor.astype(np.uint8) * 255).save(path)

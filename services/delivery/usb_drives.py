@@ -1,0 +1,93 @@
+"""USB drives: detection of mounted, writable drives, and the atomic copy of files into a new folder of one drive."""
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from device import atomic_io
+from services.errors import UsbDriveFull, UsbDriveUnavailable
+
+ROOTS = (Path("/media"), Path("/run/media"))
+MOUNTS = Path("/proc/self/mounts")
+MOUNT_ESCAPES = {r"\040": " ", r"\011": "\t", r"\012": "\n", r"\134": "\\"}  # escapes of /proc/self/mounts
+
+
+@dataclass(frozen=True)
+class UsbDrive:
+    """A mounted drive: mount point (`folder`), and free space in bytes."""
+
+    folder: Path
+    free_bytes: int
+
+
+class UsbDrives:
+    """Writable drives mounted below `roots`; the kernel's mount table (`mounts`) is read at each call."""
+
+    def __init__(self, roots: tuple[Path, ...] = ROOTS, mounts: Path = MOUNTS) -> None:
+        self._roots, self._mounts = roots, mounts
+
+    def present(self) -> list[UsbDrive]:
+        """Return the drives that are mounted and writable now."""
+        found = []
+        for folder in self._mounted():
+            try:
+                if os.access(folder, os.W_OK):
+                    found.append(UsbDrive(folder, atomic_io.free_bytes(folder)))
+            except OSError:  # removed since the mount table was read
+                continue
+        return found
+
+    def mounted_folder(self, folder: str) -> Path:
+        """Return the mount point with that path; UsbDriveUnavailable if no writable drive is mounted there now."""
+        for drive in self.present():
+            if str(drive.folder) == folder:
+                return drive.folder
+        raise UsbDriveUnavailable(f"{folder[:80]!r} is no USB stick that is there now")
+
+    def _mounted(self) -> list[Path]:
+        lines = self._mounts.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+        folders = [Path(_unescaped(line.split(" ")[1])) for line in lines]
+        return [folder for folder in folders if any(root in folder.parents for root in self._roots)]
+
+
+def _unescaped(word: str) -> str:
+    for code, letter in MOUNT_ESCAPES.items():
+        word = word.replace(code, letter)
+    return word
+
+
+def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
+    """Copy files into a new folder of a drive; return the folder once it is durable.
+
+    `drive`: mount point; `name`: name of the new folder, with a number appended if that folder exists. The folder gets
+    this name after all files are written; after an error in writing them the partial copy is deleted, if the drive is
+    still there. Errors: UsbDriveFull, UsbDriveUnavailable.
+    """
+    with _drive_errors(drive):
+        target, number = drive / name, 1
+        while target.exists():
+            number += 1
+            target = drive / f"{name}-{number}"
+        temporary = drive / f".{target.name}.part"
+        shutil.rmtree(temporary, ignore_errors=True)  # left by an interrupted copy
+        try:
+            atomic_io.write_folder(temporary, files)
+            atomic_io.replace_durably(temporary, target)
+        except OSError:
+            shutil.rmtree(temporary, ignore_errors=True)  # no effect on a removed drive
+            raise
+        atomic_io.fsync_folder(target)  # on FAT, fsync of a folder writes its own entry, fsync of its parent does not
+    return target
+
+
+@contextmanager
+def _drive_errors(drive: Path) -> Iterator[None]:
+    """Convert OSError to UsbDriveFull (no space) or UsbDriveUnavailable (other errors); a context manager."""
+    try:
+        yield
+    except OSError as error:
+        kind = UsbDriveFull if atomic_io.is_full(error) else UsbDriveUnavailable
+        raise kind(f"{drive} refused: {error.strerror or error}") from error

@@ -1,0 +1,86 @@
+"""Export of a visit: its files as a mapping for a ZIP archive or a USB drive.
+
+De-identified: the fields name, phone and village are left out; patient number and visit id identify the visit.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from datetime import datetime
+
+from services.delivery.visit_json import visit_as_json
+from services.imaging.picture_files import with_note
+from services.records.answers import IDENTIFIERS
+from services.records.capture_report import report_as_json
+from services.records.capture_store import CaptureStore
+from services.records.json_values import JsonObject
+from services.records.visit import Visit
+
+EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # earliest date of a ZIP entry
+
+
+def export_files(store: CaptureStore, visit: Visit, undo_until: datetime | None) -> dict[str, bytes]:
+    """Return the exported files of a visit by name, with the time until which its finish can be undone, or None.
+
+    `<slot>-<number>.png` and `.json`: picture and report of each capture, the oldest of a slot first; `visit.json`: the
+    visit without identifying fields; `SHA256SUMS`. StoreDamaged if any picture or report is damaged.
+    """
+    until = undo_until.isoformat() if undo_until else None
+    return _files(store, visit, visit_as_json(visit) | {"undo_until": until})
+
+
+def uploaded_files(store: CaptureStore, visit: Visit) -> dict[str, bytes]:
+    """Return the uploaded files of a visit: those of the export, without the time of undo, which changes by the day."""
+    return _files(store, visit, visit_as_json(visit))
+
+
+def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, bytes]:
+    files: dict[str, bytes] = {}
+    for slot, state in visit.slots.items():
+        for number, taken in enumerate(state.captures, 1):
+            files[f"{slot}-{number}.png"] = _picture(store, taken.capture)
+            files[f"{slot}-{number}.json"] = _report(store, taken.capture)
+    plain = dict(shown) | {"fields": {key: value for key, value in visit.fields.items() if key not in IDENTIFIERS}}
+    files["visit.json"] = json.dumps(plain, indent=1, ensure_ascii=False).encode()
+    sums = [f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items()]
+    return files | {"SHA256SUMS": "".join(sums).encode()}
+
+
+def _picture(store: CaptureStore, id: str) -> bytes:
+    """Return the stored picture (PNG) of a capture.
+
+    For a capture that was moved to the other eye, return the same pixels with the corrected eye in the note.
+    """
+    capture, stored = store.get(id), store.read(id, "picture.png")
+    if not capture.report.moved:
+        return stored
+    return with_note(stored, f"{capture.eye} {capture.taken_at:%Y-%m-%d}")
+
+
+def _report(store: CaptureStore, id: str) -> bytes:
+    """Return the stored report (JSON); for a capture that was moved to the other eye, with its new eye and slot."""
+    capture, stored = store.get(id), store.read(id, "report.json")
+    if not capture.report.moved:
+        return stored
+    report = report_as_json(capture.report)
+    correction = {name: report[name] for name in ("slot", "moved")}
+    return json.dumps(json.loads(stored) | {"eye": capture.eye} | correction, indent=1).encode()
+
+
+def folder_name(visit: Visit) -> str:
+    """Return the folder name of an export: patient number and visit id."""
+    return f"{visit.number}-{visit.id}"
+
+
+def zip_archive(name: str, files: Mapping[str, bytes], begun_at: datetime) -> bytes:
+    """Return a ZIP archive with the files in the folder `name`, uncompressed because PNG is compressed already.
+
+    Each entry is dated `begun_at`, so equal files give an equal archive; dates before 1980 become 1980.
+    """
+    out, dated = io.BytesIO(), max(begun_at.timetuple()[:6], EARLIEST_ZIP_DATE)
+    with zipfile.ZipFile(out, "w") as archive:
+        for path, content in files.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}/{path}", dated), content)
+    return out.getvalue()

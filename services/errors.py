@@ -1,0 +1,335 @@
+"""Errors of services, which the device never raises: authentication, requests, records, uploads and updates.
+
+HTTP status codes: `HTTP_STATUS` in services/http.
+
+DiffuscopeError                       base class in device/errors.py
+├── AuthenticationError               authentication of the technician
+│   ├── LoginRequired                 no login, or login expired
+│   ├── PinWrong                      wrong or invalid PIN
+│   └── PinLockedOut                  lock-out after repeated wrong PINs
+├── Busy                              the instrument is occupied
+├── RequestRefused                    request not permitted, or not now
+│   ├── ControlLeaseHeld              another screen holds the control lease
+│   ├── CrossOriginRequest            cross-origin request (CSRF check)
+│   ├── UntrustedHost                 Host header is not a name of the instrument
+│   ├── VisitFinished                 the visit is finished
+│   ├── ConsentMissing                no consent recorded for the visit
+│   └── ConsentDeclined               consent declined or withdrawn
+├── StoreError                        base class in device/errors.py
+│   ├── StoreDamaged                  stored file missing or changed
+│   ├── UsbDriveFull                  no space on the USB drive
+│   ├── UsbDriveUnavailable           USB drive removed or not writable
+│   └── RecordNotFound (LookupError)  no such capture
+├── UploadError                       upload of a visit failed
+│   ├── UploadDisabled                no receiver configured
+│   ├── ReceiverUnreachable           receiver unreachable, retried later
+│   ├── ReceiverUntrusted             receiver's TLS certificate not trusted
+│   ├── UploadUnauthorised            device not authorised by the receiver
+│   ├── UploadRejected                visit rejected by the receiver
+│   └── UploadMismatch                uploaded archive differs (SHA-256 or length)
+└── UpdateError                       update not installed
+    ├── UpdateBusy                    another update in progress
+    ├── UpdateRequestInvalid          invalid update request
+    ├── UpdateUncommitted             running version not yet committed
+    ├── UpdateDuringExam              exam in progress
+    ├── UpdatePowerLow                battery below one half
+    ├── UpdateCapturesAtRisk          captures not readable or writable
+    ├── UpdateNotFound                no update found
+    ├── UpdateUnreachable             update server unreachable or connection lost
+    ├── UpdateSourceRemoved           USB drive removed
+    ├── UpdateUntrusted               no trusted signature
+    ├── UpdateDamaged                 file incomplete or changed
+    ├── UpdateWrongDevice             made for another device type
+    ├── UpdateOlder                   not newer than the running version
+    ├── UpdateStepMissing             needs an intermediate version
+    ├── UpdateNoRoom                  no space for the update
+    └── UpdateFailed                  write or trial of the update failed
+"""
+
+from device.errors import DiffuscopeError, StoreError
+
+
+class AuthenticationError(DiffuscopeError):
+    """Authentication of the technician failed."""
+
+    code = "technician"
+    default_remedy = "Go back to the pictures, or call the technician."
+
+
+class LoginRequired(AuthenticationError):
+    """No technician is logged in, the login has expired, or no PIN is set yet."""
+
+    code = "technician.locked"
+    default_remedy = "Give the technician's PIN."
+
+
+class PinWrong(AuthenticationError):
+    """The PIN is not that of the device, or a new PIN has an invalid format."""
+
+    code = "technician.pin"
+    default_remedy = "Give the PIN that was set on this device: 4 to 12 digits."
+
+
+class PinLockedOut(AuthenticationError):
+    """Lock-out after repeated wrong PINs: the next attempt has to wait."""
+
+    code = "technician.wait"
+    default_remedy = "Wait until the time is over, then try again."
+
+
+class Busy(DiffuscopeError):
+    """The instrument is occupied, for example by another picture or a calibration, or the request is out of turn."""
+
+    code = "busy"
+    default_remedy = "A picture is being taken. Wait until it is done, then press again."
+
+
+class RequestRefused(DiffuscopeError):
+    """The request is not permitted, or not now."""
+
+    code = "refused"
+    default_remedy = "Reload the page and try again."
+
+
+class ControlLeaseHeld(RequestRefused):
+    """Another screen holds the control lease."""
+
+    code = "link.other"
+    default_remedy = "Another screen is taking pictures."
+
+
+class CrossOriginRequest(RequestRefused):
+    """Cross-origin request, refused by the CSRF check: the page is not served by this instrument."""
+
+    code = "link.forged"
+    default_remedy = "Close the other page, and open the camera's own page again."
+
+
+class UntrustedHost(RequestRefused):
+    """The Host header of the request is not a name of this instrument."""
+
+    code = "link.host"
+    default_remedy = "Open the page by the camera's address, as it is written on the device."
+
+
+class VisitFinished(RequestRefused):
+    """The visit is finished and read-only."""
+
+    code = "visit.finished"
+    default_remedy = "This visit is finished. Begin a new visit for this person."
+
+
+class ConsentMissing(RequestRefused):
+    """No consent is recorded for the visit: no light, neither for a picture nor for aiming."""
+
+    code = "consent.missing"
+    default_remedy = "First ask the person: may we take pictures of the eyes? Then choose the answer."
+
+
+class ConsentDeclined(RequestRefused):
+    """Consent was declined or withdrawn: no light, neither for a picture nor for aiming."""
+
+    code = "consent.declined"
+    default_remedy = "This person did not agree. Take no pictures, and finish the visit."
+
+
+class StoreDamaged(StoreError):
+    """A stored file or database row is missing, unreadable or invalid, or a digest differs from the stored one."""
+
+    code = "store.damaged"
+    default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+
+
+class UsbDriveFull(StoreError):
+    """The USB drive has no space for the export."""
+
+    code = "stick.full"
+    default_remedy = "The USB stick is full. Nothing was lost. Use another stick, or make room on this one."
+
+
+class UsbDriveUnavailable(StoreError):
+    """The USB drive is not present, was removed, or cannot be written."""
+
+    code = "stick.gone"
+    default_remedy = "The USB stick cannot be written. Nothing was lost. Put it in again, and copy once more."
+
+
+class RecordNotFound(StoreError, LookupError):
+    """There is no capture, visit or picture slot with this id."""
+
+    code = "store.unknown"
+    default_remedy = "Choose a picture from the list."
+
+
+class UploadError(DiffuscopeError):
+    """The upload of a visit failed; the visit stays on this device."""
+
+    code = "send"
+    default_remedy = "Nothing is lost. Copy the visit to a USB stick, and call the technician."
+
+
+class UploadDisabled(UploadError):
+    """No receiver is configured."""
+
+    code = "send.off"
+    default_remedy = "Nothing is sent from this device. Copy visits to a USB stick, or save them as files."
+
+
+class ReceiverUnreachable(UploadError):
+    """The receiver does not answer or is temporarily unavailable; the upload is retried."""
+
+    code = "send.link"
+    default_remedy = "It is tried again by itself. Look whether this device is connected to the internet."
+
+
+class ReceiverUntrusted(UploadError):
+    """The receiver's TLS certificate is not trusted; a wrong clock has the same effect."""
+
+    code = "send.certificate"
+    default_remedy = "Look whether the date of this device is right. If it is, call the technician."
+
+
+class UploadUnauthorised(UploadError):
+    """The receiver does not authorise this device."""
+
+    code = "send.key"
+    default_remedy = "The receiver does not know this device. Call the technician: its key must be renewed."
+
+
+class UploadRejected(UploadError):
+    """The receiver rejects this visit permanently."""
+
+    code = "send.refused"
+    default_remedy = "The receiver does not take this visit. Copy it to a USB stick, and call the technician."
+
+
+class UploadMismatch(UploadError):
+    """The receiver's copy of the visit differs from the sent archive in SHA-256 or length."""
+
+    code = "send.unlike"
+    default_remedy = (
+        "The receiver has only a part of it, or something else. Copy it to a USB stick, and call the technician."
+    )
+
+
+class UpdateError(DiffuscopeError):
+    """An update cannot be installed; the running version stays."""
+
+    code = "update"
+
+
+class UpdateBusy(UpdateError):
+    """Another update, or the transfer of another update file, is in progress."""
+
+    code = "update.busy"
+    default_remedy = "An update is under way already. Wait until it is done."
+
+
+class UpdateRequestInvalid(UpdateError):
+    """The page's update request cannot be read or is invalid."""
+
+    code = "update.request"
+    default_remedy = "Reload the page, look for updates once more, and choose one of those that are listed."
+
+
+class UpdateUncommitted(UpdateError):
+    """The running version is on trial and not yet committed."""
+
+    code = "update.uncommitted"
+    default_remedy = (
+        "The version before this one must stay until this one has shown that it works. Wait some minutes, "
+        "then try again."
+    )
+
+
+class UpdateDuringExam(UpdateError):
+    """An examination is in progress: a picture is being taken, or a visit was begun recently and is open."""
+
+    code = "update.exam"
+    default_remedy = "Finish the examination first, then start the update again."
+
+
+class UpdatePowerLow(UpdateError):
+    """The battery charge is below the minimum for an update, normally one half."""
+
+    code = "update.power"
+    default_remedy = "Connect the charger, and start the update again when the battery is half full."
+
+
+class UpdateCapturesAtRisk(UpdateError):
+    """The captures on this device cannot be read or written."""
+
+    code = "update.captures"
+    default_remedy = "Copy the pictures to a USB stick first, and call the technician."
+
+
+class UpdateNotFound(UpdateError):
+    """No update was found: none or several at the source, no update server set, or none installed that awaits trial."""
+
+    code = "update.nowhere"
+    default_remedy = "Put in the USB stick that holds the update, a file whose name ends in .raucb."
+
+
+class UpdateUnreachable(UpdateError):
+    """The update server does not answer, or the connection was lost."""
+
+    code = "update.link"
+    default_remedy = "The connection was lost. What has arrived is kept: try again later, and it goes on from there."
+
+
+class UpdateSourceRemoved(UpdateError):
+    """The source of the update (USB drive or chosen file) was removed."""
+
+    code = "update.stick"
+    default_remedy = "Put the USB stick back in and leave it there until the update is done. Nothing has changed yet."
+
+
+class UpdateUntrusted(UpdateError):
+    """The update has no trusted signature."""
+
+    code = "update.foreign"
+    default_remedy = "Do not use this file. Get the update from the maker of the device."
+
+
+class UpdateDamaged(UpdateError):
+    """The update file is incomplete or was changed."""
+
+    code = "update.damaged"
+    default_remedy = "This file is damaged. Copy it to the stick again, or download it again."
+
+
+class UpdateWrongDevice(UpdateError):
+    """The update is made for another type of device."""
+
+    code = "update.device"
+    default_remedy = "Get the update for this device: the file's name says which one it is for."
+
+
+class UpdateOlder(UpdateError):
+    """The update is not newer than the running version."""
+
+    code = "update.older"
+    default_remedy = "Nothing needs to be done: this device has that version or a newer one."
+
+
+class UpdateStepMissing(UpdateError):
+    """The update needs an intermediate version first."""
+
+    code = "update.step"
+    default_remedy = "Install the version in between first; the message names it."
+
+
+class UpdateNoRoom(UpdateError):
+    """There is no space for the update."""
+
+    code = "update.room"
+    default_remedy = "Copy pictures to a USB stick and remove old ones, then try again. Nothing that was kept is lost."
+
+
+class UpdateFailed(UpdateError):
+    """The update could not be written, or its trial failed."""
+
+    code = "update.failed"
+    default_remedy = (
+        "This device works on with the version that it had. Try again; if it happens again, call the technician."
+    )

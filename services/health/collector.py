@@ -1,0 +1,65 @@
+"""Status collector: the inputs of the health checks from instrument, capture store, upload queue and computer."""
+
+from pathlib import Path
+
+from device.clock import Clock
+from device.errors import StoreError
+from services.health.checks import StatusSnapshot
+from services.health.instrument_status import InstrumentStatus
+from services.records.capture import Capture
+from services.records.capture_store import CaptureStore
+from services.records.visit_repository import VisitRepository
+
+COMPUTER_TEMPERATURE_FILE = Path("/sys/class/thermal/thermal_zone0/temp")
+CLOCK_SYNCHRONISED_FILE = Path("/run/systemd/timesync/synchronized")
+MAX_PRESSES = 100
+
+
+def collect_status(
+    instrument: InstrumentStatus,
+    lamp_is_dark: bool,
+    store: CaptureStore,
+    people: VisitRepository,
+    clock: Clock,
+    unsent: tuple[int, int] | None = None,
+) -> StatusSnapshot:
+    """Return the current inputs of the checks; `unsent` as in `StatusSnapshot`."""
+    newest, orphans, damaged, error = _store_status(store, people)
+    return StatusSnapshot(
+        state=instrument.state,
+        problem=instrument.problem,
+        lamp_is_dark=lamp_is_dark,
+        calibration=instrument.calibration_error,
+        store=error,
+        captures_left=store.space.captures_left(),
+        people_left=store.space.visits_left(len(people.protocol.slots)),
+        battery=instrument.battery,
+        emptiest=instrument.emptiest,
+        head_c=instrument.head_c,
+        warmest_c=instrument.warmest_c,
+        computer_c=int(COMPUTER_TEMPERATURE_FILE.read_text()) / 1000 if COMPUTER_TEMPERATURE_FILE.exists() else None,
+        now=clock.wall(),
+        clock_was_set=CLOCK_SYNCHRONISED_FILE.exists(),
+        newest=newest[0].taken_at if newest else None,
+        presses=[(spent_s, spent_s - one.report.budget_s) for one in newest if (spent_s := one.report.total_s) > 0],
+        unsent=unsent,
+        torn_bytes=list(store.quarantine.sizes_bytes().values()),
+        orphans=orphans,
+        damaged=damaged,
+    )
+
+
+def _store_status(store: CaptureStore, people: VisitRepository) -> tuple[list[Capture], int, int, StoreError | None]:
+    """Return the last MAX_PRESSES captures, the number of orphans, the number of damaged rows, and the store's error.
+
+    Orphan: complete capture folder without a row. Damaged rows: of captures and visits. The error is None if the store
+    accepts a file and returns all files of the newest capture; otherwise the other values are empty and 0.
+    """
+    try:
+        newest = store.captures(MAX_PRESSES)
+        store.check_writable()
+        for name in newest[0].files if newest else ():
+            store.read(newest[0].id, name)
+        return newest, len(store.quarantine.orphans()), store.damaged() + people.damaged(), None
+    except StoreError as error:
+        return [], 0, 0, error

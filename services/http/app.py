@@ -1,0 +1,133 @@
+"""App factory: every endpoint, middleware and background worker of one head arbiter."""
+
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+
+from fastapi import APIRouter, Depends, FastAPI
+
+from services.delivery.upload_worker import UploadWorker, archive_builder
+from services.delivery.uploader import Uploader
+from services.delivery.usb_drives import UsbDrives
+from services.health.alert_monitor import AlertMonitor, AlertSources
+from services.http.authentication import PinAuthenticator
+from services.http.control_lease import ControlLease
+from services.http.dependencies import acquire_control_lease, login_required
+from services.http.openapi import DocumentedApp
+from services.http.problem_responses import problem_response, register_error_handlers
+from services.http.routes.calibration import calibration_router
+from services.http.routes.captures import captures_router, press_router
+from services.http.routes.events import event_router
+from services.http.routes.exports import exports_router
+from services.http.routes.preview import preview_router
+from services.http.routes.status import status_router
+from services.http.routes.technician import login_router
+from services.http.routes.updates import UPLOAD_PATH
+from services.http.routes.uploads import upload_router
+from services.http.routes.visits import visits_router
+from services.http.schemas.problems import ProblemResponse
+from services.http.security import BodyLimit, CrossOriginProtection, SecurityHeaders, own_host_names
+from services.http.static_files import add_page_routes
+from services.instrument.checkpointing import Checkpoints
+from services.instrument.events import EventBus
+from services.instrument.head_arbiter import HeadArbiter
+from services.instrument.pending_captures import PendingCaptures
+from services.instrument.status import read_status
+from services.records.protocol import Protocol, load_protocol
+from services.records.upload_queue import UploadQueue
+from services.records.visit_repository import VisitRepository
+
+
+@dataclass(frozen=True)
+class Application:
+    """The HTTP application (`http`, an ASGI application) and the parts behind its endpoints.
+
+    `upload_worker` is None if no receiver is set up.
+    """
+
+    http: FastAPI
+    visits: VisitRepository
+    lease: ControlLease
+    alerts: AlertMonitor
+    upload_worker: UploadWorker | None
+
+
+def create_app(
+    arbiter: HeadArbiter, authenticator: PinAuthenticator, protocol: Protocol | None = None,
+    host_names: tuple[str, ...] | None = None, usb_drives: UsbDrives | None = None,
+    technician_routers: Sequence[APIRouter] = (), uploader: Uploader | None = None,
+) -> Application:  # fmt: skip
+    """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
+
+    `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
+    name of this computer. `protocol` None loads the default programme. `technician_routers` are routers that require
+    the technician's login. `uploader` uploads finished visits; None means that no receiver is set up.
+    """
+    store, clock = arbiter.context.store, arbiter.context.clock
+    visits, lease = VisitRepository(store.engine, protocol or load_protocol(), clock), ControlLease(clock)
+    queue, pack = UploadQueue(store.engine, clock), archive_builder(store, visits)
+    worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
+    sources = AlertSources(
+        lambda: read_status(arbiter), store, visits, lambda: lease.holder, None if worker is None else queue
+    )
+    alerts = AlertMonitor(sources, clock, arbiter.context.event_bus.publish)
+    checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
+    life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker)
+    app = _http_application(life, own_host_names() if host_names is None else host_names)
+    pending, controlled = PendingCaptures(), [Depends(acquire_control_lease(lease))]
+    app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
+    app.include_router(captures_router(store, arbiter))
+    app.include_router(visits_router(visits, lease, pending, checkpoints.request), dependencies=controlled)
+    app.include_router(exports_router(visits, store, usb_drives or UsbDrives()), dependencies=controlled)
+    app.include_router(upload_router(worker), dependencies=controlled)
+    app.include_router(status_router(arbiter, visits, lease, alerts, worker))
+    app.include_router(preview_router(arbiter, visits))
+    app.include_router(event_router(arbiter))
+    app.include_router(login_router(authenticator))
+    app.include_router(calibration_router(arbiter, authenticator))
+    for router in technician_routers:
+        app.include_router(router, dependencies=[Depends(login_required(authenticator))])
+    add_page_routes(app)
+    return Application(app, visits, lease, alerts, worker)
+
+
+Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
+
+
+def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAPI:
+    """Return a FastAPI application with problem responses and the security middlewares, the last one outermost."""
+    app = DocumentedApp(
+        title="Diffuscope", version=version("diffuscope"), lifespan=lifespan,
+        openapi_url="/api/openapi.json", docs_url=None, redoc_url=None,
+        responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
+    )  # fmt: skip
+    register_error_handlers(app)
+    app.add_middleware(CrossOriginProtection, names=host_names, answer=problem_response)
+    app.add_middleware(BodyLimit, exempt=frozenset({UPLOAD_PATH}), answer=problem_response)
+    app.add_middleware(SecurityHeaders)
+    return app
+
+
+def _lifespan(
+    event_bus: EventBus, alerts: AlertMonitor, checkpoints: Checkpoints, upload_worker: UploadWorker | None
+) -> Lifespan:
+    """Return the lifespan handler: alerts, checkpoints and upload worker start and stop with the server.
+
+    At the end it also closes the event bus.
+    """
+
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        alerts.begin()
+        checkpoints.begin()
+        if upload_worker is not None:
+            upload_worker.begin()
+        yield
+        if upload_worker is not None:
+            upload_worker.close()
+        checkpoints.close()
+        alerts.close()
+        event_bus.close()
+
+    return life

@@ -1,0 +1,47 @@
+"""Dependencies of endpoints: the control lease of a screen and the technician's login."""
+
+from collections.abc import Callable
+from typing import Annotated
+
+from fastapi import Cookie, Header, Request
+
+from services.http.authentication import PinAuthenticator
+from services.http.control_lease import ControlLease
+from services.http.security import SAFE_METHODS
+
+COOKIE = "technician"
+Token = Annotated[str | None, Cookie(alias=COOKIE)]
+
+
+def acquire_control_lease(lease: ControlLease) -> Callable[..., None]:
+    """Return the dependency that acquires or renews the control lease for the screen of a changing request.
+
+    ControlLeaseHeld if another screen holds the lease. Safe requests (GET, HEAD, OPTIONS) and those to /api/controller
+    pass; with the holder's key in `X-Controller` they renew the lease.
+    """
+
+    def acquire(request: Request, x_controller: Annotated[str | None, Header(max_length=64)] = None) -> None:
+        if request.method in SAFE_METHODS or request.url.path == "/api/controller":
+            lease.renew(x_controller or "")
+        else:
+            lease.acquire_or_refuse(x_controller)
+
+    return acquire
+
+
+def login_required(authenticator: PinAuthenticator) -> Callable[..., None]:
+    """Return the dependency of endpoints that read: LoginRequired without a valid login."""
+
+    def logged_in(token: Token = None) -> None:
+        authenticator.require_login(token)
+
+    return logged_in
+
+
+def login_renewal(authenticator: PinAuthenticator) -> Callable[..., None]:
+    """Return the dependency of endpoints that act: LoginRequired without a valid login; restarts the idle timeout."""
+
+    def acting(token: Token = None) -> None:
+        authenticator.renew_login(token)
+
+    return acting

@@ -1,0 +1,87 @@
+"""Endpoints of the accuracy explorer: measured frontier of accuracy and time, time budget, recomputed pictures."""
+
+from collections.abc import Callable
+
+from fastapi import APIRouter, Query
+
+from device.errors import CalibrationMissing
+from device.recon.reconstructor import Recipe
+from device.values import Calibration
+from services.http.media import PngResponse, file_responses
+from services.http.problem_responses import error_text
+from services.http.schemas.accuracy import ExplorerAnswer, TimeBudgetChoice
+from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture
+from services.records.capture_store import CaptureStore
+
+PNG = file_responses("image/png")
+
+
+def accuracy_routes(
+    explorer: AccuracyExplorer, store: CaptureStore, calibration: Callable[[], Calibration]
+) -> APIRouter:
+    """Return the router of the accuracy explorer under /api/technician; `calibration` returns the one in use."""
+    router = APIRouter(prefix="/api/technician")
+    router.include_router(_explorer_router(explorer))
+
+    @router.get("/captures/{id}/again.png", response_class=PngResponse, responses=PNG)
+    def reconstruct_again(
+        id: str, method: str, bin: int = Query(1, ge=1, le=16), rounds: int | None = Query(None, ge=0, le=1000)
+    ) -> PngResponse:
+        """Reconstruct a stored capture with another method and return it as PNG.
+
+        `bin` is the binning, `rounds` the number of iterations (default: the method's own). Uses the calibration in
+        use. 404 for an unknown capture, 409 while another measurement or picture is computed, 422 for an unknown
+        method, 423 if the capture was taken with another calibration.
+        """
+        frames = _stored_frames(store, id, calibration())
+        return PngResponse(explorer.reconstruct(frames, Recipe(method, bin, rounds)))
+
+    return router
+
+
+def _explorer_router(explorer: AccuracyExplorer) -> APIRouter:
+    """Return the router of the measurement and of the time budget."""
+    router = APIRouter()
+
+    @router.get("/explorer")
+    def accuracy() -> ExplorerAnswer:
+        """Return the measured accuracy and time of every method on this device, and the chosen time budget."""
+        return explorer_answer(explorer)
+
+    @router.post("/explorer", status_code=202)
+    def measure() -> ExplorerAnswer:
+        """Start to measure every method on this device, in the background.
+
+        The measurement takes minutes; captures have priority. Answers 202 with the state; 409 while another measurement
+        or picture is computed.
+        """
+        explorer.measure()
+        return explorer_answer(explorer)
+
+    @router.put("/pace")
+    def choose(choice: TimeBudgetChoice) -> ExplorerAnswer:
+        """Set the time budget of pictures, from the next capture on; 422 for an unknown name."""
+        explorer.choose(choice.pace)
+        return explorer_answer(explorer)
+
+    return router
+
+
+def explorer_answer(explorer: AccuracyExplorer) -> ExplorerAnswer:
+    """Return the state of the accuracy explorer."""
+    now = explorer.state()
+    return ExplorerAnswer(
+        measured=now.measured, pace=now.pace, paces_s=dict(now.paces_s), busy=now.busy, said=now.progress,
+        scene=now.scene, problem=error_text(now.problem),
+    )  # fmt: skip
+
+
+def _stored_frames(store: CaptureStore, id: str, seen: Calibration) -> StoredCapture:
+    """Return the stored frames of a capture; CalibrationMissing unless it was taken with the calibration `seen`."""
+    capture = store.get(id)
+    if capture.calibration_id != seen.id:
+        raise CalibrationMissing(
+            f"{id} was taken with calibration {capture.calibration_id}, and {seen.id} is in force",
+            "Choose a picture that was taken since, or go back to that calibration.",
+        )
+    return StoredCapture(store.read(id, "raw.tiff"), store.read(id, "dark.tiff"), seen, capture.simulated)

@@ -1,0 +1,184 @@
+"""Endpoints of the calibration of the head: state, live picture of the sensor, start, steps, choice."""
+
+from dataclasses import asdict
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Response
+
+from device.calibration.archive import Archive, StoredCalibration
+from device.calibration.procedure.calibration_sequence import CalibrationTarget
+from device.errors import CalibrationError, HeadMismatch
+from device.head import fault_names, kind_of
+from services.errors import Busy
+from services.http.authentication import IDLE_TIMEOUT_S, PinAuthenticator
+from services.http.dependencies import login_renewal, login_required
+from services.http.media import JpegResponse, file_responses, no_picture
+from services.http.problem_responses import error_text
+from services.http.schemas.calibration import (
+    ArchivedCalibration,
+    CalibrationAnswer,
+    CalibrationChoice,
+    CalibrationStart,
+    DamagedCalibration,
+    IntactCalibration,
+    StepState,
+    TargetReady,
+)
+from services.http.schemas.problems import ErrorText
+from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest
+from services.instrument.calibration_session import STANDS, SessionState
+from services.instrument.head_arbiter import HeadArbiter
+
+MAX_LISTED = 8  # calibrations in the list of earlier ones
+STEP_FILES: dict[CalibrationTarget, str] = {"cap": "darks.npz", "screen": "flats.npz", "point": "point.npz"}
+PREVIEW_RESPONSES = file_responses("image/jpeg") | no_picture("no picture within 2 s, or no calibration runs")
+
+
+def calibration_router(arbiter: HeadArbiter, authenticator: PinAuthenticator) -> APIRouter:
+    """Return the router of the calibration; every endpoint needs the login."""
+    router = APIRouter()
+    router.include_router(_read_router(arbiter), dependencies=[Depends(login_required(authenticator))])
+    router.include_router(_write_router(arbiter), dependencies=[Depends(login_renewal(authenticator))])
+    return router
+
+
+def _read_router(arbiter: HeadArbiter) -> APIRouter:
+    """Return the router of the calibration endpoints that only read."""
+    router = APIRouter(prefix="/api/calibration")
+
+    @router.get("")
+    def state() -> CalibrationAnswer:
+        """Return the state of the calibration procedure: steps, progress, results, errors, archived calibrations."""
+        return calibration_state(arbiter)
+
+    @router.get("/preview", response_class=JpegResponse, responses=PREVIEW_RESPONSES)
+    def preview(after: int = Query(0, ge=0)) -> Response:
+        """Return the latest preview picture with a number above `after`, as JPEG, with its levels in headers.
+
+        `X-Frame` (picture number), `X-Age-Ms`, `X-Exposure-Ms`, `X-Brightest` (99.9th percentile, counts), `X-Mean`
+        (counts), `X-Full` (share of saturated pixels). 204 if there is none within 2 s or no calibration runs.
+        """
+        wizard = arbiter.owner.session
+        frame = wizard.next_picture(after) if wizard is not None else None
+        if frame is None:
+            return Response(status_code=204)
+        age_ms = max(0, round((arbiter.context.clock.now_s() - frame.seen_s) * 1000))
+        headers = {
+            "X-Frame": str(frame.number), "X-Age-Ms": str(age_ms), "X-Exposure-Ms": f"{frame.exposure_s * 1000:.3g}",
+            "X-Brightest": f"{frame.brightest_dn:.0f}", "X-Mean": f"{frame.mean_dn:.1f}", "X-Full": f"{frame.full:.4f}",
+        }  # fmt: skip
+        return JpegResponse(frame.jpeg, headers=headers)
+
+    return router
+
+
+def _write_router(arbiter: HeadArbiter) -> APIRouter:
+    """Return the router of the calibration endpoints that act."""
+    router = APIRouter(prefix="/api/calibration")
+
+    @router.post("")
+    def start(start: CalibrationStart) -> CalibrationAnswer:
+        """Start a calibration, or resume an unfinished one.
+
+        409 while a calibration is under way or the instrument starts, 401 without a login.
+        """
+        arbiter.calibrate(CalibrationRequest(arbiter.context.archive.root, start.serial, start.by, start.source_deg))
+        return calibration_state(arbiter)
+
+    @router.post("/ready")
+    def ready(ready: TargetReady) -> CalibrationAnswer:
+        """Confirm that the requested target is in place, and measure it; 409 if this target is not requested now."""
+        wizard = arbiter.owner.session
+        if wizard is None:
+            raise Busy("nothing is being calibrated", "Start the calibration first.")
+        wizard.ready(ready.stand, ready.mishap)
+        return calibration_state(arbiter)
+
+    @router.post("/cancel")
+    def cancel() -> CalibrationAnswer:
+        """Cancel the running calibration; its finished steps can be resumed for 12 hours."""
+        arbiter.stop_calibration()
+        return calibration_state(arbiter)
+
+    @router.post("/use")
+    def use(use: CalibrationChoice) -> CalibrationAnswer:
+        """Put an earlier calibration in force again; 409 during a calibration, 423 if it is unknown or damaged."""
+        arbiter.roll_back(use.id)
+        return calibration_state(arbiter)
+
+    return router
+
+
+def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
+    """Return the state of the calibration procedure, its errors and the archived calibrations."""
+    spec, archive, owner = arbiter.context.spec, arbiter.context.archive, arbiter.owner
+    problem = owner.problem
+    now = owner.session.snapshot() if owner.session is not None else SessionState(owner.idle_state)
+    kept = _listed(archive)
+    return CalibrationAnswer(
+        state=now.state,
+        stand=now.stand,
+        progress=now.progress,
+        error=error_text(now.error or owner.calibration_failure),
+        needed=error_text(problem if isinstance(problem, CalibrationError | HeadMismatch) else None),
+        steps=[_step(stand, now) for stand in STANDS],
+        unfinished=[stand for stand, name in STEP_FILES.items() if (archive.root / STEPS_FOLDER / name).is_file()],
+        made=next((one for one in kept if one.id == owner.last_made_id), None),
+        in_force=next((one for one in kept if one.in_force), None),
+        kept=kept,
+        name=spec.name,
+        kind=kind_of(spec),
+        white_dn=spec.camera.white_dn,
+        shape=(spec.camera.rows, spec.camera.cols),
+        mishaps=list(fault_names()) if spec.camera.backend == "sim" else [],
+        idle_s=IDLE_TIMEOUT_S,
+    )
+
+
+def _step(stand: CalibrationTarget, now: SessionState) -> StepState:
+    found = now.found.get(stand)
+    state: Literal["todo", "now", "done"] = "now" if stand == now.stand else "done" if found else "todo"
+    return StepState(stand=stand, state=state, found=None if found is None else dict(found))
+
+
+def _listed(archive: Archive) -> list[ArchivedCalibration]:
+    """Return the archived calibrations, the newest first, at most `MAX_LISTED` and the current one."""
+    try:
+        current = archive.active_id()
+    except CalibrationError:
+        current = None
+    ids = archive.ids()[::-1][:MAX_LISTED]
+    if current is not None and current not in ids and current in archive.ids():
+        ids = (*ids, current)
+    return [_described(archive, id, id == current) for id in ids]
+
+
+def _described(archive: Archive, id: str, in_force: bool) -> ArchivedCalibration:
+    try:
+        return _read(archive, id).model_copy(update={"in_force": in_force})
+    except CalibrationError as error:
+        damaged = ErrorText(code=error.code, message=error.message, remedy=error.remedy)
+        return DamagedCalibration(id=id, damaged=damaged, numbers={}, in_force=in_force)
+
+
+@lru_cache(maxsize=32)  # key: the archive object; a load checks every byte, and the page polls each second
+def _read(archive: Archive, id: str) -> IntactCalibration:
+    return intact_calibration(archive.load(id))
+
+
+def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
+    """Return origin and figures of a calibration that is not in force.
+
+    `psf_spread_px` is the effective number of pixels of the PSF: squared sum over sum of squares.
+    """
+    calibration, made = stored.calibration, stored.provenance
+    psf = calibration.psfs[0].pixels
+    numbers = dict(made.figures) | asdict(calibration.sensor)
+    numbers |= {"psf_spread_px": float(psf.sum(dtype=np.float64) ** 2 / np.square(psf, dtype=np.float64).sum())}
+    return IntactCalibration(
+        id=calibration.id, serial=made.serial, made_at=made.made_at, made_by=made.made_by, software=made.software,
+        temperature_c=made.temperature_c, simulated=calibration.simulated, numbers=numbers, damaged=None,
+        in_force=False,
+    )  # fmt: skip

@@ -1,0 +1,51 @@
+"""Endpoints of the exports of visits: USB drives, ZIP download, copy on a drive."""
+
+from fastapi import APIRouter
+
+from services.delivery.usb_drives import UsbDrives, copy_to_drive
+from services.delivery.visit_export import export_files, folder_name, zip_archive
+from services.http.media import ZipResponse, file_responses
+from services.http.schemas.common import FolderName
+from services.http.schemas.exports import UsbDrive, UsbDriveList, VisitExport
+from services.records.capture_store import CaptureStore
+from services.records.visit_repository import VisitRepository
+
+
+def exports_router(repository: VisitRepository, store: CaptureStore, drives: UsbDrives) -> APIRouter:
+    """Return the router of the exports of visits: to a USB drive, or as ZIP archive for download."""
+    router = APIRouter()
+
+    @router.get("/api/exports")
+    def exports() -> UsbDriveList:
+        """List the USB drives that are present, with their free space in bytes."""
+        return UsbDriveList(
+            folders=[
+                UsbDrive(id=str(drive.folder), name=drive.folder.name, free_bytes=drive.free_bytes)
+                for drive in drives.present()
+            ]
+        )
+
+    @router.get("/api/visits/{id}/export.zip", response_class=ZipResponse, responses=file_responses("application/zip"))
+    def download(id: str) -> ZipResponse:
+        """Return a visit as ZIP archive; 404 for an unknown visit."""
+        visit = repository.get(id)
+        name = folder_name(visit)
+        content = zip_archive(name, export_files(store, visit, repository.undo_until(visit)), visit.begun_at)
+        return ZipResponse(content, headers={"Content-Disposition": f'attachment; filename="{name}.zip"'})
+
+    @router.post("/api/visits/{id}/export")
+    def copy_visit(id: str, order: VisitExport) -> FolderName:
+        """Copy a visit to a USB drive.
+
+        Answers with the path of the new folder; 404 for an unknown visit, 503 if the drive was removed, 507 if it is
+        full.
+        """
+        visit = repository.get(id)
+
+        def copy() -> str:
+            files = export_files(store, visit, repository.undo_until(visit))
+            return str(copy_to_drive(drives.mounted_folder(order.folder), folder_name(visit), files))
+
+        return FolderName(folder=repository.requests.run_once(order.key, f"export {id} {order.folder}", copy))
+
+    return router

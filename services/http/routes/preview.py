@@ -1,0 +1,42 @@
+"""Endpoint of the live picture: the next live picture as JPEG, with number, age and aiming hint in headers."""
+
+import json
+from dataclasses import asdict
+
+from fastapi import APIRouter, Query, Response
+
+from device.values import EYES, Eye
+from services.http.media import JpegResponse, file_responses, no_picture
+from services.http.schemas.common import ID_PATTERN
+from services.instrument.capture import LiveRequest
+from services.instrument.head_arbiter import HeadArbiter
+from services.records.visit_repository import VisitRepository
+
+RESPONSES = file_responses("image/jpeg") | no_picture("no picture within 2 s")
+
+
+def preview_router(arbiter: HeadArbiter, repository: VisitRepository) -> APIRouter:
+    """Return the router of the live picture."""
+    router = APIRouter()
+
+    @router.get("/api/preview", response_class=JpegResponse, responses=RESPONSES)
+    def preview(
+        after: int = Query(0, ge=0), eye: Eye | None = None, visit: str | None = Query(None, pattern=ID_PATTERN)
+    ) -> Response:
+        """Return the next live picture with a number above `after`, as JPEG; the request turns the aiming light on.
+
+        `eye`: the eye whose light dose is counted, by default both. Headers: `X-Frame` (picture number), `X-Age-Ms`,
+        `X-Aim` (aiming hint, JSON). 204 if no picture arrives within 2 s. With `visit`, 409 unless its consent is
+        `agreed`; the lamp stays off. Without it, the picture is a test picture. CSRF protection: the request needs a
+        same-origin `Sec-Fetch-Site` or any `X-Controller` header, else 403, since it turns the lamp on.
+        """
+        wanted = LiveRequest(EYES if eye is None else (eye,), repository.pictures.permission(visit))
+        wanted.permit()
+        live = arbiter.preview(after, wanted)
+        if live is None:
+            return Response(status_code=204)
+        age_ms = max(0, round((arbiter.context.clock.now_s() - live.exposed_s) * 1000))
+        headers = {"X-Frame": str(live.number), "X-Age-Ms": str(age_ms), "X-Aim": json.dumps(asdict(live.aim))}
+        return JpegResponse(live.jpeg, headers=headers)
+
+    return router

@@ -1,0 +1,58 @@
+"""Endpoints of the upload queue: waiting visits with the last error of each, and an immediate retry."""
+
+from fastapi import APIRouter
+
+from device.errors import DiffuscopeError
+from services.delivery.upload_worker import UploadWorker
+from services.errors import RecordNotFound, StoreDamaged, UploadDisabled, UploadError
+from services.http.schemas.problems import ErrorText
+from services.http.schemas.uploads import QueueAnswer, UploadRetry, WaitingVisit
+from services.records.upload_queue import QueuedVisit
+
+MAX_LISTED = 200
+UPLOAD_ERRORS: tuple[type[DiffuscopeError], ...] = (*UploadError.__subclasses__(), StoreDamaged, RecordNotFound)
+REMEDIES = {kind.code: kind.default_remedy for kind in UPLOAD_ERRORS}
+
+
+def upload_router(sender: UploadWorker | None) -> APIRouter:
+    """Return the router of the upload queue; `sender` None means that no receiver is set up."""
+    router = APIRouter()
+
+    @router.get("/api/outbox")
+    def upload_queue() -> QueueAnswer:
+        """Return the visits in the upload queue, the longest waiting first, and the seconds until the next try.
+
+        `configured` is false, and the queue empty, if no receiver is set up.
+        """
+        return queue_answer(sender)
+
+    @router.post("/api/outbox/try")
+    def retry_now(order: UploadRetry) -> QueueAnswer:
+        """Retry uploads at once, without waiting for the backoff; 409 (`send.off`) if no receiver is set up."""
+        if sender is None:
+            raise UploadDisabled("no receiver is set up")
+        sender.retry_now(order.visit)
+        return queue_answer(sender)
+
+    return router
+
+
+def queue_answer(sender: UploadWorker | None) -> QueueAnswer:
+    """Return the upload queue, at most `MAX_LISTED` visits; empty without a `sender`."""
+    if sender is None:
+        return QueueAnswer(configured=False, sent=0, waiting=0, next_try_s=0.0, visits=[])
+    visits = [_waiting_visit(one) for one in sender.queue.queued(MAX_LISTED, sizes=True)]
+    counts = sender.counts()
+    return QueueAnswer(
+        configured=True, sent=counts.sent, waiting=counts.waiting, next_try_s=round(sender.backoff_s, 1), visits=visits
+    )
+
+
+def _waiting_visit(one: QueuedVisit) -> WaitingVisit:
+    error = None
+    if one.error:
+        error = ErrorText(code=one.error, message=one.message or "", remedy=REMEDIES.get(one.error, ""))
+    return WaitingVisit(
+        visit=one.visit, number=one.number, since=one.finished_at, size_bytes=one.size_bytes, tries=one.tries,
+        failing_since=one.failing_since, error=error, stuck=one.stuck,
+    )  # fmt: skip

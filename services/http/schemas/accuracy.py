@@ -1,0 +1,27 @@
+"""Bodies of the endpoints of the accuracy explorer."""
+
+from services.http.schemas.common import RequestBody, ResponseBody
+from services.http.schemas.problems import ErrorText
+from services.instrument.measured_frontier import MeasuredFrontier
+from services.instrument.time_budget import Pace
+
+
+class TimeBudgetChoice(RequestBody):
+    """Request body: the time budget of a picture, by name."""
+
+    pace: Pace
+
+
+class ExplorerAnswer(ResponseBody):
+    """Last measurement, selected time budget, progress of a running computation (`said`), and last error.
+
+    `paces_s`: time budgets in seconds by name. `busy`: a computation is running. `scene`: the simulated scene.
+    """
+
+    measured: MeasuredFrontier | None
+    pace: Pace
+    paces_s: dict[Pace, float]
+    busy: bool
+    said: str
+    scene: str
+    problem: ErrorText | None

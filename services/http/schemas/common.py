@@ -1,0 +1,53 @@
+"""Bases and shared types of all request and response bodies."""
+
+from datetime import datetime
+from typing import Annotated, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, PlainSerializer, WithJsonSchema
+
+KEY_PATTERN = "^[0-9a-f]{16}$"
+ID_PATTERN = "^[A-Za-z0-9._-]{1,128}$"
+Key = Annotated[str, Field(pattern=KEY_PATTERN)]
+RecordId = Annotated[str, Field(pattern=ID_PATTERN)]
+SlotName = Annotated[str, Field(min_length=1, max_length=40)]
+Timestamp = Annotated[
+    datetime,
+    PlainSerializer(datetime.isoformat, return_type=str),  # pydantic would write "Z" for "+00:00"
+    WithJsonSchema({"type": "string", "format": "date-time"}),
+]
+Number = int | float  # a stored number keeps its type
+Value = TypeVar("Value")
+OmittedIfNone = Annotated[
+    Value | None, Field(exclude_if=lambda value: value is None)
+]  # the key is absent without a value
+
+
+class RequestBody(BaseModel):
+    """Request body that refuses unknown fields."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class IdempotentRequest(RequestBody):
+    """Request body of a change; `key` is an idempotency key: a repeated request has no further effect."""
+
+    key: Key
+
+
+class ResponseBody(BaseModel):
+    """Response body, or a part of one; its fields are the keys on the wire."""
+
+    model_config = ConfigDict(frozen=True, from_attributes=True)
+
+
+class StoredPart(ResponseBody):
+    """Part of a response body that was stored; entries that this release does not know are passed on."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, JsonValue]
+
+
+class FolderName(ResponseBody):
+    """Answer to a copy on a USB drive: the new folder."""
+
+    folder: str

@@ -1,0 +1,164 @@
+"""Payloads of the server-sent events, by event name."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, JsonValue, TypeAdapter
+
+from device.recon.assessment.aiming import AimCode
+from services.http.schemas.captures import CaptureAnswer
+from services.http.schemas.common import OmittedIfNone, ResponseBody
+from services.http.schemas.problems import ErrorText
+from services.http.schemas.status import AlertAnswer, FindingAnswer
+
+
+class Heartbeat(ResponseBody):
+    """Heartbeat, once per second; `number` of the latest event."""
+
+    number: int
+
+
+class InstrumentState(ResponseBody):
+    """State of the exam: `starting`, `aim`, `busy` or `making`."""
+
+    state: str
+
+
+class AimingHint(ResponseBody):
+    """Aiming hint, and the lit share of the field, 0 to 1."""
+
+    code: AimCode
+    fill: float
+
+
+class CaptureProgress(ResponseBody):
+    """Progress of a capture: stage, `fraction` done (0 to 1), seconds left, and the idempotency key of its request.
+
+    `url`: URL of the quick look, or null. `visit`, `slot`: null for a test picture.
+    """
+
+    id: str
+    stage: str
+    fraction: float
+    left_s: float
+    url: str | None
+    key: str | None
+    visit: str | None
+    slot: str | None
+
+
+class CaptureVerdict(ResponseBody):
+    """Verdict on the image quality of a capture: word, code of the cause (null if good), and measured figures."""
+
+    id: str
+    word: str
+    code: str | None
+    numbers: dict[str, JsonValue]
+
+
+class Failure(ErrorText):
+    """An error; `id` is present if it ended a capture."""
+
+    id: OmittedIfNone[str] = None
+
+
+class ExplorerProgress(ResponseBody):
+    """Progress text of the accuracy explorer; empty at the end."""
+
+    said: str
+
+
+class AlertChange(AlertAnswer):
+    """An alert that is active from now on, with its values, or ended (`over`)."""
+
+    over: OmittedIfNone[bool] = None
+
+
+class LeaseChange(ResponseBody):
+    """Another screen has the control lease, or none has it (`over`)."""
+
+    code: Literal["link.other"]
+    over: bool
+
+
+class CalibrationFindings(ResponseBody):
+    """Findings of the calibration monitor, published when the set of failed ones changes."""
+
+    findings: list[FindingAnswer]
+
+
+class HeartbeatEvent(ResponseBody):
+    """Event `beat`."""
+
+    event: Literal["beat"]
+    data: Heartbeat
+
+
+class StateEvent(ResponseBody):
+    """Event `state`."""
+
+    event: Literal["state"]
+    data: InstrumentState
+
+
+class AimEvent(ResponseBody):
+    """Event `aim`."""
+
+    event: Literal["aim"]
+    data: AimingHint
+
+
+class StageEvent(ResponseBody):
+    """Event `stage`."""
+
+    event: Literal["stage"]
+    data: CaptureProgress
+
+
+class VerdictEvent(ResponseBody):
+    """Event `verdict`."""
+
+    event: Literal["verdict"]
+    data: CaptureVerdict
+
+
+class KeptEvent(ResponseBody):
+    """Event `kept`: a stored capture."""
+
+    event: Literal["kept"]
+    data: CaptureAnswer
+
+
+class FailedEvent(ResponseBody):
+    """Event `failed`."""
+
+    event: Literal["failed"]
+    data: Failure
+
+
+class ExplorerEvent(ResponseBody):
+    """Event `explorer`."""
+
+    event: Literal["explorer"]
+    data: ExplorerProgress
+
+
+class NoticeEvent(ResponseBody):
+    """Event `notice`."""
+
+    event: Literal["notice"]
+    data: AlertChange | LeaseChange
+
+
+class CalibrationEvent(ResponseBody):
+    """Event `calibration`."""
+
+    event: Literal["calibration"]
+    data: CalibrationFindings
+
+
+ServerSentEvent = Annotated[
+    HeartbeatEvent | StateEvent | AimEvent | StageEvent | VerdictEvent | KeptEvent | FailedEvent | ExplorerEvent
+    | NoticeEvent | CalibrationEvent,
+    Field(discriminator="event"),
+]  # fmt: skip
+SERVER_SENT_EVENT: TypeAdapter[ServerSentEvent] = TypeAdapter(ServerSentEvent)

@@ -1,0 +1,110 @@
+"""Bodies of the endpoints of visits and of the control lease."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from services.http.schemas.captures import VerdictAnswer
+from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName, Timestamp
+from services.records.visit import OutcomeCode
+
+FieldAnswer = str | int | bool | list[str] | None
+
+
+class NewVisit(IdempotentRequest):
+    """Request body: a new visit of a patient by number; null takes the next automatic number."""
+
+    number: str | None = Field(default=None, min_length=1, max_length=40)
+
+
+class FieldValue(IdempotentRequest):
+    """Request body: the value of one form field; null clears it."""
+
+    field: str = Field(min_length=1, max_length=40)
+    value: FieldAnswer
+
+
+class MissingPicture(IdempotentRequest):
+    """Request body: a picture that could not be taken, and the reason."""
+
+    slot: SlotName
+    reason: str = Field(min_length=1, max_length=40)
+
+
+class SlotChoice(IdempotentRequest):
+    """Request body: the capture that fills a picture slot; null empties the slot."""
+
+    slot: SlotName
+    capture: RecordId | None
+
+
+class ControlRequest(IdempotentRequest):
+    """Request body of the control lease; `key` is the secret key of the screen.
+
+    `take` takes the lease from another screen, `release` lets it expire.
+    """
+
+    take: bool = False
+    release: bool = False
+
+
+class LeaseAnswer(ResponseBody):
+    """State of the control lease: public name of its present or last holder, and whether this screen holds it."""
+
+    lease: str | None
+    mine: bool
+
+
+class SlotAnswer(ResponseBody):
+    """One picture slot of a visit: the chosen capture with its verdict, all captures, and the number of attempts.
+
+    `reason`: why a picture is not possible, or null.
+    """
+
+    state: Literal["empty", "taken", "could_not"]
+    capture: str | None
+    captures: list[str]
+    verdict: VerdictAnswer | None
+    reason: str | None
+    tries: int
+
+
+class OutcomeAnswer(ResponseBody):
+    """Outcome of a visit: its code, and a sentence for the health worker."""
+
+    code: OutcomeCode
+    sentence: str
+
+
+class VisitAnswer(ResponseBody):
+    """A visit with its form fields and picture slots; `day` is the local date.
+
+    `next_slot`: first empty slot, or null. `outcome`, `finished_at`: null until the visit is finished. `undo_until`:
+    time until which the finish can be undone, or null.
+    """
+
+    id: str
+    number: str
+    begun_at: Timestamp
+    day: str
+    fields: dict[str, FieldAnswer]
+    slots: dict[str, SlotAnswer]
+    next_slot: str | None
+    outcome: OutcomeAnswer | None
+    finished_at: Timestamp | None
+    undo_until: Timestamp | None
+
+
+class VisitCounts(ResponseBody):
+    """Numbers of finished (`done`), unfinished (`to_finish`) and `referred` visits."""
+
+    done: int
+    to_finish: int
+    referred: int
+
+
+class VisitList(ResponseBody):
+    """Visits, the newest first, with the counts of the day, or of all days."""
+
+    visits: list[VisitAnswer]
+    counts: VisitCounts

@@ -1,0 +1,140 @@
+"""Security middlewares: CSRF and DNS rebinding (checks of Host, Origin, Sec-Fetch-Site), body limit, security headers.
+
+Changing requests with a foreign `Origin` are refused. `GET /api/preview` turns the lamp on, and a foreign page can send
+it with an <img>: it needs a same-origin `Sec-Fetch-Site` (browsers set it over https and on localhost), or, without
+that header, any `X-Controller`, which a foreign page cannot send without a CORS preflight.
+"""
+
+import ipaddress
+import socket
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from device.errors import DiffuscopeError, InputError
+from services.errors import CrossOriginRequest, UntrustedHost
+
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+LIGHT_EMITTING_PATHS = frozenset({"/api/preview"})
+SAME_ORIGIN_SITES = frozenset({"same-origin", "none"})  # `none`: the user typed the URL
+MAX_BODY_BYTES = 10_000
+SECURITY_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
+        "require-trusted-types-for 'script'; trusted-types lit-html"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
+ErrorResponse = Callable[[DiffuscopeError], Response]
+
+
+class CrossOriginProtection:
+    """ASGI middleware against CSRF: refuse untrusted hosts, and changing or light-emitting requests from other origins.
+
+    `names` are accepted host names (case-insensitive); `answer` turns an error into a response.
+    """
+
+    def __init__(self, app: ASGIApp, names: tuple[str, ...], answer: ErrorResponse) -> None:
+        self.app, self.names, self.answer = app, frozenset(name.lower() for name in names), answer
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a permitted ASGI request to the application; answer a refused one with its error."""
+        error = self._error(scope) if scope["type"] == "http" else None
+        await (self.app if error is None else self.answer(error))(scope, receive, send)
+
+    def _error(self, scope: Scope) -> DiffuscopeError | None:
+        headers = Headers(scope=scope)
+        host, origin = headers.get("host"), headers.get("origin")
+        if host is not None and not is_trusted_host(host, self.names):
+            return UntrustedHost(f"{host[:80]!r} is not a name of this camera")
+        if scope["method"] not in SAFE_METHODS and origin is not None and _authority(origin) != (host or "").lower():
+            return CrossOriginRequest(f"a page of {origin[:80]!r} asked for a change")
+        if scope["path"] in LIGHT_EMITTING_PATHS and not _is_same_origin(headers):
+            return CrossOriginRequest("nobody knows which page asked for light", "Open the camera's own page to aim.")
+        return None
+
+
+def _is_same_origin(headers: Headers) -> bool:
+    """Return whether a request comes from the own page: by Sec-Fetch-Site, or without it by any X-Controller."""
+    site = headers.get("sec-fetch-site")
+    return "x-controller" in headers if site is None else site in SAME_ORIGIN_SITES
+
+
+def is_trusted_host(host: str, names: frozenset[str]) -> bool:
+    """Return whether a Host header is valid and trusted: any IP address, localhost, *.local, or one of `names`."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        urlsplit(f"//{host}").port  # noqa: B018  # ValueError for an invalid port
+    except ValueError:
+        return False
+    if name in names or name == "localhost" or name.endswith(".local"):
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def own_host_names() -> tuple[str, ...]:
+    """Return the host name of this computer, as a tuple of one."""
+    return (socket.gethostname(),)
+
+
+def _authority(origin: str) -> str:
+    """Return host and port of an Origin as in a Host header, in lower case; "" for "null" and invalid values."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
+class BodyLimit:
+    """ASGI middleware: refuse bodies over `MAX_BODY_BYTES`, and chunked ones, with the answer for an InputError.
+
+    `exempt` are the paths whose body is a file; their endpoints have their own limit.
+    """
+
+    def __init__(self, app: ASGIApp, exempt: frozenset[str], answer: ErrorResponse) -> None:
+        self.app, self.exempt = app, exempt
+        self._too_large = answer(InputError("this request is too large", "Reload the page and try again."))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one ASGI request to the application, or answer 422 for a body that is too large."""
+        limited = scope["type"] == "http" and scope["path"] not in self.exempt
+        app = self._too_large if limited and _is_too_large(Headers(scope=scope)) else self.app
+        await app(scope, receive, send)
+
+
+def _is_too_large(headers: Headers) -> bool:
+    """Return True if the body is chunked, or its declared length exceeds `MAX_BODY_BYTES` or is no number."""
+    length = headers.get("content-length") or "0"
+    return "transfer-encoding" in headers or not length.isdecimal() or int(length) > MAX_BODY_BYTES
+
+
+class SecurityHeaders:
+    """ASGI middleware: add the security headers to every answer. Streamed answers pass through unbuffered."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one ASGI request to the application and add the headers to its answer."""
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(security_headers(scope["path"]))
+            await send(message)
+
+        await self.app(scope, receive, with_headers if scope["type"] == "http" else send)
+
+
+def security_headers(path: str) -> dict[str, str]:
+    """Return the security headers for this path (Content-Security-Policy and others), with `no-store` under /api/."""
+    return SECURITY_HEADERS | ({"Cache-Control": "no-store"} if path.startswith("/api/") else {})

@@ -1,0 +1,200 @@
+"""Server process: bind the socket, open store and head, and run uvicorn until a signal or a failure.
+
+The socket is bound first, so that a port in use is an error before any file or device is opened.
+"""
+
+import errno
+import logging
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from threading import Event
+from types import FrameType
+from typing import Self
+
+import uvicorn
+
+from device.calibration.archive import Archive
+from device.clock import SystemClock
+from device.config.head_file import InstrumentSpec
+from device.errors import DiffuscopeError, InputError
+from device.head import open_bench, open_head
+from device.light_safety.hazard import light_limits
+from services.delivery.uploader import Uploader
+from services.delivery.usb_drives import UsbDrives
+from services.health.event_log import EventLog
+from services.http.app import create_app
+from services.http.authentication import PinAuthenticator
+from services.http.routes.accuracy import accuracy_routes
+from services.http.routes.event_log import event_log_routes
+from services.http.routes.updates import update_routes
+from services.http.security import own_host_names
+from services.instrument.accuracy_explorer import AccuracyExplorer, Measure
+from services.instrument.events import EventBus
+from services.instrument.exam import ExamService
+from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_path, with_calibration
+from services.instrument.update_requests import UpdateRequests
+from services.instrument.watchdog import Watchdog
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.protocol import Protocol
+
+log = logging.getLogger(__name__)
+
+BACKLOG = 128
+SD_LISTEN_FD = 3  # the file descriptor of sd_listen_fds(3)
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
+
+def bind_socket(host: str, port: int) -> socket.socket:
+    """Return a listening socket at `host` and `port`; InputError if the address cannot be bound.
+
+    It listens at once: two sockets that are only bound could share an address. Early requests wait in the backlog.
+    """
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with ExitStack() as undo:
+            listener = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((host, port))
+            listener.listen(BACKLOG)
+            undo.pop_all()
+    except OSError as error:
+        raise InputError(
+            f"http://{host}:{port} cannot be served: {error.strerror or error}", _remedy(error, port)
+        ) from error
+    return listener
+
+
+def inherited_socket(environment: Mapping[str, str]) -> socket.socket | None:
+    """Return the listening socket that systemd passed to this process (socket activation); None unless exactly one."""
+    if environment.get("LISTEN_PID") != str(os.getpid()) or environment.get("LISTEN_FDS") != "1":
+        return None
+    return socket.socket(fileno=SD_LISTEN_FD)
+
+
+def _remedy(error: OSError, port: int) -> str:
+    """Return the remedy for a failed bind: a sentence for the user."""
+    other = port + 1 if port < 65535 else 8000
+    if error.errno == errno.EADDRINUSE:
+        return f"Another program uses it, perhaps this one. Stop that, or choose another with --port {other}."
+    if error.errno == errno.EACCES:
+        return "Ports below 1024 belong to the system. Choose one with --port 8000."
+    return "Give an address of this computer with --host: 127.0.0.1 for itself, 0.0.0.0 for the whole network."
+
+
+def serve(
+    spec: InstrumentSpec, address: socket.socket, data: Path, ready: Callable[[], None], watchdog: Watchdog,
+    protocol: Protocol, measure: Measure, host_names: tuple[str, ...] = (),
+    updater: tuple[Path | None, Path | None] = (None, None), uploader: Uploader | None = None,
+) -> None:  # fmt: skip
+    """Open the store and the head, call `ready`, and serve at `address` until SIGTERM, SIGINT or a failure.
+
+    The page is available while the exam still plans its FFTs; an error that stopped the server is raised at the end.
+    `data`: data folder. `host_names`: accepted host names beside the own and local ones. `measure`: the frontier
+    measurement of this device. `updater`: the updater's state folder and its request folder. `uploader`: uploads to the
+    receiver. Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
+    """
+    clock = SystemClock()
+    with _Stop() as stop, address, CaptureStore(data, clock=clock) as store, ExitStack() as undo:
+        dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
+        archive = Archive(archive_path(spec, data))
+        event_log = undo.enter_context(closing(EventLog(data / "diary")))
+        context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
+        explorer = AccuracyExplorer(data / "explorer", data / "plans", clock, spec, context.event_bus.publish, measure)
+
+        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer)
+        arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
+        undo.callback(arbiter.close)
+        authenticator = PinAuthenticator(data / "technician.json", clock)
+        routers = [
+            accuracy_routes(explorer, store, lambda: arbiter.exam.head.calibration),
+            update_routes(UpdateRequests(*updater, clock, version("diffuscope")), authenticator),
+            event_log_routes(event_log, UsbDrives(), clock),
+        ]
+        names = own_host_names() + host_names
+        app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
+        config = uvicorn.Config(app.http, log_level="warning", timeout_graceful_shutdown=1)
+        log.info("started, version %s", app.http.version)
+        if torn := ", ".join(store.newly_quarantined):
+            log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
+        ready()
+        stop.register(_Server(config, context.event_bus)).run(sockets=[address])
+    if (failure := arbiter.owner.failure) is not None or stop.has_failed:
+        raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _open_exam(context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer) -> ExamService:
+    """Open the head with the calibration in force, and return its exam."""
+    head = open_head(with_calibration(context.spec, context.archive.root), context.clock, doses)
+    return ExamService(
+        head, context.store, context.event_bus, context.clock, plans, context.on_failure, context.watchdog,
+        lambda: explorer.budget_s,
+    )  # fmt: skip
+
+
+class _Stop:
+    """Signal handling: stop the server on SIGTERM, SIGINT or a failed head, so that every `close` runs afterwards.
+
+    uvicorn handles the signals too, but raises them again after its server has ended, and SIGTERM then kills the
+    process before anything is closed. A signal before the server exists raises SystemExit(0) in the main thread; a
+    signal during closing has no effect. The earlier handlers are restored at exit.
+    """
+
+    def __init__(self) -> None:
+        self._failed = Event()
+        self._server: uvicorn.Server | None = None
+
+    def __enter__(self) -> Self:
+        self._before = {number: signal.signal(number, self._stop) for number in STOP_SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether `failed` was called."""
+        return self._failed.is_set()
+
+    def failed(self) -> None:
+        """Stop the server because of a failure; `serve` then raises an error. Callable from any thread."""
+        self._failed.set()
+        if self._server is not None:
+            self._server.should_exit = True
+
+    def register(self, server: uvicorn.Server) -> uvicorn.Server:
+        """Register the server that signals and failures stop, and return it."""
+        self._server = server
+        if self._failed.is_set():
+            server.should_exit = True
+        return server
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._server is None:
+            raise SystemExit(0)
+        self._server.handle_exit(number, frame)
+
+
+class _Server(uvicorn.Server):
+    """uvicorn server that closes its event streams before it waits for open connections."""
+
+    def __init__(self, config: uvicorn.Config, event_bus: EventBus) -> None:
+        super().__init__(config)
+        self._event_bus = event_bus
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave signal handling to `_Stop`."""
+        yield
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close the event bus, which ends the event streams, then shut down."""
+        self._event_bus.close()
+        await super().shutdown(sockets)

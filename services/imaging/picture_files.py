@@ -1,0 +1,219 @@
+"""Encoding and decoding of arrays: display pictures (PNG, JPEG) and raw frames (16-bit TIFF).
+
+Display pixels are sRGB-encoded: a screen inverts that curve, so its luminance is proportional to the linear picture.
+Linear pixels would show vessels too dark; any other curve would change their contrast.
+"""
+
+import json
+import struct
+import zlib
+from functools import lru_cache
+from io import BytesIO
+from itertools import accumulate
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+from PIL import ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
+
+from device.errors import FrameError, SettingError
+from device.values import Counts, Image, check_image_shape
+from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metadata
+
+Pixels = NDArray[np.uint8]
+
+MARK = "SIMULATED"
+_BROKEN_TIFF = (tifffile.TiffFileError, struct.error, zlib.error)  # exceptions of tifffile on truncated data
+_LOW, _HIGH = 0.5, 99.8  # percentiles of the lit pixels: noise below, reflections above
+_SAMPLES = 40_000  # error of the percentiles below a grey level, in 1 % of the time for all pixels
+_BLACK_LIMIT = 1e-30  # a picture below this is black; a division by its range would overflow
+_SATURATED_SHARE = 0.05  # of the pixels of a block: the block is shown as saturated
+_STEPS = 4096  # in linear light, finer than 8 bits of sRGB anywhere (its slope is at most 12.92)
+_LETTER_RATIO = 1 / 18  # letter size of the mark over picture height: legible on a telephone at arm's length
+_LETTER_LEAST_PX = 12.0  # smaller letters touch each other
+
+
+def to_png(picture: Image, simulated: bool, note: str = "") -> bytes:
+    """Return an 8-bit sRGB PNG, windowed between percentiles 0.5 and 99.8 of the pixels that are not zero.
+
+    `picture` is linear float32 (rows, cols) or (rows, cols, 3) and keeps its size; all channels share one window, which
+    preserves neutral colours. A simulated picture carries a mark in its pixels and the text chunk `simulated`; `note`
+    becomes a text chunk. Raises FrameError if any value is NaN or infinite.
+    """
+    _refuse_invalid_picture(picture)
+    return _png(Pillow.fromarray(_marked(_display_pixels(picture), simulated)), "true" if simulated else "false", note)
+
+
+def with_note(png: bytes, note: str) -> bytes:
+    """Return a PNG of `to_png` with another note and the same pixels."""
+    with Pillow.open(BytesIO(png)) as image:
+        return _png(image, str(image.info["simulated"]), note)
+
+
+def _png(image: Pillow.Image, simulated: str, note: str) -> bytes:
+    chunks = PngInfo()
+    chunks.add(b"sRGB", b"\0")
+    chunks.add_text("simulated", simulated)
+    if note:
+        chunks.add_itxt("note", note)
+    out = BytesIO()
+    # Level 1: level 6 takes four times as long and hardly shrinks a noisy picture further.
+    image.save(out, "PNG", pnginfo=chunks, compress_level=1)
+    return out.getvalue()
+
+
+def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int = 70) -> bytes:
+    """Return an 8-bit sRGB JPEG with the window and mark of `to_png`, never enlarged.
+
+    Its longer side is at most `longest_side_px`; the reduction in linear light preserves the mean. Raises FrameError
+    for NaN or infinite values, SettingError for a size below 1 or a quality outside 1 to 95.
+    """
+    if longest_side_px < 1 or not 1 <= quality <= 95:
+        raise SettingError(f"a picture {longest_side_px} px long, at quality {quality} of 1 to 95, cannot be made")
+    _refuse_invalid_picture(picture)
+    small = _block_mean(picture, max(picture.shape[:2]) // longest_side_px)
+    image = Pillow.fromarray(_display_pixels(small))
+    image.thumbnail(
+        (longest_side_px, longest_side_px), Pillow.Resampling.BILINEAR
+    )  # remaining reduction below a factor of two
+    out = BytesIO()
+    comment = f"simulated={'true' if simulated else 'false'}"
+    Pillow.fromarray(_marked(np.asarray(image), simulated)).save(out, "JPEG", quality=quality, comment=comment)
+    return out.getvalue()
+
+
+def counts_jpeg(counts: Counts, black_dn: float, white_dn: float, longest_side_px: int, simulated: bool) -> bytes:
+    """Return a JPEG of raw counts, uint16 (rows, cols): sRGB grey from `black_dn` to `white_dn`, saturated blocks red.
+
+    Reduced by a whole factor, so its longer side is below twice `longest_side_px`. Marked if `simulated`.
+    """
+    smaller = max(counts.shape) // longest_side_px
+    share = (_block_mean(counts.astype(np.float32), smaller) - black_dn) / (white_dn - black_dn)
+    grey = _srgb_curve().take((np.clip(share, 0, 1) * (_STEPS - 1)).astype(np.uint16))
+    full = _block_mean((counts >= white_dn).astype(np.float32), smaller) > _SATURATED_SHARE
+    pixels = np.stack([np.where(full, 255, grey), *[np.where(full, 0, grey)] * 2], -1).astype(np.uint8)
+    out = BytesIO()
+    Pillow.fromarray(_marked(pixels, simulated)).save(out, "JPEG", quality=80)
+    return out.getvalue()
+
+
+def raw_tiff(counts: Counts, metadata: RawMetadata) -> bytes:
+    """Return a lossless 16-bit TIFF (deflate) with `metadata` as JSON in the tag ImageDescription.
+
+    `counts` is uint16 (rows, cols) or (rows, cols, 3). Raises FrameError for other arrays, SettingError for an
+    exposure time that is NaN or infinite.
+    """
+    check_image_shape(counts.shape)
+    if counts.dtype != np.uint16:
+        raise FrameError(f"a raw frame holds uint16 counts, not {counts.dtype}")
+    text = metadata_text(metadata)
+    out = BytesIO()
+    tifffile.imwrite(
+        out,
+        counts,
+        photometric="rgb" if counts.ndim == 3 else "minisblack",
+        compression="zlib",  # level 1: fast on a Raspberry Pi; sensor noise does not shrink further
+        compressionargs={"level": 1},
+        description=text,
+        metadata=None,
+    )
+    return out.getvalue()
+
+
+def read_raw_tiff(data: bytes) -> tuple[Counts, RawMetadata]:
+    """Return counts and metadata of a TIFF written by `raw_tiff`; FrameError for any other data."""
+    try:
+        with tifffile.TiffFile(BytesIO(data)) as tiff:
+            page = tiff.pages.first
+            counts, description = page.asarray(), json.loads(page.description)
+    except (*_BROKEN_TIFF, ValueError, OSError, LookupError) as error:
+        raise FrameError(f"this is not a whole raw TIFF: {error}") from error
+    if counts.dtype != np.uint16 or not isinstance(description, dict):
+        raise FrameError(f"this TIFF holds {counts.dtype}, and no description of a raw frame")
+    return counts, read_metadata(description)
+
+
+def _refuse_invalid_picture(picture: Image) -> None:
+    check_image_shape(picture.shape)
+    if not np.isfinite(picture).all():
+        raise FrameError("the picture holds values that are not numbers (NaN or infinite)")
+
+
+def _display_pixels(picture: Image) -> Pixels:
+    """Return the 8-bit sRGB pixels of a linear picture, same shape, scaled to the window of `_window`."""
+    low, high = _window(picture)
+    scaled = np.subtract(picture, low, dtype=np.float32)
+    scaled *= np.float32((_STEPS - 1) / (high - low))
+    np.clip(scaled, 0, _STEPS - 1, out=scaled)
+    scaled += np.float32(0.5)
+    pixels: Pixels = _srgb_curve().take(scaled.astype(np.uint16))
+    return pixels
+
+
+def _window(picture: Image) -> tuple[float, float]:
+    """Return the values shown as black and as white: percentiles of the pixels that are not zero; (0, 1) if all are.
+
+    A reconstruction is zero outside the illuminated disc; these pixels would make the window depend on its size.
+    """
+    step = max(1, int(np.sqrt(picture.size / _SAMPLES)))
+    sample = picture[::step, ::step]
+    lit = sample[sample != 0]
+    if not lit.size or not np.abs(lit).max() > _BLACK_LIMIT:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.percentile(lit, (_LOW, _HIGH)))
+    if high - low <= 1e-6 * max(abs(low), abs(high)):  # uniform grey: the window includes zero
+        low, high = min(low, 0.0), max(high, 0.0)
+    return low, high
+
+
+@lru_cache(maxsize=1)
+def _srgb_curve() -> Pixels:
+    """Return the lookup table from `_STEPS` levels of linear light to 8-bit sRGB (IEC 61966-2-1)."""
+    linear = np.linspace(0, 1, _STEPS)
+    curve = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    pixels: Pixels = np.rint(255 * curve).astype(np.uint8)
+    return pixels
+
+
+def _block_mean(picture: Image, block: int) -> Image:
+    """Return the means of blocks of `block` x `block` pixels per channel; incomplete blocks at the edge are dropped."""
+    if block < 2:
+        return picture
+    down, across = (min(block, length) for length in picture.shape[:2])  # a narrow picture may be thinner than a block
+    rows, cols = picture.shape[0] // down * down, picture.shape[1] // across * across
+    strips = sum((picture[row:rows:down] for row in range(1, down)), start=picture[0:rows:down])
+    total = sum((strips[:, col:cols:across] for col in range(1, across)), start=strips[:, 0:cols:across])
+    return np.asarray(total / np.float32(down * across), np.float32)
+
+
+def _marked(pixels: Pixels, simulated: bool) -> Pixels:
+    """Return a copy of the pixels with the mark in the bottom left corner if `simulated`, else the same array."""
+    if not simulated:
+        return pixels
+    band = _band(*pixels.shape[:2])
+    rows, cols = band.shape
+    marked = pixels.copy()
+    marked[-rows:, :cols] = band if pixels.ndim == 2 else band[..., np.newaxis]
+    return marked
+
+
+@lru_cache(maxsize=8)
+def _band(rows: int, cols: int) -> Pixels:
+    """Return the mark (text MARK, white on black, grey pixels) for a picture of rows x cols, not larger than it."""
+    size = max(_LETTER_LEAST_PX, rows * _LETTER_RATIO)
+    size = max(1.0, size * min(1.0, cols / _lengths(size)[-1]))
+    font, ends = ImageFont.load_default(size), _lengths(size)
+    width, height = min(cols, round(ends[-1])), min(rows, round(1.25 * size))
+    band = Pillow.new("L", (width, height), 0)
+    for letter, end in zip(MARK, ends, strict=False):  # the last value is the right margin
+        ImageDraw.Draw(band).text((end, height / 2), letter, fill=255, font=font, anchor="rm")
+    return np.asarray(band)
+
+
+def _lengths(size: float) -> list[float]:
+    """Return the right end of each letter of the mark, and last the width of its band, pixels; `size`: letter size."""
+    font, gap = ImageFont.load_default(size), 0.15 * size
+    ends = list(accumulate((font.getlength(letter) + gap for letter in MARK), initial=0.3 * size))
+    return [*ends[1:], ends[-1] + 0.45 * size]

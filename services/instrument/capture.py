@@ -1,0 +1,151 @@
+"""Values of one capture: its request with an idempotency key, its exposed frames, its report and its files."""
+
+import json
+from collections import OrderedDict
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from device.light_safety.dose_report import DoseReport
+from device.recon.assessment.aiming import Aim
+from device.recon.assessment.frame_quality import Verdict
+from device.recon.assessment.laterality import Laterality
+from device.values import EYES, Eye, Frame, Image, Report
+from services.imaging import picture_files
+from services.imaging.raw_metadata import RawMetadata
+from services.records.capture import Capture, CaptureReport, LateralityEstimate, PictureVerdict
+from services.records.capture_journal import InterruptedCapture
+from services.records.capture_report import read_report, report_as_json
+from services.records.capture_target import CaptureTarget, Permit, permit_test_picture
+from services.records.idempotent_requests import key_conflict
+from services.records.json_values import JsonObject
+
+REMEMBERED = 32  # idempotency keys: a request that the network repeats makes one capture
+QUICK_PX = 640
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Live picture: number, JPEG, time of exposure (clock seconds) and aiming hint."""
+
+    number: int
+    jpeg: bytes
+    exposed_s: float
+    aim: Aim
+
+
+@dataclass(frozen=True)
+class LiveRequest:
+    """Request for live pictures: the eyes that the dose counts for; `permit` raises RequestRefused without consent."""
+
+    eyes: tuple[Eye, ...] = EYES
+    permit: Permit = permit_test_picture
+
+
+NO_VISIT = LiveRequest()
+
+
+@dataclass(frozen=True)
+class Press:
+    """Accepted capture request: future of the capture, eye, capture target and idempotency key."""
+
+    future: Future[Capture]
+    eye: Eye
+    target: CaptureTarget
+    key: str | None
+
+    def journal_entry(self, id: str) -> InterruptedCapture:
+        """Return the journal entry that is written before the exposure; `id` is the identifier of the capture."""
+        return InterruptedCapture(id, self.eye, self.target.visit, self.target.slot, self.target.tries)
+
+
+@dataclass(frozen=True)
+class ExposedCapture:
+    """Exposed capture: the lit (`frame`) and dark frame of a press, before reconstruction.
+
+    `expose_s`: duration of both exposures. `light`: dose report. `verdict`: first verdict, on the raw frame.
+    """
+
+    press: Press
+    id: str
+    taken_at: datetime
+    frame: Frame
+    dark: Frame
+    expose_s: float
+    light: DoseReport
+    verdict: Verdict
+
+
+class IdempotencyKeys:
+    """Latest presses by idempotency key. Not thread-safe: the mutex of `ExamRequests` guards it."""
+
+    def __init__(self) -> None:
+        self._presses: OrderedDict[str, Press] = OrderedDict()
+
+    def find(self, key: str | None, eye: Eye, target: CaptureTarget) -> Future[Capture] | None:
+        """Return the future of the press with this key, or None; InputError for another eye, visit or slot."""
+        press = None if key is None else self._presses.get(key)
+        if press is None:
+            return None
+        before = press.eye, press.target.visit, press.target.slot
+        if before != (eye, target.visit, target.slot):
+            raise key_conflict()
+        return press.future
+
+    def remember(self, key: str, press: Press) -> None:
+        """Store a press under its key; drop the oldest press if more than REMEMBERED are stored."""
+        self._presses[key] = press
+        while len(self._presses) > REMEMBERED:
+            self._presses.popitem(last=False)
+
+
+def capture_files(
+    capture: Capture, head: str, frame: Frame, dark: Frame, shown: Image, quick: bytes | None
+) -> dict[str, bytes]:
+    """Return the files of a capture by name; `shown` is the linear picture of the field, `quick` its quick look (JPEG).
+
+    `head` is the name of the head. The raw frames and the calibration in their metadata suffice to repeat the
+    reconstruction.
+    """
+    metadata = RawMetadata(
+        id=capture.id, eye=capture.eye, taken_at=capture.taken_at, exposure_s=frame.exposure_s,
+        illumination=frame.illumination, simulated=frame.simulated, calibration_id=capture.calibration_id, head=head,
+    )  # fmt: skip
+    return {
+        "raw.tiff": picture_files.raw_tiff(frame.counts, metadata),
+        "dark.tiff": picture_files.raw_tiff(dark.counts, replace(metadata, illumination=None)),
+        "picture.png": picture_files.to_png(shown, capture.simulated, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"),
+        "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),
+        "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
+    }
+
+
+def capture_report(
+    shot: ExposedCapture, made: Report, verdict: Verdict, seen: Laterality | None, budget_s: float
+) -> CaptureReport:
+    """Return the report of a capture, with plain numbers for numpy scalars.
+
+    `made`: report of the reconstruction; `verdict`: the final one; `seen`: laterality of the picture; `budget_s`: time
+    budget in seconds.
+    """
+    report = CaptureReport(
+        replace(made, seconds={"expose": shot.expose_s, **made.seconds}),
+        shot.light, shot.press.target.visit, shot.press.target.slot,
+        PictureVerdict(verdict.word, verdict.code, verdict.numbers),
+        None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),
+        budget_s,
+    )  # fmt: skip
+    return read_report(json.loads(as_json(report_as_json(report))))
+
+
+def as_json(data: JsonObject) -> bytes:
+    """Return indented JSON, UTF-8; numpy scalars become plain numbers, TypeError for other types."""
+    return json.dumps(data, indent=1, default=_plain).encode()
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value)} does not belong into a report")

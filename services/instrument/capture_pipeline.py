@@ -1,0 +1,254 @@
+"""Steps of one capture: lit and dark exposure, verdict, reconstruction in steps, record; and live pictures.
+
+The pipeline publishes nothing, knows no state of the exam and calls nothing back: the exam loop decides what happens
+between two steps. One thread, the one that owns the head, calls it.
+"""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from device.clock import Clock, Deadline
+from device.errors import DiffuscopeError, FrameError
+from device.head import Head
+from device.light_safety.burst import require_lit
+from device.recon.assessment.aiming import Aim
+from device.recon.assessment.frame_quality import Verdict
+from device.recon.assessment.laterality import Laterality
+from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import field_box
+from device.recon.model.kernels import Pixels
+from device.recon.reconstructor import Reconstructor, Step, default_schedule
+from device.values import EYES, Calibration, ExposureSettings, Eye, Frame, Illumination, Image, Reconstruction, Report
+from services.imaging import picture_files
+from services.instrument.capture import ExposedCapture, capture_files, capture_report
+from services.instrument.frame_feedback import FrameAssessor
+from services.records.capture import NO_METHOD, Capture
+from services.records.capture_target import CaptureTarget
+
+log = logging.getLogger(__name__)
+
+PREVIEW_BUDGET_S = 0.2
+PREVIEW_PX = 480
+
+
+class FrameReconstructor(Protocol):
+    """Reconstruction of frames in steps, as `device.recon.reconstructor.Reconstructor` does it."""
+
+    @property
+    def refractor(self) -> RefractionEstimator | None:
+        """Estimator of the refraction; None if the calibration permits none."""
+
+    def steps(
+        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool, deadline: Deadline | None = None
+    ) -> Iterator[Step]:
+        """Yield the result of each stage, a pause after each round of the last one, and the picture."""
+
+    def __call__(
+        self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
+        quick: bool = False,
+    ) -> Reconstruction:  # fmt: skip
+        """Return the picture of all stages, or with `quick` of the first one."""
+
+
+class FrameFeedback(Protocol):
+    """Assessment of frames and pictures, as `FrameAssessor` does it."""
+
+    def aim(self, counts: Pixels, exposed_s: float) -> Aim:
+        """Return the aiming hint after one more live frame."""
+
+    def assess(self, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
+        """Return the verdict on a raw frame."""
+
+    def reassess(self, first: Verdict, report: Report, target: CaptureTarget) -> Verdict:
+        """Return the final verdict after the reconstruction."""
+
+    def estimate_laterality(self, picture: Image, verdict: Verdict, target: CaptureTarget) -> Laterality | None:
+        """Return the laterality estimate, or None."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Lit and dark frame of one press, with the clock seconds of the begin and the duration of both exposures."""
+
+    lit: Frame
+    dark: Frame
+    begin_s: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """Frame in aiming light, its time of exposure and the time at which the lamp was off (clock seconds)."""
+
+    frame: Frame
+    exposed_s: float
+    dark_s: float
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """Capture before its storage: its row, its frames, and the picture of the illuminated field; `head`: its name."""
+
+    capture: Capture
+    lit: Frame
+    dark: Frame
+    shown: Image
+    head: str
+
+    def files(self, quick: bytes | None) -> dict[str, bytes]:
+        """Return the encoded files by name; `quick` is the quick look (JPEG), if one was made."""
+        return capture_files(self.capture, self.head, self.lit, self.dark, self.shown, quick)
+
+
+class CapturePipeline:
+    """Steps of the captures and live pictures of one head.
+
+    `reconstructor` makes the pictures of captures, `live` those of live pictures, whose colour may have another PSF.
+    """
+
+    def __init__(
+        self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
+        feedback: FrameFeedback,
+    ) -> None:  # fmt: skip
+        self.reconstructor, self.live = reconstructor, live
+        self._head, self._clock, self._feedback = head, clock, feedback
+
+    def expose(self, eye: Eye) -> Exposure:
+        """Return a lit and a dark frame of an eye; the errors are those of the module function `expose`, below."""
+        begin_s = self._clock.now_s()
+        lit, dark = expose(self._head, (eye,))
+        return Exposure(lit, dark, begin_s, self._clock.now_s() - begin_s)
+
+    def assess(self, exposure: Exposure) -> Verdict:
+        """Return the verdict on the raw frame."""
+        return self._feedback.assess(exposure.lit.counts, exposure.dark.counts, exposure.begin_s)
+
+    def quick_look(self, shot: ExposedCapture) -> Image:
+        """Return the picture of the first stage, cropped to the illuminated field; FrameError for a useless frame."""
+        made = self.reconstructor(shot.frame.counts, shot.dark.counts, quick=True)
+        return crop_to_field(made.picture, self._head)
+
+    def reconstruct(self, shot: ExposedCapture, budget_s: float) -> Iterator[Step]:
+        """Yield the steps of the reconstruction within `budget_s` seconds; the last one is the picture.
+
+        After a FrameError it is the raw frame, with the error in its report: the exposure has cost dose.
+        """
+        deadline = Deadline.after(self._clock, budget_s)
+        try:
+            yield from self.reconstructor.steps(
+                shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated, deadline=deadline
+            )
+        except FrameError as error:
+            log.warning("reconstruction failed: %s", error, extra={"code": error.code, "about": shot.id})
+            yield unreconstructed(shot.frame, error)
+
+    def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
+        """Return the final verdict, from the first one, the report and the number of tries of the slot."""
+        return self._feedback.reassess(shot.verdict, report, shot.press.target)
+
+    def record(self, shot: ExposedCapture, made: Reconstruction, verdict: Verdict, budget_s: float) -> CaptureRecord:
+        """Return the record of a capture with its report, laterality estimate and shown picture."""
+        shown = crop_to_field(made.picture, self._head)
+        side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
+        report = capture_report(shot, made.report, verdict, side, budget_s)
+        id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
+        capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
+        return CaptureRecord(capture, shot.frame, shot.dark, shown, self._head.spec.name)
+
+    def expose_live(self, eyes: tuple[Eye, ...]) -> LiveFrame:
+        """Return a frame in aiming light, whose dose counts for `eyes`."""
+        return LiveFrame(*expose_live(self._head, eyes, self._clock))
+
+    def live_picture(self, seen: LiveFrame) -> tuple[bytes, Aim]:
+        """Return the live picture (JPEG) of a frame, and its aiming hint."""
+        counts, deadline = seen.frame.counts, Deadline.after(self._clock, PREVIEW_BUDGET_S)
+        made = self.live(counts, simulated=seen.frame.simulated, deadline=deadline, quick=True)
+        jpeg = picture_files.to_jpeg(crop_to_field(made.picture, self._head), PREVIEW_PX, made.simulated)
+        return jpeg, self._feedback.aim(counts, seen.exposed_s)
+
+
+def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
+    """Return the pipeline of a head after all planning; `plans` is the folder of the FFT plans.
+
+    With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose` then.
+    """
+    planner, light, shape = Planner(plans), head.spec.light, head.camera.shape
+    calibration, live = (head.calibration.for_colour(colour) for colour in (light.colour, light.preview_colour))
+    index = _best_psf(head, calibration, planner)
+    recipes = default_schedule(calibration, shape, index)
+    reconstructor = live_reconstructor = Reconstructor(calibration, shape, planner, clock, recipes, index)
+    if live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
+        live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
+    feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback)
+
+
+def _best_psf(head: Head, calibration: Calibration, planner: Planner) -> int:
+    """Return the index of the PSF with the highest likelihood for one frame exposed now; 0 if there is only one.
+
+    A recording may hold PSFs of several depths.
+    """
+    if len(calibration.psfs) == 1:
+        return 0
+    frame, _ = expose(head, EYES)
+    return most_likely_psf(calibration, frame.counts, planner)[0]
+
+
+def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
+    """Return a lit and a dark frame; the dose counts for `eyes`.
+
+    Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
+    or cannot be on. The lamp is off at every exit.
+    """
+    head.check()
+    shot = ExposureSettings(head.spec.camera.exposure_s)
+    announce_eye(head, eyes)
+    head.camera.prepare(shot)
+    try:
+        with head.light.on(Illumination(head.spec.light.colour), eyes):
+            frame = require_lit(head.camera.expose(shot))
+        return frame, head.camera.expose(shot)
+    finally:
+        head.light.off()
+
+
+def expose_live(head: Head, eyes: tuple[Eye, ...], clock: Clock) -> tuple[Frame, float, float]:
+    """Return a frame in aiming light, its time of exposure and the time at which the lamp was off (clock seconds).
+
+    The dose counts for `eyes`. The lamp is off at every exit.
+    """
+    shot = ExposureSettings(head.spec.camera.preview_exposure_s)
+    announce_eye(head, eyes)
+    head.camera.prepare(shot)
+    try:
+        with head.light.on(Illumination(head.spec.light.preview_colour), eyes):
+            exposed_s = clock.now_s()
+            frame = require_lit(head.camera.expose(shot))
+    finally:
+        head.light.off()
+    return frame, exposed_s, clock.now_s()
+
+
+def announce_eye(head: Head, eyes: tuple[Eye, ...]) -> None:
+    """Announce the eye of the next exposure to a simulated head while the lamp is off, if `eyes` has exactly one."""
+    if len(eyes) == 1:
+        head.present_eye(eyes[0])
+
+
+def crop_to_field(image: Image, head: Head) -> Image:
+    """Return the picture cropped to the illuminated field; a picture of another shape than the camera stays whole."""
+    whole = image.shape[:2] != head.camera.shape  # the camera runs in another mode
+    return image if whole else image[field_box(head.calibration, head.camera.shape)]
+
+
+def unreconstructed(frame: Frame, error: DiffuscopeError) -> Reconstruction:
+    """Return the raw frame as picture, with the error in the report, for a failed reconstruction."""
+    report = Report(method=NO_METHOD, rounds=0, stopped=error.code, warnings=(error.message,))
+    return Reconstruction(frame.counts.astype(np.float32), report, frame.simulated)

@@ -1,0 +1,108 @@
+"""Publication of what happens in the exam: on the event bus, to systemd, and as the output of the exam."""
+
+import logging
+from dataclasses import asdict, replace
+from types import MappingProxyType
+
+from device.errors import DiffuscopeError
+from device.recon.assessment.aiming import Aim
+from device.recon.assessment.frame_quality import Verdict
+from device.values import Image
+from services.imaging import picture_files
+from services.instrument.capture import QUICK_PX, ExposedCapture, Press, Preview
+from services.instrument.events import EventBus
+from services.instrument.exam_requests import ExamOutput, ExamRequests
+from services.instrument.progress import Progress, ProgressEstimate
+from services.instrument.watchdog import Watchdog
+
+log = logging.getLogger(__name__)
+
+
+class ExamEvents:
+    """Publisher of the exam. Not thread-safe: the thread `head` calls it, without a lock."""
+
+    def __init__(self, event_bus: EventBus, watchdog: Watchdog, progress: Progress, requests: ExamRequests) -> None:
+        self._event_bus, self._watchdog, self._progress, self._requests = event_bus, watchdog, progress, requests
+        self._published_state = "starting"
+        self._published_aim: Aim | None = None
+
+    @property
+    def output(self) -> ExamOutput:
+        """What other threads see; only this thread changes it."""
+        return self._requests.snapshot.output
+
+    def state(self) -> None:
+        """Publish the state if it has changed, on the event bus and to systemd."""
+        state = self._requests.snapshot.wire_state
+        if state != self._published_state:
+            self._published_state = state
+            self._event_bus.publish("state", state=state)
+            self._watchdog.status(state)
+
+    def stage(self, press: Press, id: str, stage: str, url: str | None = None) -> None:
+        """Publish that a capture has reached a stage, with the URL of its quick look if it has one."""
+        self._watchdog.beat()
+        self._event_bus.publish("stage", **stage_event(press, id, self._progress.enter_stage(id, stage), url))
+
+    def progress(self, press: Press, id: str) -> None:
+        """Publish the estimated progress of a capture within its stage."""
+        self._event_bus.publish("stage", **stage_event(press, id, self._progress.estimate(id)))
+
+    def quick_look(self, shot: ExposedCapture, image: Image) -> None:
+        """Publish the quick look of a capture in progress."""
+        jpeg = picture_files.to_jpeg(image, QUICK_PX, shot.frame.simulated)
+        self._show_quick_looks({**self.output.quick_looks, shot.id: jpeg})
+        self.stage(shot.press, shot.id, "quick", f"/api/captures/{shot.id}/quick.jpg")
+
+    def forget_quick_look(self, id: str) -> None:
+        """Remove the quick look of a capture that is no longer in progress."""
+        self._show_quick_looks({one: jpeg for one, jpeg in self.output.quick_looks.items() if one != id})
+
+    def verdict(self, id: str, verdict: Verdict) -> None:
+        """Publish the verdict on a capture."""
+        self._event_bus.publish("verdict", id=id, **asdict(verdict))
+
+    def kept(self, id: str) -> None:
+        """Publish that a capture is stored, and end its progress."""
+        self._progress.finish(id, kept=True)
+        self._event_bus.publish("kept", id=id)
+
+    def failed(self, id: str, error: DiffuscopeError) -> None:
+        """Publish that a capture has failed, and end its progress."""
+        self._progress.finish(id, kept=False)
+        log.warning("capture failed: %s", error, extra={"code": error.code})
+        self._event_bus.publish("failed", id=id, code=error.code, message=error.message, remedy=error.remedy)
+
+    def aim(self, aim: Aim) -> None:
+        """Publish an aiming hint if its code has changed."""
+        if self._published_aim is None or self._published_aim.code != aim.code:
+            self._published_aim = aim
+            self._event_bus.publish("aim", **asdict(aim))
+
+    def preview(self, jpeg: bytes, exposed_s: float, aim: Aim) -> None:
+        """Show the next live picture."""
+        number = self.output.preview.number + 1
+        self._requests.show(replace(self.output, preview=Preview(number, jpeg, exposed_s, aim)))
+
+    def problem(self, error: DiffuscopeError | None) -> None:
+        """Show the error of the last live picture, None if there is none; publish it if its code has changed."""
+        before = self.output.problem
+        self._requests.show(replace(self.output, problem=error))
+        if error is not None and error.code != (before.code if before else None):
+            log.warning("no live picture: %s", error, extra={"code": error.code})
+            self._event_bus.publish("failed", code=error.code, message=error.message, remedy=error.remedy)
+
+    def ended(self, problem: DiffuscopeError | None, failure: DiffuscopeError | None) -> None:
+        """Show the error that ended the exam, None if it was closed; `failure`: see `ExamOutput`."""
+        self._requests.show(replace(self.output, problem=problem or self.output.problem, failure=failure))
+
+    def _show_quick_looks(self, quick_looks: dict[str, bytes]) -> None:
+        self._requests.show(replace(self.output, quick_looks=MappingProxyType(quick_looks)))
+
+
+def stage_event(press: Press, id: str, now: ProgressEstimate, url: str | None = None) -> dict[str, object]:
+    """Return the data of the event `stage`: progress of capture `id`, URL of its quick look, and its press."""
+    return {
+        "id": id, "stage": now.stage, "fraction": now.fraction, "left_s": round(now.left_s, 2), "url": url,
+        "key": press.key, "visit": press.target.visit, "slot": press.target.slot,
+    }  # fmt: skip

@@ -1,0 +1,264 @@
+"""Loop of the exam: the one thread that owns the head runs its actions one by one, the most urgent first.
+
+A press has priority: between two solver rounds of a running refinement it is exposed and gets its quick look, then the
+refinement resumes. Every way out of an action turns the lamp off.
+"""
+
+import logging
+import secrets
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+
+from device.clock import Clock
+from device.errors import DiffuscopeError, FrameError, LightFault, StoreError
+from device.head import Head
+from device.recon.reconstructor import RoundDone, StageResult
+from device.values import Reconstruction
+from services.errors import Busy
+from services.instrument.background import run_in_thread
+from services.instrument.calibration_monitor import CalibrationMonitor
+from services.instrument.capture import ExposedCapture, Press
+from services.instrument.capture_pipeline import CapturePipeline
+from services.instrument.exam_events import ExamEvents
+from services.instrument.exam_requests import ExamRequests, ExamSnapshot
+from services.instrument.exam_state import ExamEvent
+from services.instrument.frame_feedback import FAILED_VERDICT
+from services.instrument.live_pictures import LivePictures
+from services.instrument.watchdog import BEAT_S, Watchdog
+from services.records.capture import Capture
+from services.records.capture_journal import CaptureJournal
+from services.records.capture_store import CaptureStore
+
+log = logging.getLogger(__name__)
+
+LIVE_S = 0.4  # interval of progress events and of live pictures during a refinement
+
+
+@dataclass(frozen=True)
+class ExamParts:
+    """Parts of an exam that its service and its loop share; `budget_s` returns the time budget of a reconstruction."""
+
+    head: Head
+    store: CaptureStore
+    clock: Clock
+    watchdog: Watchdog
+    budget_s: Callable[[], float]
+    requests: ExamRequests
+    events: ExamEvents
+    capture_journal: CaptureJournal
+    calibration_monitor: CalibrationMonitor
+
+
+class ExamLoop:
+    """Loop of the thread `head`, which alone reads and writes its fields and uses the head.
+
+    Each change of the state is an event of `exam_state`; `parts.requests` holds the state.
+    """
+
+    def __init__(self, parts: ExamParts, pipeline: CapturePipeline) -> None:
+        self._parts, self._requests, self._events = parts, parts.requests, parts.events
+        self._pipeline = pipeline
+        self._live = LivePictures(parts.head.light, parts.clock, pipeline, parts.requests, parts.events)
+        self._exposed: deque[ExposedCapture] = deque()
+        self._last_update_s = 0.0
+
+    def run(self) -> None:
+        """Run actions until the exam closes and every exposed capture is stored."""
+        while not (now := self._requests.snapshot).is_closing or self._exposed:
+            if not self.step(now):
+                self._requests.wait(now, BEAT_S)
+
+    def step(self, now: ExamSnapshot) -> bool:
+        """Run the most urgent action in the state `now`; return whether there was one."""
+        self._parts.watchdog.beat()
+        if now.has_press:
+            self._expose_pending()
+        elif self._exposed:
+            self._complete_oldest()
+        elif self._parts.calibration_monitor.has_pending and not now.is_closing:
+            self._parts.calibration_monitor.step()
+        elif self._live.are_wanted:
+            self._live.refresh()
+        else:
+            return False
+        return True
+
+    def fail_exposed(self) -> list[Press]:
+        """Forget the captures that wait for their reconstruction; return their presses, for the caller to fail."""
+        presses = [shot.press for shot in self._exposed]
+        self._exposed.clear()
+        return presses
+
+    def _expose_pending(self) -> None:
+        """Expose the waiting press, lit and dark, publish its first verdict and queue the exposure for reconstruction.
+
+        The consent is checked again and a journal entry written before the light; an error fails the press.
+        """
+        press = self._requests.take_press()
+        self._events.state()
+        taken_at = self._parts.clock.wall()
+        id = Capture.new_id(taken_at, press.eye, secrets.token_hex(3))
+        with self._resolving(press, id, ExamEvent.EXPOSURE_FAILED):
+            self._exposed.append(self._expose(press, id, taken_at))
+            # Before the `off` at the exit of this context: if that fails during a refinement, this capture is exposed
+            # and waits all the same, and the error fails only the capture whose refinement is suspended.
+            self._requests.advance(ExamEvent.EXPOSED)
+        self._events.state()
+
+    def _expose(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
+        press.target.permit()  # again: the consent may have been withdrawn while the press waited
+        self._parts.capture_journal.begin(press.journal_entry(id), press.key)
+        self._events.stage(press, id, "expose")
+        exposure = self._pipeline.expose(press.eye)
+        verdict = self._pipeline.assess(exposure)
+        self._events.verdict(id, verdict)
+        light = self._parts.head.light.dose_report()
+        return ExposedCapture(
+            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light=light, verdict=verdict
+        )
+
+    def _complete_oldest(self) -> None:
+        """Reconstruct and store the oldest exposure, then resolve the future of its press."""
+        shot = self._exposed.popleft()
+        with self._resolving(shot.press, shot.id, ExamEvent.FAILED):
+            kept = self._process(shot)
+            self._end_journal_entry(shot.id, shot.press.key)
+            self._events.problem(None)
+            self._requests.advance(ExamEvent.STORED)
+            self._events.state()
+            shot.press.future.set_result(kept)
+        self._events.forget_quick_look(shot.id)
+
+    @contextmanager
+    def _resolving(self, press: Press, id: str, on_error: ExamEvent) -> Iterator[None]:
+        """Turn the lamp off at exit; on an error, apply the event `on_error` to the state and fail the press's future.
+
+        A DiffuscopeError is also published on the event bus. Another exception is raised again; its journal entry
+        stays, so that the next start reports the capture as interrupted. LightFault if the lamp cannot be turned off.
+        """
+        try:
+            yield
+        except DiffuscopeError as error:
+            self._events.failed(id, error)
+            self._end_journal_entry(id)
+            self._requests.advance(on_error)
+            self._events.state()
+            press.future.set_exception(error)
+        except BaseException:
+            self._requests.advance(on_error)
+            self._events.state()
+            press.future.set_exception(DiffuscopeError("the instrument stopped unexpectedly"))
+            raise
+        finally:
+            self._parts.head.light.off()
+
+    def _end_journal_entry(self, id: str, key: str | None = None) -> None:
+        """Remove a capture from the journal; with `key`, also interrupted captures of that key."""
+        with suppress(StoreError):  # then the next start reports the capture as interrupted
+            self._parts.capture_journal.end(id, key)
+
+    def _process(self, shot: ExposedCapture) -> Capture:
+        """Reconstruct, assess and store one exposure; return the stored capture."""
+        budget_s = self._parts.budget_s()
+        made = self._reconstruct(shot, budget_s)
+        verdict = self._pipeline.reassess(shot, made.report)
+        if verdict.code != FAILED_VERDICT.code and (verdict.word, verdict.code) != (
+            shot.verdict.word,
+            shot.verdict.code,
+        ):
+            self._events.verdict(shot.id, verdict)  # a failed reconstruction is published with the stored capture
+        record = self._pipeline.record(shot, made, verdict, budget_s)
+        self._events.stage(shot.press, shot.id, "keep")
+        quick, write_rows = self._events.output.quick_looks.get(shot.id), shot.press.target.write_rows
+        kept = run_in_thread(
+            lambda: self._parts.store.save(record.capture, record.files(quick), write_rows),
+            lambda: self._serve_between_rounds(shot),
+        )
+        self._events.kept(shot.id)
+        took_s, method = kept.report.total_s, made.report.method
+        log.info("a picture was kept after %.1f s, made by %s", took_s, method, extra={"about": shot.id})
+        self._parts.calibration_monitor.add(kept)
+        return kept
+
+    def _reconstruct(self, shot: ExposedCapture, budget_s: float) -> Reconstruction:
+        """Run the steps of a reconstruction; publish its quick look, and serve requests between its rounds."""
+        self._last_update_s = self._parts.clock.now_s()
+        for step in self._pipeline.reconstruct(shot, budget_s):
+            match step:
+                case StageResult(last=False):
+                    self._events.quick_look(shot, step.picture)
+                case RoundDone():
+                    self._parts.watchdog.beat()
+                    self._serve_between_rounds(shot)
+                case Reconstruction():
+                    made = step
+        return made
+
+    def _serve_between_rounds(self, shot: ExposedCapture) -> None:
+        """Expose a waiting press; else, every LIVE_S, publish the progress of `shot` and take a requested live picture.
+
+        Called between two solver rounds, and every 50 ms while a thread stores the capture. `shot` is not among the
+        waiting captures `_exposed` meanwhile.
+        """
+        if self._requests.snapshot.has_press:
+            self._expose_during_refinement()
+        elif self._parts.clock.now_s() - self._last_update_s > LIVE_S:
+            self._last_update_s = self._parts.clock.now_s()
+            self._events.progress(shot.press, shot.id)
+            if self._last_update_s < self._requests.snapshot.live_until_s:
+                self._live.refresh()
+
+    def _expose_during_refinement(self) -> None:
+        """Expose the waiting press and publish its quick look while the running refinement is suspended.
+
+        The exposure stays queued for its own reconstruction.
+        """
+        self._expose_pending()
+        if self._exposed:
+            shot = self._exposed.pop()
+            with self._resolving(shot.press, shot.id, ExamEvent.FAILED):
+                with suppress(FrameError):  # its own reconstruction will report the error
+                    self._events.quick_look(shot, self._pipeline.quick_look(shot))
+                self._exposed.append(shot)
+
+
+def run_exam(
+    parts: ExamParts, plan: Callable[[], CapturePipeline], ready: Callable[[], None], on_failure: Callable[[], None]
+) -> None:
+    """Make the plans, call `ready`, then run the loop; at every exit turn the lamp off and fail the waiting presses.
+
+    After a planning error or an unexpected exception also call `on_failure`, which ends the process (restart).
+    """
+    failure: DiffuscopeError | None = None
+    loop: ExamLoop | None = None
+    try:
+        parts.watchdog.status("making plans")
+        pipeline = plan()
+        parts.calibration_monitor.start(pipeline.reconstructor.refractor)
+        loop = ExamLoop(parts, pipeline)
+        parts.requests.advance(ExamEvent.PLANNED)
+        ready()
+        parts.watchdog.ready()
+        parts.events.state()
+        loop.run()
+    except DiffuscopeError as error:  # from the planning or the lamp's `off`: other errors fail their press
+        failure = error
+    finally:
+        with suppress(LightFault):  # then the guardian process and the restart of this process turn the lamp off
+            parts.head.light.off()
+        _fail_waiting(parts.requests, loop)
+        if parts.requests.snapshot.is_closing:
+            parts.events.ended(None, failure)
+        else:
+            parts.events.ended(failure or DiffuscopeError("the instrument stopped unexpectedly"), failure)
+            on_failure()
+
+
+def _fail_waiting(requests: ExamRequests, loop: ExamLoop | None) -> None:
+    """Fail the futures of all presses that were not completed, with Busy."""
+    pending = requests.end()
+    for press in [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]:
+        press.future.set_exception(Busy("the instrument was switched off before the picture was taken"))

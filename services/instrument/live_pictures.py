@@ -1,0 +1,64 @@
+"""Live pictures between captures and during a refinement: aiming light, picture, aiming hint, pause."""
+
+from device.clock import Clock
+from device.errors import DiffuscopeError
+from device.light_safety.guard import GuardedLight
+from services.errors import RequestRefused
+from services.instrument.capture_pipeline import CapturePipeline, LiveFrame
+from services.instrument.exam_events import ExamEvents
+from services.instrument.exam_requests import ExamRequests
+
+RETRY_S = 1.0
+
+
+class LivePictures:
+    """Live pictures while a client requests them. Not thread-safe: the thread `head` calls it."""
+
+    def __init__(
+        self, light: GuardedLight, clock: Clock, pipeline: CapturePipeline, requests: ExamRequests, events: ExamEvents
+    ) -> None:
+        self._light, self._clock, self._pipeline = light, clock, pipeline
+        self._requests, self._events = requests, events
+
+    @property
+    def are_wanted(self) -> bool:
+        """Whether a client requested a live picture a short time ago."""
+        return self._clock.now_s() < self._requests.snapshot.live_until_s
+
+    def refresh(self) -> None:
+        """Take one live picture, then keep the lamp off at least as long as it was on.
+
+        After an error publish it and wait RETRY_S.
+        """
+        try:
+            if (seen := self._take()) is None:
+                return
+        except DiffuscopeError as error:
+            self._light.off()
+            self._events.problem(error)
+            self._pause(RETRY_S)
+            return
+        self._pause(2 * seen.dark_s - seen.exposed_s - self._clock.now_s())  # lamp duty cycle: at most 1/2
+
+    def _take(self) -> LiveFrame | None:
+        """Expose and show the next live picture; None if a press arrived or the consent was withdrawn."""
+        wanted = self._requests.live_request
+        try:
+            wanted.permit()
+        except RequestRefused:  # the consent was withdrawn after the request
+            self._requests.withdraw(wanted)
+            return None
+        seen = self._pipeline.expose_live(wanted.eyes)
+        if self._requests.snapshot.state.has_press:
+            return None
+        jpeg, aim = self._pipeline.live_picture(seen)
+        self._events.aim(aim)
+        self._events.problem(None)
+        self._events.preview(jpeg, seen.exposed_s, aim)
+        return seen
+
+    def _pause(self, duration_s: float) -> None:
+        """Sleep with the lamp off until `duration_s` is over, a press arrives, or the exam closes."""
+        until_s = self._clock.now_s() + duration_s
+        while not self._requests.snapshot.is_interrupted and (left_s := until_s - self._clock.now_s()) > 0:
+            self._clock.sleep(min(left_s, 0.02))

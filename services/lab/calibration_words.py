@@ -1,0 +1,72 @@
+"""Text of `diffuscope calibrations` for one archived calibration."""
+
+from device.calibration.archive import StoredCalibration
+from device.values import Calibration, Geometry
+
+
+def printable(text: str) -> str:
+    """Return text with a space for each unprintable character, so that the text cannot control the terminal."""
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def summary(kept: StoredCalibration) -> tuple[str, ...]:
+    """Return two or three lines: ID, date, serial number, temperature and technician; measured values; warnings."""
+    found, provenance = kept.calibration, kept.provenance
+    warm = "-" if provenance.temperature_c is None else f"{provenance.temperature_c:.1f} C"
+    first = (
+        f"{found.id}  {provenance.made_at:%Y-%m-%d %H:%M}  {printable(provenance.serial):<12}  {warm:>7}"
+        f"  by {printable(provenance.made_by)}"
+    )
+    return (first, _numbers(kept), *_warnings(kept))
+
+
+def details(kept: StoredCalibration) -> tuple[str, ...]:
+    """Return the values that `summary` omits, one line each, and the list of unknown ones."""
+    found, provenance = kept.calibration, kept.provenance
+    lines = [
+        ("software", printable(provenance.software)),
+        ("geometry", _geometry(found.geometry)),
+        ("field", "unknown" if found.field_deg is None else f"{found.field_deg:g} deg"),
+        *((name, "unknown" if getattr(found, name) is None else "measured") for name in ("dark_dn", "flat", "bad")),
+        *((f"psf {k}", printable(psf.name)) for k, psf in enumerate(found.psfs)),
+        *((printable(name), f"{value:.4g}") for name, value in provenance.figures),
+    ]
+    if provenance.unknown:
+        lines.append(("unknown", printable(", ".join(provenance.unknown))))
+    wide = max(len(name) for name, _ in lines)
+    return tuple(f"  {name:<{wide}}  {value}" for name, value in lines)
+
+
+def _numbers(kept: StoredCalibration) -> str:
+    found, unknown = kept.calibration, kept.provenance.unknown
+    sensor = found.sensor
+    black = "unknown" if "black_dn" in unknown else f"{sensor.black_dn:.2f} DN"
+    white = "unknown" if "white_dn" in unknown else f"{sensor.white_dn:.0f} DN"
+    gain = "unknown" if sensor.gain_e_per_dn is None else f"{sensor.gain_e_per_dn:.3f} e-/DN"
+    noise = "unknown" if sensor.read_noise_e is None else f"{sensor.read_noise_e:.2f} e-"
+    return f"black {black}, white {white}, gain {gain}, read noise {noise}, {_psfs(found)}"
+
+
+def _psfs(found: Calibration) -> str:
+    rows, cols = found.psfs[0].shape
+    return f"{rows} x {cols} pixels" + (f", {len(found.psfs)} PSFs" if len(found.psfs) > 1 else "")
+
+
+def _warnings(kept: StoredCalibration) -> tuple[str, ...]:
+    provenance, notes = kept.provenance, []
+    if kept.calibration.simulated:
+        notes.append("SIMULATED")
+    if provenance.origin == "imported":
+        notes.append(
+            f"IMPORTED from {printable(provenance.source or 'somewhere')}, {len(provenance.unknown)} things unknown"
+        )
+    return (", ".join(notes),) if notes else ()
+
+
+def _geometry(geometry: Geometry | None) -> str:
+    if geometry is None:
+        return "unknown"
+    return (
+        f"{geometry.pitch_um:g} um per pixel, {geometry.diffuser_to_sensor_um:g} um to the sensor, "
+        f"angles x {geometry.angular_magnification:g}"
+    )

@@ -1,0 +1,399 @@
+"""Accuracy against run time on this machine, for every method, bin and number of rounds.
+
+A time is that of one frame in memory to its picture on the sensor grid, with FFT plans already made. Every point is run
+once for its score. The timed runs of all points are interleaved, so that a burst of other load affects all points
+alike; the median of the repeats counts.
+"""
+
+import os
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pyfftw
+
+from device.clock import Clock, Deadline, SystemClock
+from device.config.head_file import InstrumentSpec, load_head
+from device.config.image_files import read_image
+from device.errors import FrameError, SettingError
+from device.recon.assessment.metrics import FIT, RANGE, PictureScorer, Scores, shift_px
+from device.recon.installed_methods import available_methods
+from device.recon.methods import METHODS, Method
+from device.recon.model.fft_plans import Planner, processor_name
+from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.grid import disc
+from device.recon.model.kernels import Pixels
+from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
+from device.sim.scene_files import simulate_exposure
+from device.values import Calibration, Image, Mask, Reconstruction
+from services.instrument.measured_frontier import MeasuredFrontier
+from services.lab.frontier_oracle import best_mus
+from services.lab.frontier_plot import draw_frontier
+from services.lab.frontier_result import (
+    BestMu,
+    Choice,
+    FrameSize,
+    Frontier,
+    Machine,
+    Point,
+    ScoredRegion,
+    frontier_text,
+)
+from services.lab.reconstruct_file import require_writable, write_or_raise
+from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_calibration, load_raw, name_of
+
+ROUNDS = (0, 1, 2, 4, 8, 12, 20)
+MOST_BIN, LEAST_SAMPLES = 4, 48
+RIM_PX = 2.0  # width of the blurred field edge, which is excluded from scores
+HIGHPASS_DEG, HIGHPASS_PX = 2.0, 32.0
+ProgressCallback = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class FrontierRequest:
+    """Options of `diffuscope frontier`: a scene, or a raw frame with its PSF and its truth.
+
+    `json` and `plot` are the output files, `plans` the folder of cached FFT plans.
+    """
+
+    scene: Path | None
+    raw: Path | None
+    psf: Path | None
+    truth: Path | None
+    head: Path | None
+    field_deg: float | None
+    json: Path
+    plot: Path
+    budget_s: float
+    repeats: int
+    plans: Path
+
+
+@dataclass(frozen=True)
+class Case:
+    """One frame with its truth: the data in memory before a timed run.
+
+    `vessels` is the mask of the vessels, None if unknown. `registered`: the truth has its own origin, and one common
+    shift registers all pictures with it.
+    """
+
+    name: str
+    counts: Pixels
+    truth: Image
+    vessels: Mask | None
+    calibration: Calibration
+    registered: bool
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of the sensor."""
+        return self.counts.shape[0], self.counts.shape[1]
+
+
+def frontier(request: FrontierRequest, progress: ProgressCallback) -> Frontier:
+    """Measure the frontier, write the JSON file and the plot, and return the result.
+
+    `progress` is called with one line per step. SettingError for invalid options; StoreError for an unwritable file.
+    """
+    _refuse_invalid(request)
+    Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
+    methods = available_methods()
+    found = measure_frontier(_case(request), request.plans, request.budget_s, request.repeats, progress, methods)
+    text = frontier_text(found)
+    write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
+    picture = draw_frontier(found, methods)
+    write_or_raise(request.plot, lambda: request.plot.write_text(picture, encoding="utf-8"))
+    return found
+
+
+def measure_frontier(
+    case: Case, plans: Path, budget_s: float, repeats: int, progress: ProgressCallback,
+    methods: Mapping[str, Method] = METHODS,
+) -> Frontier:  # fmt: skip
+    """Measure every point of one case with each of `methods`, and the instrument's choice within `budget_s`."""
+    bench = _Bench(case, Planner(plans), SystemClock(), progress, methods)
+    points, choice = bench.measure(budget_s, repeats)
+    front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
+    points = tuple(replace(point, pareto=on) for point, on in zip(points, front, strict=True))
+    kept = {point.method for point in points if point.pareto}
+    return Frontier(
+        machine=this_machine(),
+        versions=versions(),
+        scene=case.name,
+        simulated=case.calibration.simulated,
+        frame=FrameSize(case.shape[0], case.shape[1]),
+        region=bench.region(),
+        timing=f"counts in memory to picture on the sensor grid, plans made; {repeats} interleaved repeats",
+        edge="seconds_median against psnr_db",
+        points=points,
+        best_mu=bench.best_mus(),
+        budget_s=budget_s,
+        choice=choice,
+        dominated=tuple(method for method in methods if method not in kept),
+    )
+
+
+def scene_case(spec: InstrumentSpec) -> Case:
+    """Return one exposure of a simulated head, with its truth."""
+    scene = simulate_exposure(spec)
+    return Case(spec.name, scene.counts, scene.truth, scene.vessels, scene.calibration, False)
+
+
+def measure_scene(
+    spec: InstrumentSpec, plans: Path, budget_s: float, repeats: int, progress: ProgressCallback
+) -> MeasuredFrontier:
+    """Return the frontier of one simulated exposure of a head, as `measure_frontier` does."""
+    found = measure_frontier(scene_case(spec), plans, budget_s, repeats, progress)
+    return MeasuredFrontier.model_validate_json(frontier_text(found))
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return for each (cost, worth) whether it is on the Pareto front.
+
+    A pair dominates another if its cost is at most as high, its worth at least as high, and one of both is better.
+    """
+    order = sorted(range(len(points)), key=lambda k: (points[k][0], -points[k][1]))
+    on, best, at_s = [False] * len(points), -np.inf, -np.inf
+    for k in order:
+        cost, worth = points[k]
+        on[k] = worth > best or (worth == best and cost == at_s)  # equal pairs do not dominate each other
+        if worth > best:
+            best, at_s = worth, cost
+    return on
+
+
+def table(found: Frontier) -> str:
+    """Return as text the points from fast to slow (*: Pareto front), the best mus and the instrument's choice."""
+    lines = [f"{'':2}{'method':<10} {'bin':>3} {'rounds':>6} {'ms':>8} {'p95':>8} {'PSNR':>6} {'PCC':>6} {'SSIM':>6} "
+             f"{'detail':>6} {'vessel':>6}"]  # fmt: skip
+    for p in sorted(found.points, key=lambda p: p.seconds_median):
+        vessel = "-" if p.vessel_contrast is None else f"{p.vessel_contrast:.3f}"
+        lines.append(
+            f"{'* ' if p.pareto else '  '}{p.method:<10} {p.bin:>3} {p.rounds:>6} "
+            f"{p.seconds_median * 1e3:>8.1f} {p.seconds_p95 * 1e3:>8.1f} {p.psnr_db:>6.2f} {p.pcc:>6.3f} "
+            f"{p.ssim:>6.3f} {p.highpass_pcc:>6.3f} {vessel:>6}"
+        )
+    for best in found.best_mu:
+        lines.append(f"  tikhonov with the best mu, {best.mu:.0e}, chosen by the truth: bin {best.bin}, "
+                     f"{best.psnr_db:.2f} dB, PCC {best.pcc:.3f}")  # fmt: skip
+    choice = found.choice
+    lines.append(
+        f"within {found.budget_s:g} s the instrument chooses {choice.method}, bin {choice.bin}, "
+        f"{choice.rounds} rounds: {choice.psnr_db:.2f} dB in {choice.solve_s:.3f} s, "
+        f"{choice.db_below_edge:.2f} dB below the edge; and {choice.refract_s:.3f} s for the eye's refraction"
+    )
+    return "\n".join(lines)
+
+
+class _Bench:
+    """Planned reconstructors of one case, and the scorer of their pictures."""
+
+    def __init__(
+        self, case: Case, planner: Planner, clock: Clock, progress: ProgressCallback, methods: Mapping[str, Method]
+    ) -> None:
+        self.case, self.planner, self.clock, self.progress = case, planner, clock, progress
+        geometry = case.calibration.geometry
+        self.detail_px = HIGHPASS_DEG * geometry.px_per_deg if geometry else HIGHPASS_PX
+        self.inside, self.where = scored_region(case)
+        self.judge = PictureScorer(case.truth, self.inside, self.detail_px, case.vessels)
+        steps = default_schedule(case.calibration, case.shape)
+        progress(f"{case.name}: planning the instrument's own ladder")
+        self.instrument = Reconstructor(case.calibration, case.shape, planner, clock, steps)
+        self.shift = (0, 0)
+        if case.registered:  # the truth of a scene is aligned with its frame
+            self.shift = shift_px(_grey(self.instrument(case.counts).picture), case.truth)
+        self.recipes = _recipes(case.shape, steps[-1].bin, methods)
+        self.makers: dict[tuple[str, int], Reconstructor] = {}
+        for recipe in self.recipes:
+            key = recipe.method, recipe.bin
+            if key not in self.makers:
+                progress(f"{case.name}: planning {recipe.method}, bin {recipe.bin}")
+                most = Recipe(recipe.method, recipe.bin, max(ROUNDS))
+                self.makers[key] = Reconstructor(
+                    case.calibration, case.shape, planner, clock, (most,), refract=False, methods=methods
+                )
+
+    def _reconstruct(self, recipe: Recipe) -> Reconstruction:
+        return self.makers[recipe.method, recipe.bin](self.case.counts, rounds=recipe.rounds)
+
+    def score(self, made: Reconstruction) -> Scores:
+        """Return the scores of a picture after the shift that all pictures of this case share."""
+        return self.judge(self.moved(_grey(made.picture)))
+
+    def moved(self, picture: Image) -> Image:
+        """Return a picture moved back by `shift` (rows, cols), the offset that all pictures of this case share."""
+        return np.roll(picture, (-self.shift[0], -self.shift[1]), axis=(0, 1))
+
+    def best_mus(self) -> tuple[BestMu, ...]:
+        """Return for each bin the best mu of Tikhonov regularisation in the paper's range, and its scores.
+
+        The truth selects mu: an oracle for comparison, not a usable method.
+        """
+        self.progress("tikhonov at the best mu of its range")
+        case = self.case
+        bins = sorted({recipe.bin for recipe in self.recipes if recipe.method == "tikhonov"})
+        return best_mus(
+            case.counts, case.calibration, self.planner, case.truth, self.inside, bins, self.judge, self.moved
+        )
+
+    def measure(self, budget_s: float, repeats: int) -> tuple[tuple[Point, ...], Choice]:
+        """Return every point, and the instrument's choice within `budget_s`."""
+        scored = []
+        for k, recipe in enumerate(self.recipes, 1):
+            scores = self.score(self._reconstruct(recipe))
+            scored.append(scores)
+            self.progress(f"{k:>3}/{len(self.recipes)} {_name(recipe)}: {scores.psnr_db:.2f} dB, PCC {scores.pcc:.3f}")
+        times, own, made = self._times(budget_s, repeats)
+        last = sorted(made, key=lambda each: (each.report.rounds, -each.report.bin))[len(made) // 2]  # the median run
+        points = tuple(
+            Point(recipe.method, recipe.bin, recipe.rounds or 0, *_summary(seconds), **asdict(scores))
+            for recipe, seconds, scores in zip(self.recipes, times, scored, strict=True)
+        )
+        report = last.report
+        refract_s = float(np.median([each.report.seconds["refract"] for each in made]))
+        solve_s = _summary(own)[0] - refract_s
+        scores = self.score(last)
+        lead_db = (p.psnr_db - scores.psnr_db for p in points if p.seconds_median <= solve_s)
+        choice = Choice(
+            method=report.method, bin=report.bin, rounds=report.rounds, stopped=report.stopped,
+            seconds_median=_summary(own)[0], seconds_p95=_summary(own)[1], within_budget=max(own) <= budget_s,
+            refract_s=refract_s, solve_s=solve_s, db_below_edge=max(0.0, *lead_db, 0.0), **asdict(scores),
+        )  # fmt: skip
+        return points, choice
+
+    def _times(self, budget_s: float, repeats: int) -> tuple[list[list[float]], list[float], list[Reconstruction]]:
+        """Return interleaved times in s: of every point, and of the instrument within its budget; and its results."""
+        times: list[list[float]] = [[] for _ in self.recipes]
+        own: list[float] = []
+        made: list[Reconstruction] = []
+        for turn in range(repeats):
+            self.progress(f"timing, turn {turn + 1} of {repeats}")
+            for recipe, seconds in zip(self.recipes, times, strict=True):
+                begin_s = self.clock.now_s()
+                self._reconstruct(recipe)
+                seconds.append(self.clock.now_s() - begin_s)
+            begin_s = self.clock.now_s()
+            made.append(self.instrument(self.case.counts, deadline=Deadline.after(self.clock, budget_s)))
+            own.append(self.clock.now_s() - begin_s)
+        return times, own, made
+
+    def region(self) -> ScoredRegion:
+        """Return the scored region and the settings of the scores."""
+        return ScoredRegion(
+            what=self.where, pixels=int(self.judge.inside.sum()), intensity_fit=FIT, psnr_range=RANGE,
+            truth_variance=self.judge.truth_variance, ssim="sigma 1.5 px, 11 x 11, "
+            "K1 0.01, K2 0.03, on the region eroded by 5 px", highpass_sigma_px=self.detail_px,
+            shift_px=self.shift, truth_vessel_contrast=self.judge.truth_contrast,
+        )  # fmt: skip
+
+
+def _summary(seconds: list[float]) -> tuple[float, float]:
+    return float(np.median(seconds)), float(np.quantile(seconds, 0.95))
+
+
+def _name(recipe: Recipe) -> str:
+    rounds = "" if recipe.rounds is None else f", {recipe.rounds} rounds"
+    return f"{recipe.method}, bin {recipe.bin}{rounds}"
+
+
+def _recipes(shape: tuple[int, int], working: int, methods: Mapping[str, Method]) -> list[Recipe]:
+    """Return every method at every usable bin, iterative methods at each number in ROUNDS.
+
+    Bins go up to MOST_BIN, or to the `working` bin of the default schedule if that is larger.
+    """
+    bins = [n for n in range(1, max(MOST_BIN, working) + 1) if n == 1 or min(shape) // n >= LEAST_SAMPLES]
+    wanted = []
+    for method in methods.values():
+        rounds = ROUNDS if method.round_pairs else (None,)
+        wanted += [Recipe(method.name, n, k) for n in bins for k in rounds]
+    return wanted
+
+
+def scored_region(case: Case) -> tuple[Mask, str]:
+    """Return the compared region and its description.
+
+    The region is the lit field without its edge. If the field is unknown, it is all pixels with a non-zero truth, or
+    the whole frame if these are at most 5 %. Pixels with an unknown truth (NaN) are left out.
+    """
+    radius_px = field_radius_px(case.calibration)
+    if np.isfinite(radius_px):
+        centre = ((case.shape[0] - 1) / 2, (case.shape[1] - 1) / 2)
+        inside = disc(case.shape, centre, radius_px - RIM_PX) > 0.5
+        return inside & _known(case.truth), f"the illuminated field less {RIM_PX:g} px of its rim"
+    lit = _known(case.truth) & (case.truth != 0)
+    if lit.mean() > 0.05:
+        return lit, "no field is known: wherever the truth is not zero"
+    return _known(case.truth), "no field is known: the whole frame"
+
+
+def _known(truth: Image) -> Mask:
+    return np.isfinite(truth)
+
+
+def _grey(picture: Image) -> Image:
+    return picture if picture.ndim == 2 else np.asarray(picture.mean(axis=2), np.float32)
+
+
+def this_machine() -> Machine:
+    """Return this computer, as a measurement states it."""
+    return Machine(processor_name(), os.cpu_count(), platform.platform(), fft_threads=1)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the program, its libraries, Python and FFTW by name."""
+    names = ("diffuscope", "numpy", "scipy", "pyfftw", "numba")
+    found = {name: version(name) for name in names}
+    return found | {"python": platform.python_version(), "fftw": str(pyfftw.fftw_version)}
+
+
+def _refuse_invalid(request: FrontierRequest) -> None:
+    """Raise SettingError for options that cannot be measured, before any computation."""
+    files = {"--raw": request.raw, "--psf": request.psf, "--truth": request.truth}
+    if request.scene is not None:
+        extra = [word for word, path in {**files, "--head": request.head}.items() if path is not None]
+        if extra or request.field_deg is not None:
+            raise SettingError(
+                f"a scene brings its own frame, truth and field; {', '.join(extra or ['--field-deg'])} has no place",
+                "Give --scene alone, or --raw with --psf and --truth.",
+            )
+    elif missing := [word for word, path in files.items() if path is None]:
+        raise SettingError(
+            f"there is nothing to measure: {', '.join(missing)} and --scene are missing",
+            "Give --scene SCENE.toml, or --raw, --psf and --truth together.",
+        )
+    if request.repeats < 1:
+        raise SettingError(f"{request.repeats} repeats measure nothing", "Give --repeats of at least 5.")
+    for place in (request.json, request.plot):
+        require_writable(place)
+
+
+def _case(request: FrontierRequest) -> Case:
+    if request.scene is not None:
+        return scene_case(load_head(request.scene))
+    assert request.raw is not None
+    assert request.psf is not None
+    assert request.truth is not None
+    return recorded_case(request.raw, request.psf, request.truth, request.head, request.field_deg, request.plans)
+
+
+def recorded_case(
+    raw: Source, psf: Source, truth: Source, head: Path | None, field_deg: float | None, plans: Path
+) -> Case:
+    """Return a recorded frame with its truth, files or arrays; FrameError for a truth of another shape.
+
+    `head`, `field_deg`: as in `ReconstructOptions`. `plans`: folder of cached FFT plans.
+    """
+    pixels = _grey((read_image(truth) if isinstance(truth, Path) else np.asarray(truth)).astype(np.float32))
+    frame = load_raw(raw)
+    if pixels.shape != frame.shape:
+        raise FrameError(
+            f"{name_of(truth, 'the truth')} has {pixels.shape[0]} x {pixels.shape[1]} pixels, "
+            f"the raw {frame.shape[0]} x {frame.shape[1]}",
+            "Give the truth on the sensor's grid: one value per pixel of the raw frame.",
+        )
+    options = ReconstructOptions(raw, (psf,), None, None, None, None, None, head, field_deg, False, plans)
+    name = raw.name if isinstance(raw, Path) else frame.name
+    return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame.raw), True)

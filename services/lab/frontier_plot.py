@@ -1,0 +1,90 @@
+"""SVG plot of a frontier measurement: PSNR against run time of every method, bin and number of rounds."""
+
+from collections.abc import Mapping, Sequence
+from math import log10
+
+from device.recon.methods import METHODS, Method
+from services.lab.frontier_result import Frontier, Point
+from services.lab.plot import Mark, Plot, Series, svg, time_axis, value_axis
+
+
+def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> str:
+    """Return the SVG of `found`, the result of `frontier.measure_frontier` with `methods`."""
+    points, choice, budget_s = found.points, found.choice, found.budget_s
+    edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
+    seconds = [p.seconds_median for p in points] + [choice.solve_s, budget_s]
+    worths = [p.psnr_db for p in points] + [choice.psnr_db]
+    y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
+    plot = Plot(
+        title=f"What accuracy costs in time: {found.scene}",
+        subtitle=_subtitle(found),
+        description=_description(found, edge),
+        x=time_axis(seconds, "from counts in memory to the picture on the sensor grid, refraction apart"),
+        y=y,
+        series=tuple(
+            _series(points, method) for method in methods.values() if any(p.method == method.name for p in points)
+        ),
+        edge=tuple(edge),
+        limit=(budget_s, f"budget {budget_s:g} s"),
+        ring=(choice.solve_s, choice.psnr_db, "the instrument's choice"),
+        right=_correlations(y.low, y.high, found.region.truth_variance),
+        right_title="the same as correlation (PCC)",
+    )
+    return svg(plot)
+
+
+def _subtitle(found: Frontier) -> str:
+    machine, frame = found.machine, found.frame
+    kind = "simulated" if found.simulated else "recorded"
+    return (
+        f"{frame.rows} x {frame.cols} pixels, {kind}; {machine.cpu or 'unknown processor'}, "
+        f"one FFT thread; {found.region.what}"
+    )
+
+
+def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
+    choice = found.choice
+    best = ", ".join(f"{value:.1f} dB in {seconds * 1e3:.0f} ms" for seconds, value in edge)
+    return (
+        f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
+        f"truth. The best within each time: {best}. Within {found.budget_s:g} s the instrument chooses "
+        f"{choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.psnr_db:.1f} dB in "
+        f"{choice.solve_s * 1e3:.0f} ms, and looks for the eye's refraction in {choice.refract_s * 1e3:.0f} ms."
+    )
+
+
+def _series(points: Sequence[Point], method: Method) -> Series:
+    """Return the marks of one method.
+
+    A closed-form method has one trail over the bins; an iterative one has a trail over the rounds of each bin.
+    """
+    own = [p for p in points if p.method == method.name]
+    if method.round_pairs == 0:
+        return Series(method.name, (tuple(_mark(p, method, f"bin {p.bin}") for p in own),))
+    trails = []
+    for n in sorted({p.bin for p in own}):
+        rounds = [p for p in own if p.bin == n]
+        labels = [f"bin {n}", *(str(p.rounds) if p.pareto else "" for p in rounds[1:])]
+        trails.append(tuple(_mark(p, method, label) for p, label in zip(rounds, labels, strict=True)))
+    return Series(f"{method.name} (rounds)", tuple(trails))
+
+
+def _mark(point: Point, method: Method, label: str) -> Mark:
+    ms = point.seconds_median * 1e3
+    rounds = f", {point.rounds} rounds" if method.round_pairs else ""
+    tooltip = f"{point.method}, bin {point.bin}{rounds}: {ms:.1f} ms, {point.psnr_db:.2f} dB, PCC {point.pcc:.3f}"
+    return Mark(point.seconds_median, point.psnr_db, label, tooltip, 1.0 if point.pareto else 0.75)
+
+
+def _correlations(low_db: float, high_db: float, truth_variance: float) -> tuple[tuple[float, str], ...]:
+    """Return ticks for the right axis: the PSNR in dB and the text of round correlations (PCC) in the plotted range.
+
+    After the best affine fit, mse = `truth_variance` (1 - PCC^2). Ticks that are too close are left out.
+    """
+    ladder = (0.2, 0.4, 0.6, 0.7, 0.8, 0.85, 0.9, 0.92, 0.94, 0.95, 0.96, 0.97, 0.975, 0.98, 0.985, 0.99, 0.995, 0.999)
+    places = [(-10 * log10(max(truth_variance * (1 - pcc**2), 1e-20)), f"{pcc:g}") for pcc in ladder]
+    apart: list[tuple[float, str]] = []
+    for place in places:
+        if low_db <= place[0] <= high_db and (not apart or place[0] - apart[-1][0] > 0.04 * (high_db - low_db)):
+            apart.append(place)
+    return tuple(apart)

@@ -1,0 +1,106 @@
+"""Defects of raw counts that the simulator does not model, one function each.
+
+Counts are uint16 (rows, cols); `white_dn` is the full-scale count, `black_dn` the count without light. Sizes are shares
+of the rows, positions shares of rows or columns, so that merged pixels have the same defect.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.config.head_file import CameraSpec
+from device.values import Counts, Image, Mask
+
+COLUMNS_AT = (0.31, 0.44, 0.56, 0.68)  # of the width
+ROWS_AT = (0.36, 0.61)  # of the height
+WIDE = 3 / 1080  # of the rows: width of a group of dead columns or rows
+BLOB_AT, BLOB_SHARE = (0.45, 0.56), 0.055  # 60 of 1080 rows
+GLARE_AT, GLARE_SIGMA = (0.42, 0.57), 0.022
+FLICKER_HZ, READ_S = 100.0, 0.032  # mains light, and a rolling shutter's time from the first row to the last
+
+
+def dead_columns(shape: tuple[int, int]) -> Mask:
+    """Return the mask of twelve columns of a full sensor, in four groups of three."""
+    dead = np.zeros(shape, np.bool_)
+    for at in COLUMNS_AT:
+        first = round(at * shape[1])
+        dead[:, first : first + _wide_px(shape)] = True
+    return dead
+
+
+def dead_rows(shape: tuple[int, int]) -> Mask:
+    """Return the mask of six rows of a full sensor, in two groups of three."""
+    dead = np.zeros(shape, np.bool_)
+    for at in ROWS_AT:
+        first = round(at * shape[0])
+        dead[first : first + _wide_px(shape)] = True
+    return dead
+
+
+def _wide_px(shape: tuple[int, int]) -> int:
+    return max(1, round(WIDE * shape[0]))
+
+
+def blob(shape: tuple[int, int], share: float = BLOB_SHARE) -> Mask:
+    """Return the mask of a disc near the centre, as of a dust grain; its radius is `share` of the rows."""
+    rows, cols = (np.arange(n) - at * n for n, at in zip(shape, BLOB_AT, strict=True))
+    return np.asarray(np.hypot(rows[:, None], cols[None]) < share * shape[0])
+
+
+def read_as(counts: Counts, where: Mask, value_dn: int) -> Counts:
+    """Return the counts with `value_dn` where the mask is set."""
+    out = counts.copy()
+    out[where] = value_dn
+    return out
+
+
+def declared(where: Mask) -> Image:
+    """Return a flat frame with NaN at bad pixels and 1 elsewhere, the way a user of `reconstruct` declares them."""
+    return np.where(where, np.float32(np.nan), np.float32(1))
+
+
+def warm(counts: Counts, camera: CameraSpec, share: float, more: float) -> Counts:
+    """Raise a random `share` of the pixels by `more` times the full-scale count, and clip."""
+    out = counts.astype(np.float64)
+    out[np.random.default_rng(41).random(counts.shape) < share] += more * camera.white_dn
+    return _as_counts(out, camera)
+
+
+def glare(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Add a Gaussian bright reflex with shot noise; it saturates about `share` of all pixels, its halo stays below."""
+    rows, cols = (np.arange(n) - at * n for n, at in zip(counts.shape, GLARE_AT, strict=True))
+    sigma_px = GLARE_SIGMA * counts.shape[0]
+    spot = np.exp(-(rows[:, None] ** 2 + cols[None] ** 2) / (2 * sigma_px**2))
+    clipped_px = share * counts.size
+    span_e = camera.full_well_e
+    peak_e = span_e * float(np.exp(clipped_px / np.pi / (2 * sigma_px**2)))  # the spot alone saturates these pixels
+    arriving_e = np.random.default_rng(42).poisson(np.minimum(spot * peak_e, 20 * span_e))
+    return _as_counts(counts + arriving_e / camera.gain_e_per_dn, camera)
+
+
+def flicker(counts: Counts, camera: CameraSpec, share: float) -> Counts:
+    """Multiply the light above black by 1 + `share` sin(2 pi FLICKER_HZ t), with t = 0 to READ_S over the rows."""
+    swing = 1 + share * np.sin(2 * np.pi * FLICKER_HZ * READ_S * np.linspace(0, 1, counts.shape[0]))
+    return _as_counts(camera.black_dn + (counts - camera.black_dn) * swing[:, None], camera)
+
+
+def offset(counts: Counts, camera: CameraSpec, more_dn: float) -> Counts:
+    """Raise all counts by `more_dn`, so that the black level differs from the head file; round and clip."""
+    return _as_counts(counts + more_dn, camera)
+
+
+def eight_bits(counts: Counts, camera: CameraSpec) -> NDArray[np.uint8]:
+    """Return the upper eight bits of the counts of the head's converter."""
+    return np.asarray(counts >> (camera.bit_depth - 8), np.uint8)
+
+
+def missing(counts: Counts, share: float) -> Image:
+    """Return the counts as float, with NaN in a random `share` of the pixels."""
+    out = counts.astype(np.float32)
+    out[np.random.default_rng(43).random(counts.shape) < share] = np.nan
+    return out
+
+
+def _as_counts(values: NDArray[Any], camera: CameraSpec) -> Counts:
+    return np.clip(np.round(values), 0, camera.white_dn).astype(np.uint16)

@@ -1,0 +1,182 @@
+"""`diffuscope paper`: runs all experiments in order and writes the HTML report."""
+
+from base64 import b64decode
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from pathlib import Path
+
+from device.clock import Clock
+from device.errors import SettingError
+from services.lab.paper import (  # fmt: skip
+    caustics,
+    first_order,
+    hard,
+    hard_grid,
+    light,
+    printed,
+    rules,
+    screen,
+    sensors,
+    trainer,
+)
+from services.lab.paper.bench import Bench
+from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Status, Table
+from services.lab.paper.style import CLAIMED, STYLE
+from services.lab.reconstruct_file import write_or_raise
+
+ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L")
+MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
+CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
+_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
+EXPERIMENTS: dict[str, Experiment] = {
+    key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
+}
+
+
+@dataclass(frozen=True)
+class ExperimentRun:
+    """An experiment, its outcome and its run time."""
+
+    experiment: Experiment
+    outcome: Outcome
+    seconds: float
+
+
+def run_experiments(
+    folder: Path, clock: Clock, progress: Callable[[str], None], keys: Sequence[str] = (), merged: int = 1
+) -> list[ExperimentRun]:
+    """Run the experiments `keys` (default: all), write `report.html` and PNG files into a folder; return the outcomes.
+
+    `merged` n combines n x n pixels, as stated in the report. `progress` is called with one line per step.
+    SettingError for an unknown key; StoreError for an unwritable folder.
+    """
+    for key in keys:
+        if key not in EXPERIMENTS:
+            raise SettingError(f"no experiment is called {key!r}", f"Choose from {', '.join(EXPERIMENTS)}.")
+    write_or_raise(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
+    bench = Bench(merged, progress)
+    ran = []
+    for experiment in EXPERIMENTS.values():
+        if keys and experiment.key not in keys:
+            continue
+        begin_s = clock.now_s()
+        outcome = experiment.run(bench)
+        ran.append(ExperimentRun(experiment, outcome, clock.now_s() - begin_s))
+        _write_pictures(folder, outcome)
+        progress(f"{experiment.key}: {summary(outcome.claims)}")
+    page = folder / "report.html"
+    write_or_raise(page, lambda: page.write_text(html(ran, merged), encoding="utf-8"))
+    return ran
+
+
+def _write_pictures(folder: Path, outcome: Outcome) -> None:
+    for shown in outcome.shown:
+        if shown.file:
+            path, content = folder / shown.file, b64decode(shown.address.split(",", 1)[1])
+            write_or_raise(path, partial(path.write_bytes, content))
+
+
+def all_hold(ran: Sequence[ExperimentRun]) -> bool:
+    """Return whether every assertion of every experiment holds; a number that is not reproduced is no assertion."""
+    return all(claim.status != "does not hold" for one in ran for claim in one.outcome.claims)
+
+
+def summary(claims: Sequence[Claim]) -> str:
+    """Return how many assertions hold, of how many, and how many numbers of the paper are not reproduced."""
+    states = [claim.status for claim in claims]
+    if not states:
+        return "shown, nothing is asserted"
+    missed = states.count("not reproduced")
+    words = f"{states.count('holds')} of {len(states) - missed} assertions hold"
+    return words + (f"; numbers of the paper that are not reproduced: {missed}" if missed else "")
+
+
+def table(ran: Sequence[ExperimentRun]) -> str:
+    """Return a text table of every claim: experiment, mark, claim, value, limit, value in the paper."""
+    lines = [f"{'':5}{'':4}{'assertion':<62}{'value':>10}  {'limit':<18}paper"]
+    for one in ran:
+        for claim in one.outcome.claims:
+            mark = MARKS[claim.status]
+            lines.append(f"{one.experiment.key:<5}{mark:<4}{claim.what:<62}{_value(claim):>10}  {claim.limit:<18}"
+                         f"{claim.paper}".rstrip())  # fmt: skip
+    return "\n".join(lines)
+
+
+def html(ran: Sequence[ExperimentRun], merged: int) -> str:
+    """Return the self-contained HTML report."""
+    every, total_s = [claim for one in ran for claim in one.outcome.claims], sum(one.seconds for one in ran)
+    size = "Full size, 1080 x 1920" if merged == 1 else f"{merged} x {merged} pixels of the sensor merged to one"
+    verdict = summary(every) + ("." if all(claim.holds for claim in every) else ". These are marked.")
+    toc = "".join(
+        f'<li><a href="#{one.experiment.key}">{one.experiment.key}</a> {escape(one.experiment.title)}'
+        f"{_flags(one.outcome.claims)}</li>"
+        for one in ran
+    )
+    return "\n".join(
+        [
+            '<!doctype html><html lang="en"><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width"><title>The paper, rerun</title>',
+            f"<style>{STYLE}</style><main><h1>The paper, rerun</h1>",
+            '<p class="lead">Li, McKay, Durr, Tian: "A diffuser-based computational imaging funduscope", every '
+            "experiment "
+            "repeated in the simulator. <b>All pictures on this page are simulated.</b></p>",
+            f'<p class="verdict">{verdict} {size}; {total_s:.0f} s of computing.</p>',
+            CLAIMED,
+            f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
+            *(_section(one) for one in ran),
+            "</main></html>\n",
+        ]
+    )
+
+
+def _section(one: ExperimentRun) -> str:
+    experiment, outcome = one.experiment, one.outcome
+    pictures = "".join(_figure(shown) for shown in outcome.shown if not shown.wide)
+    plots = "".join(_figure(shown) for shown in outcome.shown if shown.wide)
+    return "\n".join(
+        [
+            f'<section id="{experiment.key}"><h2><span>{experiment.key}</span> {escape(experiment.title)}</h2>',
+            f"<p>{escape(experiment.sentence)}</p><p class=paper><b>Paper:</b> {escape(experiment.paper)}</p>",
+            _claims(outcome.claims),
+            *(_sheet(sheet) for sheet in outcome.sheets),
+            f"<div class=pictures>{pictures}</div>" if pictures else "",
+            f"<div class=plots>{plots}</div>" if plots else "",
+            *(f"<p class=note>{escape(note)}</p>" for note in outcome.notes),
+            f"<p class=quiet>{one.seconds:.1f} s</p></section>",
+        ]
+    )
+
+
+def _flags(claims: Sequence[Claim]) -> str:
+    """Return as HTML each status other than "holds" among the claims, for the table of contents."""
+    states = {claim.status for claim in claims}
+    return "".join(f" <b class={CLASSES[state]}>{state}</b>" for state in CLASSES if state in states - {"holds"})
+
+
+def _claims(claims: Sequence[Claim]) -> str:
+    rows = "".join(
+        f"<tr class={CLASSES[claim.status]}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
+        f"<td>{escape(claim.limit)}</td><td>{claim.status}</td>"
+        f"<td>{escape(claim.paper) or '&ndash;'}</td></tr>"
+        for claim in claims
+    )
+    head = "<tr><th>assertion<th class=n>here<th>limit<th><th>printed in the paper</tr>"
+    return f"<table class=claims><thead>{head}</thead><tbody>{rows}</tbody></table>"
+
+
+def _sheet(sheet: Table) -> str:
+    head = "".join(f"<th>{escape(word)}" for word in sheet.head)
+    rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}" for cell in row) for row in sheet.rows)
+    return f"<table class=sheet><thead><tr>{head}</thead><tbody>{rows}</tbody></table>"
+
+
+def _figure(shown: Figure) -> str:
+    words = escape(shown.caption)
+    kind = " class=begins" if shown.begins else ""
+    return f'<figure{kind}><img src="{shown.address}" alt="{words}"><figcaption>{words}</figcaption></figure>'
+
+
+def _value(claim: Claim) -> str:
+    return f"{claim.value:.{claim.digits}f}"

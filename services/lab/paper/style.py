@@ -1,0 +1,53 @@
+"""CSS of the report, and its HTML text on what is claimed."""
+
+CLAIMED = """
+<h2>What is claimed, and what is not</h2>
+<ul>
+<li>Claimed: with the paper's optics as described, a wave-optics simulation gives the paper's first-order numbers, and
+its pictures behave as the paper says they do: each assertion below is checked on every run.</li>
+<li>Not claimed: the paper's own scores. It prints one pair (SSIM 0.59 to 0.85 for the dots), and that pair is
+<b class=open>not reproduced</b> here (S1). The others stand in figures that we do not have; so orderings are asserted,
+and our own values stand beside them. What is not reproduced is not counted as held.</li>
+<li>Not claimed: anything about a real diffuser, a real eye, or a diagnosis. The surface is a Gaussian random one;
+nobody has measured it. Retinas are drawn from a seed.</li>
+<li>The paper chose its weight mu by eye from a small range. Here an oracle takes from such a range the weight whose
+picture correlates best with the truth. A person may choose another one: where that matters (S2) the weight with the
+best detail stands beside it.</li>
+<li>No assertion has a limit that another method keeps only by being worse.</li>
+<li>PCC, PSNR and SSIM are taken inside the lit field, on samples of about 10 um on the sensor, after one gain and one
+offset for the whole picture; SSIM with a Gaussian window of 1.5 samples. That fit alone changes PSNR by decibels.</li>
+</ul>
+"""
+
+STYLE = """
+:root { color-scheme: light dark; --ground: #fbfbf9; --ink: #1d2330; --quiet: #59606d; --line: #dfe1e6;
+  --card: #ffffff; --yes: #00664d; --no: #b3261e; --open: #8a5300; --accent: #0067a3; }
+@media (prefers-color-scheme: dark) { :root { --ground: #12161d; --ink: #eceff4; --quiet: #a9b1bf; --line: #2c333f;
+  --card: #191f28; --yes: #4fd1a5; --no: #ff8a80; --open: #ffb95c; --accent: #6cbcf5; } }
+body { margin: 0; background: var(--ground); color: var(--ink);
+  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", "Noto Sans", Arial, sans-serif; }
+main { max-width: 1320px; margin: 0 auto; padding: 32px 24px 80px; }
+h1 { font-size: 34px; line-height: 1.15; margin: 0 0 8px; }
+h2 { font-size: 23px; line-height: 1.25; margin: 0 0 8px; }
+h2 span { display: inline-block; min-width: 2.2em; color: var(--accent); }
+a { color: var(--accent); } p, ul { max-width: 76ch; margin: 0 0 12px; }
+.lead { font-size: 19px; } .verdict { font-weight: 600; } .quiet, .paper, figcaption { color: var(--quiet); }
+.quiet, figcaption { font-size: 14px; }
+.toc { columns: 2; column-gap: 32px; padding-left: 20px; margin-bottom: 32px; }
+section { border-top: 1px solid var(--line); padding: 28px 0 20px; }
+table { border-collapse: collapse; margin: 12px 0 20px; font-size: 15px; }
+th, td { text-align: left; padding: 5px 16px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+th { color: var(--quiet); font-weight: 500; } .n { text-align: right; font-variant-numeric: tabular-nums; }
+.claims { width: 100%; max-width: 1100px; table-layout: fixed; } .claims th:first-child { width: 44%; }
+.claims th:nth-child(2) { width: 9%; } .claims th:nth-child(4) { width: 11%; }
+.sheet td { font-variant-numeric: tabular-nums; }
+tr.yes td:nth-child(4) { color: var(--yes); } tr.open td:nth-child(4), b.open { color: var(--open); font-weight: 600; }
+tr.no td, b.no { color: var(--no); font-weight: 600; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(230px, 1fr)); gap: 16px; margin: 12px 0; }
+.pictures figure.begins { grid-column-start: 1; }
+.plots { max-width: 1000px; display: grid; gap: 16px; margin: 12px 0; } .plots figcaption { display: none; }
+figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
+figure img { display: block; width: 100%; } .pictures img { aspect-ratio: 1; object-fit: contain; background: #000; }
+figcaption { padding: 8px 10px; line-height: 1.35; }
+.note { border-left: 3px solid var(--accent); padding-left: 14px; }
+"""

@@ -1,0 +1,299 @@
+"""Small SVG plots of series over two linear or logarithmic axes; the marks of each series have their shape and colour.
+
+The SVG has no external fonts, scripts or files, and suits light and dark backgrounds. A mark can have a tooltip with
+its numbers, which screen readers read as well.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from math import ceil, cos, floor, log10, pi, sin
+
+STYLE = """
+  .ground { fill: #ffffff; } .frame { fill: none; stroke: #8a8f98; } .grid { stroke: #e3e5e9; }
+  text { fill: #1d2330; font: 14px system-ui, -apple-system, "Segoe UI", "Noto Sans", Arial, sans-serif; }
+  .title { font-size: 20px; font-weight: 600; } .small { font-size: 12px; } .quiet { fill: #59606d; }
+  .s0 { --ink: #8a5a00; } .s1 { --ink: #0067a3; } .s2 { --ink: #00795c; } .s3 { --ink: #a8327f; }
+  .s4 { --ink: #555b66; }
+  .mark { fill: var(--ink); stroke: #ffffff; stroke-width: 1.2; }
+  .trail { fill: none; stroke: var(--ink); opacity: .55; } .line { opacity: .9; stroke-width: 1.5; }
+  .label { fill: var(--ink); paint-order: stroke; stroke: #ffffff; stroke-width: 4px; stroke-linejoin: round; }
+  .edge { fill: none; stroke: #1d2330; stroke-width: 1.6; }
+  .limit { stroke: #b3261e; stroke-width: 1.5; stroke-dasharray: 6 4; } .limit-word { fill: #b3261e; }
+  .ring { fill: none; stroke: #1d2330; stroke-width: 2.4; }
+  @media (prefers-color-scheme: dark) {
+    .ground { fill: #12161d; } .frame { stroke: #7a818d; } .grid { stroke: #272d37; }
+    text { fill: #eceff4; } .quiet { fill: #a9b1bf; } .mark, .label { stroke: #12161d; }
+    .s0 { --ink: #f0b14a; } .s1 { --ink: #6cbcf5; } .s2 { --ink: #4fd1a5; } .s3 { --ink: #f18fcb; }
+    .s4 { --ink: #b6bdc9; }
+    .edge, .ring { stroke: #eceff4; } .limit { stroke: #ff8a80; } .limit-word { fill: #ff8a80; }
+  }
+"""
+LETTER_PX, LINE_PX = 6.6, 13.0  # width of a letter and height of a line of a 12 px label
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """One point with label and tooltip; `weight` scales the mark, and 0 draws only the line through the point."""
+
+    x: float
+    y: float
+    label: str = ""
+    tooltip: str = ""
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Series:
+    """Marks of one shape and colour; a thin line joins the marks of each trail."""
+
+    name: str
+    trails: tuple[tuple[Mark, ...], ...]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Linear or logarithmic axis of a plot: maps data to 0 (`low`) to 1 (`high`); with its ticks and their labels."""
+
+    low: float
+    high: float
+    title: str
+    ticks: tuple[tuple[float, str], ...]
+    log: bool = False
+
+    def at(self, value: float) -> float:
+        """Return the position of a value: 0 at the low end, 1 at the high end."""
+        if self.log:
+            return (log10(value) - log10(self.low)) / (log10(self.high) - log10(self.low))
+        return (value - self.low) / (self.high - self.low)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Content of one plot; `edge`: points (x, y) of the Pareto front; `limit`: x and label of a vertical line.
+
+    `ring`: x, y and label of a circle. `right`: y values and labels of ticks at the right. Width and height are in px.
+    """
+
+    title: str
+    subtitle: str
+    description: str
+    x: Axis
+    y: Axis
+    series: tuple[Series, ...]
+    edge: tuple[tuple[float, float], ...] = ()
+    limit: tuple[float, str] | None = None
+    ring: tuple[float, float, str] | None = None
+    right: tuple[tuple[float, str], ...] = ()
+    right_title: str = ""
+    width: int = field(default=960, kw_only=True)
+    height: int = field(default=600, kw_only=True)
+
+
+LEFT, RIGHT, TOP, BOTTOM = 74, 78, 96, 62
+
+
+def time_axis(seconds: Iterable[float], title: str) -> Axis:
+    """Return a log axis of times in s; a tick below 0.1 s is labelled in milliseconds, others in seconds."""
+    return log_axis(seconds, title, _time)
+
+
+def log_axis(values: Iterable[float], title: str, label: Callable[[float], str]) -> Axis:
+    """Return a log axis for positive values with ticks at 1, 2 and 5 of each decade; `label` formats a tick."""
+    every = list(values)
+    low, high = min(every) / 1.25, max(every) * 1.45
+    ticks = [m * 10.0**k for k in range(floor(log10(low)), ceil(log10(high)) + 1) for m in (1, 2, 5)]
+    return Axis(low, high, title, tuple((tick, label(tick)) for tick in ticks if low <= tick <= high), log=True)
+
+
+def _time(duration_s: float) -> str:
+    return f"{duration_s:.3g} s" if duration_s >= 0.0999 else f"{duration_s * 1e3:.3g} ms"
+
+
+def value_axis(values: Iterable[float], title: str, room: float = 0.06) -> Axis:
+    """Return a linear axis, wider than its values by the share `room` at each end, with at most nine round ticks."""
+    every = list(values)
+    span = max(max(every) - min(every), 1e-6)
+    low, high = min(every) - room * span, max(every) + room * span
+    step = next(s for k in range(-9, 9) for s in (10.0**k, 2 * 10.0**k, 5 * 10.0**k) if (high - low) / s <= 8)
+    first = ceil(low / step)
+    ticks = [(k * step, f"{k * step:.6g}") for k in range(first, floor(high / step) + 1)]
+    return Axis(low, high, title, tuple(ticks))
+
+
+def svg(plot: Plot) -> str:
+    """Return the plot as a complete SVG document."""
+    wide, tall = plot.width, plot.height
+    inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot), *_labels(plot)]
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
+            'role="img" aria-labelledby="plot-title plot-desc">',
+            f'<title id="plot-title">{escape(plot.title)}</title>',
+            f'<desc id="plot-desc">{escape(plot.description)}</desc>',
+            f"<style>{STYLE}</style>",
+            f'<rect class="ground" width="{wide}" height="{tall}"/>',
+            text(LEFT, 32, plot.title, "title"),
+            text(LEFT, 54, plot.subtitle, "quiet small"),
+            *inner,
+            "</svg>\n",
+        ]
+    )
+
+
+def _x(plot: Plot, value: float) -> float:
+    return LEFT + plot.x.at(value) * (plot.width - LEFT - RIGHT)
+
+
+def _y(plot: Plot, value: float) -> float:
+    return plot.height - BOTTOM - plot.y.at(value) * (plot.height - TOP - BOTTOM)
+
+
+def text(x: float, y: float, words: str, kind: str = "", anchor: str = "start") -> str:
+    """Return an SVG text element; `anchor` (start, middle or end) is the part of the text at (x, y)."""
+    return f'<text x="{x:.1f}" y="{y:.1f}" class="{kind}" text-anchor="{anchor}">{escape(words)}</text>'
+
+
+def line(x1: float, y1: float, x2: float, y2: float, kind: str) -> str:
+    """Return an SVG line from (x1, y1) to (x2, y2) in px; `kind` is its CSS class."""
+    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{kind}"/>'
+
+
+def _upright(x: float, y: float, words: str) -> str:
+    return f'<text transform="translate({x:.1f} {y:.1f}) rotate(-90)" text-anchor="middle">{escape(words)}</text>'
+
+
+def _frame(plot: Plot) -> list[str]:
+    low, high = plot.height - BOTTOM, plot.width - RIGHT
+    out = []
+    for value, words in plot.x.ticks:
+        at = _x(plot, value)
+        out += [line(at, TOP, at, low, "grid"), text(at, low + 19, words, "small", "middle")]
+    for value, words in plot.y.ticks:
+        at = _y(plot, value)
+        out += [line(LEFT, at, high, at, "grid"), text(LEFT - 8, at + 4, words, "small", "end")]
+    for value, words in plot.right:
+        at = _y(plot, value)
+        if TOP <= at <= low:
+            out += [line(high, at, high + 5, at, "frame"), text(high + 8, at + 4, words, "small")]
+    middle = (TOP + low) / 2
+    out.append(f'<rect class="frame" x="{LEFT}" y="{TOP}" width="{high - LEFT}" height="{low - TOP}"/>')
+    out.append(text((LEFT + high) / 2, plot.height - 16, plot.x.title, "", "middle"))
+    out.append(_upright(24, middle, plot.y.title))
+    if plot.right_title:
+        out.append(_upright(plot.width - 14, middle, plot.right_title))
+    return out
+
+
+def _edge(plot: Plot) -> list[str]:
+    """Return the Pareto front as a step line: constant up to the next point, then up, then constant to the end."""
+    if not plot.edge:
+        return []
+    path = [f"M {_x(plot, plot.edge[0][0]):.1f} {_y(plot, plot.edge[0][1]):.1f}"]
+    path += [f"H {_x(plot, x):.1f} V {_y(plot, y):.1f}" for x, y in plot.edge[1:]]
+    path.append(f"H {plot.width - RIGHT}")
+    return [f'<path class="edge" d="{" ".join(path)}"><title>Pareto edge: the best within each time</title></path>']
+
+
+def _limit(plot: Plot) -> list[str]:
+    if plot.limit is None or not plot.x.low < plot.limit[0] < plot.x.high:
+        return []
+    at = _x(plot, plot.limit[0])
+    return [
+        line(at, TOP, at, plot.height - BOTTOM, "limit"),
+        text(at + 6, plot.height - BOTTOM - 8, plot.limit[1], "small limit-word"),
+    ]
+
+
+def _series(plot: Plot) -> list[str]:
+    out = []
+    for k, series in enumerate(plot.series):
+        out.append(f'<g class="s{k % 5}">')
+        for trail in series.trails:
+            places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
+            if len(places) > 1:
+                kind = "trail" if any(mark.weight for mark in trail) else "trail line"
+                out.append(f'<polyline class="{kind}" points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in places)}"/>')
+            for mark, (x, y) in zip(trail, places, strict=True):
+                if not mark.weight:
+                    continue
+                shape = _shape(k, x, y, 6.5 * mark.weight)
+                out.append(
+                    f"{shape}<title>{escape(mark.tooltip)}</title></path>" if mark.tooltip else f"{shape}</path>"
+                )
+        out.append("</g>")
+    return out
+
+
+def _shape(k: int, x: float, y: float, r: float) -> str:
+    """Return the start tag of a mark of series `k`: circle, square, triangle, diamond or inverted triangle."""
+    if k % 5 == 0:
+        d = f"M {x - r:.1f} {y:.1f} a {r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0 a {r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0 Z"
+        return f'<path class="mark" d="{d}">'
+    corners, turn, grow = ((4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3))[k % 5 - 1]
+    around = [turn + 2 * pi * c / corners for c in range(corners)]
+    places = " L ".join(f"{x + grow * r * cos(a):.1f} {y + grow * r * sin(a):.1f}" for a in around)
+    return f'<path class="mark" d="M {places} Z">'
+
+
+def _ring(plot: Plot) -> list[str]:
+    if plot.ring is None:
+        return []
+    x, y, words = plot.ring
+    ring = f'<circle class="ring" cx="{_x(plot, x):.1f}" cy="{_y(plot, y):.1f}" r="13">'
+    return [f"{ring}<title>{escape(words)}</title></circle>"]
+
+
+def _legend(plot: Plot) -> list[str]:
+    """Return one row above the frame: shape and name of each series, then the Pareto edge and the ring."""
+    out, at = [], float(LEFT + 6)
+    for k, series in enumerate(plot.series):
+        out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', text(at + 13, TOP - 15, series.name)]
+        at += 13 + 7.4 * len(series.name) + 16
+    if plot.edge:
+        out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 31, TOP - 15, "Pareto edge")]
+        at += 31 + 7.4 * 11 + 14
+    if plot.ring is not None:
+        out += [
+            f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',
+            text(at + 24, TOP - 15, plot.ring[2]),
+        ]
+    return out
+
+
+def _labels(plot: Plot) -> list[str]:
+    """Return every label beside its mark where it overlaps no other; one without space is left out."""
+    taken: list[Box] = [
+        (_x(plot, m.x) - 6, _y(plot, m.y) - 6, _x(plot, m.x) + 6, _y(plot, m.y) + 6) for m in _marks(plot)
+    ]
+    if plot.ring is not None:
+        x, y = _x(plot, plot.ring[0]), _y(plot, plot.ring[1])
+        taken.append((x - 13, y - 13, x + 13, y + 13))
+    out = []
+    for k, series in enumerate(plot.series):
+        for mark in (mark for trail in series.trails for mark in trail if mark.label):
+            place = _free_position(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
+            if place is not None:
+                taken.append(place)
+                out.append(f'<g class="s{k % 5}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
+    return out
+
+
+def _marks(plot: Plot) -> list[Mark]:
+    return [mark for series in plot.series for trail in series.trails for mark in trail]
+
+
+def _free_position(x: float, y: float, wide: float, taken: Sequence[Box], plot: Plot) -> Box | None:
+    for near in (0, 6, 12, 20):
+        right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
+        over, under, level = y - 7 - near - LINE_PX, y + 8 + near, y - LINE_PX / 2
+        for a, b in ((middle, over), (middle, under), (right, under), (left, over), (right, over), (left, under),
+                     (right, level), (left, level)):  # fmt: skip
+            box = (a, b, a + wide, b + LINE_PX)
+            fits = (
+                a > LEFT + 2 and a + wide < plot.width - RIGHT - 2 and b > TOP + 2 and box[3] < plot.height - BOTTOM - 2
+            )
+            if fits and not any(box[0] < t[2] and t[0] < box[2] and box[1] < t[3] and t[1] < box[3] for t in taken):
+                return box
+    return None

@@ -1,0 +1,293 @@
+"""Python interface for researchers: reconstruct, forward model, simulate and frontier, on arrays or files.
+
+`diffuscope` (services/package.py) exports it. Each function runs the same code as the command of its name. Images are
+(rows, cols), colour images (rows, cols, 3); the centre of a PSF is at (rows//2, cols//2).
+"""
+
+import difflib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.config.head_file import load_head
+from device.config.image_files import as_psf, read_psf
+from device.errors import FrameError, SettingError
+from device.recon.estimation.parameter_selection import FrequencySample
+from device.recon.installed_methods import available_methods
+from device.recon.methods import Method
+from device.recon.model.fft_plans import Planner
+from device.recon.model.forward_model import Model, taper
+from device.recon.model.grid import Grid, support_radius_px
+from device.sim import scene_files
+from device.sim.plan import Decision, decide, format_plan
+from device.sim.render import crop_or_pad
+from device.sim.simulated_calibration import simulated_calibration
+from device.sim.world import World
+from device.values import Image, Mask, SimulatedCounts
+from services import resources
+from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case
+from services.lab.frontier_result import Frontier
+from services.lab.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
+from services.lab.reconstruct_inputs import ReconstructOptions, Source
+
+ImageSource = str | Path | NDArray[Any]
+
+
+class ReconstructionOptions(TypedDict, total=False):
+    """Keywords of `reconstruct` and `Reconstructor`; an option that is left out is chosen from PSF and frame.
+
+    `dark`: dark frame of the same exposure. `flat`: frame of even light. `head`: head file, for the geometry of the
+    light path and the sensor. `field_deg`: diameter of the illuminated disc in degrees, with `head`. `method`: name of
+    `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels per sample. `rounds`: largest number of rounds of an iterative
+    method. `settings`: parameters of the method, such as {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the
+    raw is a mosaic of this pattern, "rggb", "bggr", "grbg" or "gbrg".
+    """
+
+    dark: ImageSource
+    flat: ImageSource
+    head: str | Path
+    field_deg: float
+    method: str
+    bin: int
+    rounds: int
+    settings: Mapping[str, float]
+    budget_s: float
+    bayer: str
+
+
+def reconstruct(
+    raw: ImageSource, psf: ImageSource | Sequence[ImageSource], **options: Unpack[ReconstructionOptions]
+) -> FileReconstruction:
+    """Return the picture of one raw frame, with its report.
+
+    `raw`: counts, (rows, cols) or (rows, cols, 3), an array or a file (tiff, png, npy, npz, dng). `psf`: image of one
+    bright point, (rows, cols) as `raw`; several are a stack, of which the most likely one is used. `options`:
+    `ReconstructionOptions`. `picture` of the result is float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`;
+    `report` is typed; `simulated` is True if `raw` came from `simulate`. FrameError, PsfError or SettingError with a
+    remedy for input that cannot be used. Source: paper, section "Algorithm"; NUMERICS.md.
+    """
+    return Reconstructor(psf, **options)(raw)
+
+
+class Reconstructor:
+    """Reconstruction of many frames with one PSF: what does not depend on the frame is computed once.
+
+    `psf` and `options` as in `reconstruct`. Plans are made for the first frame of a shape (rows, cols) and kept. Use it
+    from one thread at a time. SettingError for options that are out of range or contradict each other.
+    """
+
+    def __init__(self, psf: ImageSource | Sequence[ImageSource], **options: Unpack[ReconstructionOptions]) -> None:
+        self._reconstruct = FileReconstructor(_options(psf, options))
+
+    def __call__(self, raw: ImageSource) -> FileReconstruction:
+        """Return the picture of one raw frame (rows, cols) or (rows, cols, 3), as `reconstruct` does."""
+        return self._reconstruct(_source(raw))
+
+
+class ForwardModel:
+    """Forward model y = crop(h * x) of a PSF h: the frame y of an object x, the adjoint, and the noise of a frame.
+
+    An object is float32 of `object_shape`, a frame float32 of `frame_shape`, both (rows, cols) in samples of bin x bin
+    pixels and linear DN. The object is larger than the frame, because light from outside of it reaches the sensor.
+    `shape`: (rows, cols) of the sensor in pixels, by default that of `psf`. `field_radius_px`: radius of the lit disc,
+    outside of which the object is 0; None: not known. PsfError for an invalid PSF, SettingError for an invalid `bin` or
+    radius. Source: paper, equation (1); NUMERICS.md 1.
+    """
+
+    def __init__(
+        self, psf: ImageSource, shape: tuple[int, int] | None = None, *, bin: int = 1,
+        field_radius_px: float | None = None,
+    ) -> None:  # fmt: skip
+        source = _source(psf)
+        kernel = read_psf(source) if isinstance(source, Path) else as_psf(source, "the PSF")
+        sensor = shape or kernel.shape
+        if not 1 <= bin <= min(sensor):
+            raise SettingError(f"a bin of {bin} does not fit {sensor[0]} x {sensor[1]} pixels", "Give a bin from 1.")
+        if field_radius_px is not None and not field_radius_px > 0:
+            raise SettingError(f"a field of radius {field_radius_px:g} px is empty", "Give a radius above 0, or None.")
+        radius_px = float("inf") if field_radius_px is None else field_radius_px
+        grid = Grid.tight(sensor, bin, radius_px, support_radius_px(kernel))
+        self._model = Model(kernel, grid, Planner(resources.fft_plans()))
+        self._sample = FrequencySample.of(self._model)
+
+    @property
+    def object_shape(self) -> tuple[int, int]:
+        """(rows, cols) of an object, in samples."""
+        return self._model.grid.shape
+
+    @property
+    def frame_shape(self) -> tuple[int, int]:
+        """(rows, cols) of a frame, in samples."""
+        return self._model.grid.window
+
+    def forward(self, x: Image) -> Image:
+        """Return the frame of an object of `object_shape`: float32 of `frame_shape`; FrameError for another shape."""
+        _require(x, self.object_shape, "the object")
+        return self.crop(self._model.blur(x * self._model.mask))
+
+    def adjoint(self, y: Image) -> Image:
+        """Return the adjoint of `forward` for a frame of `frame_shape`: float32 of `object_shape`.
+
+        <forward(x), y> = <x, adjoint(y)> for every x and y. FrameError for another shape.
+        """
+        adjoint: Image = self._model.blur_adjoint(self.embed(y)) * self._model.mask
+        return adjoint
+
+    def embed(self, y: Image) -> Image:
+        """Return an object of `object_shape` that is `y` (of `frame_shape`) in front of the sensor, and 0 elsewhere."""
+        _require(y, self.frame_shape, "the frame")
+        x: Image = np.zeros(self.object_shape, np.float32)
+        x[self._model.grid.slices] = y
+        return x
+
+    def crop(self, x: Image) -> Image:
+        """Return the part of an object of `object_shape` in front of the sensor: float32 of `frame_shape`."""
+        _require(x, self.object_shape, "the object")
+        return np.ascontiguousarray(x[self._model.grid.slices], np.float32)
+
+    def noise_dn(self, y: Image) -> float:
+        """Return the standard deviation of the noise of a frame of `frame_shape`, in DN per sample.
+
+        It is measured at the quarter of the frequencies that the PSF transmits least (NUMERICS.md 2.1); the mean of a
+        frame whose noise is shot noise. FrameError for another shape.
+        """
+        _require(y, self.frame_shape, "the frame")
+        window, fft = taper(self.frame_shape), self._model.fft
+        fft.space[:] = 0
+        fft.space[self._model.grid.slices] = (y - np.float32(y.mean(dtype=np.float64))) * window
+        size = self._model.grid.size
+        variance = self._sample.noise_variance(self._sample.energies(fft.forward()), size) * size
+        return float(np.sqrt(variance / float(np.vdot(window, window))))
+
+
+@dataclass(frozen=True)
+class SimulatedScene:
+    """One simulated exposure with its ground truth, all (rows, cols) of the sensor.
+
+    `raw`: counts, uint16, of a type that marks pictures made of it as simulated. `truth`: reflectance of the object,
+    float32. `psf`: noise-free PSF of the present eye, float32. `vessels`: mask of the vessels, None if not known.
+    `plan`: decision on every effect, by its name. `write` keeps all of it in files.
+    """
+
+    name: str
+    raw: SimulatedCounts
+    truth: Image
+    psf: Image
+    vessels: Mask | None
+    plan: Mapping[str, Decision]
+    world: World = field(repr=False)
+
+    def explain(self) -> str:
+        """Return the plan as a text table: each effect, simulated or not, and the figure that decided."""
+        return format_plan(tuple(self.plan.values()))
+
+    def write(self, folder: str | Path) -> None:
+        """Write raw.tiff, truth.npy, psf.tiff, vessels.png and plan.json into a folder; StoreError on failure."""
+        scene_files.write(self.world, np.asarray(self.raw), Path(folder))
+
+
+def simulate(
+    scene: str | Path, *, everything: bool = False, only: Sequence[str] = (), without: Sequence[str] = ()
+) -> SimulatedScene:
+    """Return one simulated exposure of a scene, with its ground truth.
+
+    `scene`: a scene file, or the name of one of device/sim/scenes/, such as "healthy". Only the effects that could be
+    seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. SettingError for an
+    unknown scene or effect, SpecError for an invalid scene file.
+    """
+    spec = load_head(_scene_file(scene))
+    world, counts = scene_files.expose(
+        spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without))
+    )
+    colour = spec.light.colour
+    mask = world.retina.vessels
+    return SimulatedScene(
+        name=spec.name, raw=counts.view(SimulatedCounts), truth=world.truth(colour),
+        psf=crop_or_pad(world.psf(colour), world.shape),
+        vessels=None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5,
+        plan={one.name: one for one in world.plan}, world=world,
+    )  # fmt: skip
+
+
+def frontier(
+    raw: ImageSource | None = None, psf: ImageSource | None = None, truth: ImageSource | None = None, *,
+    scene: str | Path | SimulatedScene | None = None, head: str | Path | None = None, field_deg: float | None = None,
+    budget_s: float = 0.26, repeats: int = 7, progress: Callable[[str], None] = lambda _: None,
+) -> Frontier:  # fmt: skip
+    """Return accuracy against time of every method, bin and number of rounds, on this machine.
+
+    Either `raw`, `psf` and `truth`, (rows, cols) of one grid (a shift and the intensity are fitted), or `scene`:
+    a scene file, the name of one, or the result of `simulate`. `head` and `field_deg` as in `reconstruct`. `budget_s`:
+    time in seconds within which the instrument chooses. `repeats`: timed runs of each point; their median counts.
+    `progress` is called with one line per step. SettingError if both or neither are given; FrameError for a truth of
+    another shape.
+    """
+    if repeats < 1 or not budget_s > 0:
+        raise SettingError("a time is measured at least once, within a budget above 0", "Give repeats and budget_s.")
+    recorded = [part for part in (raw, psf, truth) if part is not None]
+    if (scene is None) == (not recorded) or len(recorded) in (1, 2):
+        raise SettingError("a frontier needs a frame with its truth", "Give scene=, or raw, psf and truth together.")
+    if scene is not None:
+        case = _scene_case(scene)
+    else:
+        assert raw is not None
+        assert psf is not None
+        assert truth is not None
+        place = None if head is None else Path(head)
+        case = recorded_case(_source(raw), _source(psf), _source(truth), place, field_deg, resources.fft_plans())
+    return measure_frontier(case, resources.fft_plans(), budget_s, repeats, progress, available_methods())
+
+
+def methods() -> dict[str, Method]:
+    """Return the built-in and the installed methods by name, each with a sentence, its cost in FFT pairs and settings.
+
+    SettingError names the package of a plug-in that cannot be loaded.
+    """
+    return available_methods()
+
+
+def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOptions) -> ReconstructOptions:
+    head, dark, flat = given.get("head"), given.get("dark"), given.get("flat")
+    psfs = psf if isinstance(psf, list | tuple) else (psf,)
+    return ReconstructOptions(
+        raw=Path(), psfs=tuple(_source(one) for one in psfs), output=None, method=given.get("method"),
+        budget_s=given.get("budget_s"), dark=None if dark is None else _source(dark),
+        flat=None if flat is None else _source(flat), head=None if head is None else Path(head),
+        field_deg=given.get("field_deg"), even=False, plans=resources.fft_plans(), bin=given.get("bin"),
+        rounds=given.get("rounds"), settings=dict(given.get("settings", {})), bayer=parse_bayer(given.get("bayer")),
+    )  # fmt: skip
+
+
+def _source(image: ImageSource) -> Source:
+    return Path(image) if isinstance(image, str) else image
+
+
+def _scene_file(scene: str | Path) -> Path:
+    """Return the path of a scene file; SettingError for a name that no shipped scene has."""
+    if isinstance(scene, Path) or scene.endswith(".toml"):
+        return Path(scene)
+    place = resources.SCENES / f"{scene}.toml"
+    if not place.is_file():
+        names = sorted(path.stem for path in resources.SCENES.glob("*.toml"))
+        near = difflib.get_close_matches(scene, names, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        remedy = f"Give the path of a scene file, or one of: {', '.join(names)}."
+        raise SettingError(f"there is no scene '{scene}'{hint}", remedy)
+    return place
+
+
+def _scene_case(scene: str | Path | SimulatedScene) -> Case:
+    if not isinstance(scene, SimulatedScene):
+        return scene_case(load_head(_scene_file(scene)))
+    counts, calibration = np.asarray(scene.raw), simulated_calibration(scene.world)
+    return Case(scene.name, counts, scene.truth, scene.vessels, calibration, False)
+
+
+def _require(image: Image, shape: tuple[int, int], what: str) -> None:
+    if image.shape != shape:
+        given = " x ".join(map(str, image.shape))
+        raise FrameError(f"{what} has {given} samples, and {shape[0]} x {shape[1]} are needed", "See `embed`.")

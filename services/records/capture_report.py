@@ -1,0 +1,243 @@
+"""JSON of a capture's report: one reader for the reports of every release, and one writer.
+
+The writer returns every entry that the reader was given: entries that this release does not read, or whose type it does
+not know, are in the `others` of the typed values. Entries that an earlier release did not write have their default.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from device.light_safety.dose_report import DoseReport
+from device.values import EYES, Report
+from services.records.capture import (
+    BUDGET_S,
+    NO_METHOD,
+    CaptureReport,
+    EyeConfirmation,
+    EyeCorrection,
+    LateralityEstimate,
+    PictureVerdict,
+)
+from services.records.json_values import JsonObject, JsonValue
+from services.records.row_validation import one_of, parsed_json, text
+
+Value = TypeVar("Value")
+
+
+# Writer
+
+
+def report_as_json(report: CaptureReport) -> dict[str, JsonValue]:
+    """Return the report as a JSON object, with the keys of `report.json`.
+
+    numpy numbers of the reconstruction stay as they are; the writers of files and rows convert them.
+    """
+    return _known_entries(report) | dict(report.others)
+
+
+def verdict_as_json(verdict: PictureVerdict) -> dict[str, JsonValue]:
+    """Return a verdict as a JSON object."""
+    known: dict[str, JsonValue] = {"word": verdict.word, "code": verdict.code, "numbers": dict(verdict.numbers)}
+    return known | dict(verdict.others)
+
+
+def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
+    made, light = report.reconstruction, report.light
+    entries: dict[str, JsonValue] = {
+        **vars(made), "warnings": list(made.warnings),
+        **vars(light), "dose_high": list(light.dose_high),
+        "visit": report.visit, "slot": report.slot, "test": report.is_test,
+        "verdict": None if report.verdict is None else verdict_as_json(report.verdict),
+        "laterality": None if report.laterality is None else _laterality_as_json(report.laterality),
+        "budget_s": report.budget_s,
+    }  # fmt: skip
+    if report.moved:
+        entries["moved"] = [_correction_as_json(one) for one in report.moved]
+    if report.confirmed is not None:
+        entries["confirmed"] = _confirmation_as_json(report.confirmed)
+    return entries
+
+
+def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
+    disc: JsonValue = None if seen.disc is None else list(seen.disc)
+    return {"eye": seen.eye, "confidence": seen.confidence, "disc": disc} | dict(seen.others)
+
+
+def _correction_as_json(one: EyeCorrection) -> dict[str, JsonValue]:
+    known: dict[str, JsonValue] = {
+        "from_eye": one.from_eye, "from_slot": one.from_slot, "eye": one.eye, "at": one.at, "by": one.by,
+    }  # fmt: skip
+    return known | dict(one.others)
+
+
+def _confirmation_as_json(one: EyeConfirmation) -> dict[str, JsonValue]:
+    known: dict[str, JsonValue] = {"eye": one.eye, "at": one.at, "by": one.by}
+    return known | dict(one.others)
+
+
+# Reader
+
+
+def parse_report(stored: object) -> CaptureReport:
+    """Return the report of a database row; `stored` is its JSON text. Errors as in `read_report`."""
+    return read_report(parsed_json(stored))
+
+
+def read_report(content: object) -> CaptureReport:
+    """Return the report with this JSON content, of any release.
+
+    ValueError or KeyError if the content is no JSON object, or if an entry on which the program acts has a wrong type:
+    durations, budget, refraction, verdict, corrections, dose, visit and slot. A wrong type of another entry gives the
+    default, and the stored entry stays in `others`.
+    """
+    entries = _object(content)
+    verdict, moved, confirmed = entries.get("verdict"), entries.get("moved"), entries.get("confirmed")
+    report = CaptureReport(
+        reconstruction=_reconstruction(entries),
+        light=_dose_report(entries),
+        visit=_checked(entries, "visit", text, None),
+        slot=_checked(entries, "slot", text, None),
+        verdict=None if verdict is None else read_verdict(verdict),
+        laterality=_lenient(entries, "laterality", _laterality, None),
+        budget_s=_checked(entries, "budget_s", _number, BUDGET_S),
+        moved=() if moved is None else _moves(moved),
+        confirmed=_confirmation(confirmed) if isinstance(confirmed, Mapping) else None,
+    )
+    return replace(report, others=_unwritten(entries, _known_entries(report)))
+
+
+def read_verdict(content: object) -> PictureVerdict:
+    """Return the verdict with this JSON content; ValueError if it is no object, or if its `word` is no text."""
+    entries = _object(content)
+    verdict = PictureVerdict(
+        _checked(entries, "word", text, None),
+        _lenient(entries, "code", text, None),
+        _lenient(entries, "numbers", _object, {}),
+    )
+    return replace(verdict, others=_unwritten(entries, verdict_as_json(verdict)))
+
+
+def _reconstruction(entries: JsonObject) -> Report:
+    return Report(
+        method=_lenient(entries, "method", text, NO_METHOD),
+        bin=_lenient(entries, "bin", _whole, 1),
+        rounds=_lenient(entries, "rounds", _whole, 1),
+        stopped=_lenient(entries, "stopped", text, "done"),
+        seconds=_checked(entries, "seconds", _numbers, {}),
+        psf_index=_lenient(entries, "psf_index", _whole, 0),
+        psf_scale=_lenient(entries, "psf_scale", _number, 1.0),
+        refraction_dpt=_checked(entries, "refraction_dpt", _refraction, None),
+        regularisation=_lenient(entries, "regularisation", _copied, {}),
+        noise_dn=_lenient(entries, "noise_dn", _number, None),
+        residual=_lenient(entries, "residual", _number, None),
+        quality=_lenient(entries, "quality", _copied, {}),
+        warnings=_lenient(entries, "warnings", _texts, ()),
+    )
+
+
+def _dose_report(entries: JsonObject) -> DoseReport:
+    return DoseReport(
+        _checked(entries, "dose_j_per_cm2", _number, None),
+        _lenient(entries, "dose_24h_j_per_cm2", _numbers, {}),
+        _lenient(entries, "dose_stop_j_per_cm2", _number, None),
+        _lenient(entries, "dose_high", _texts, ()),
+    )
+
+
+def _laterality(content: object) -> LateralityEstimate:
+    entries = _object(content)
+    seen = LateralityEstimate(
+        _lenient(entries, "eye", lambda eye: one_of(eye, *EYES), None),
+        _lenient(entries, "confidence", _number, 0.0),
+        _lenient(entries, "disc", _position, None),
+    )
+    return replace(seen, others=_unwritten(entries, _laterality_as_json(seen)))
+
+
+def _moves(content: object) -> tuple[EyeCorrection, ...]:
+    if not isinstance(content, list):
+        raise ValueError("moves that are no list")
+    return tuple(_correction(_object(one)) for one in content)
+
+
+def _correction(entries: JsonObject) -> EyeCorrection:
+    from_eye, from_slot = one_of(entries["from_eye"], *EYES), text(entries["from_slot"])
+    eye, at, by = (_lenient(entries, name, text, None) for name in ("eye", "at", "by"))
+    move = EyeCorrection(from_eye, from_slot, eye, at, by)
+    return replace(move, others=_unwritten(entries, _correction_as_json(move)))
+
+
+def _confirmation(entries: JsonObject) -> EyeConfirmation:
+    eye, at, by = (_lenient(entries, name, text, None) for name in ("eye", "at", "by"))
+    confirmed = EyeConfirmation(eye, at, by)
+    return replace(confirmed, others=_unwritten(entries, _confirmation_as_json(confirmed)))
+
+
+def _unwritten(entries: JsonObject, written: JsonObject) -> JsonObject:
+    """Return the stored entries that the writer would lose or change."""
+    return {
+        name: value
+        for name, value in entries.items()
+        if name not in written or type(written[name]) is not type(value) or written[name] != value
+    }
+
+
+def _checked(entries: Mapping[str, object], name: str, read: Callable[[object], Value], default: Value) -> Value:
+    """Return an entry as `read` returns it; the default if it is missing or null; ValueError for a wrong type."""
+    value = entries.get(name)
+    return default if value is None else read(value)
+
+
+def _lenient(entries: Mapping[str, object], name: str, read: Callable[[object], Value], default: Value) -> Value:
+    """Return an entry as `read` returns it; the default if it is missing, null or of a wrong type."""
+    try:
+        return _checked(entries, name, read, default)
+    except ValueError:
+        return default
+
+
+def _object(value: object) -> JsonObject:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{type(value).__name__} where names and values were kept")
+    return value
+
+
+def _copied(value: object) -> dict[str, JsonValue]:
+    return dict(_object(value))
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{type(value).__name__} where a number was kept")
+    return value
+
+
+def _whole(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{type(value).__name__} where a whole number was kept")
+    return value
+
+
+def _numbers(value: object) -> dict[str, float]:
+    """Return the numbers of an object by name; null is no number and omitted, ValueError for another type."""
+    return {name: _number(one) for name, one in _object(value).items() if one is not None}
+
+
+def _refraction(value: object) -> dict[str, float]:
+    """Return the numbers of a refraction by name; ValueError if its `sphere` is neither a number nor null."""
+    entries = _object(value)
+    _checked(entries, "sphere", _number, None)
+    return {name: one for name, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"{type(value).__name__} where a list was kept")
+    return tuple(text(one) for one in value)
+
+
+def _position(value: object) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("a position has a row and a column")
+    return _number(value[0]), _number(value[1])

@@ -1,0 +1,59 @@
+"""Rows of the capture table and their conversion to `Capture`; an unreadable row affects its own capture only."""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import Row, Select, select
+from sqlalchemy.orm import Session
+
+from device.values import EYES
+from services.records import row_validation
+from services.records.capture import Capture
+from services.records.capture_report import parse_report
+from services.records.schema import CAPTURE_ROWID, CaptureRow, FileRow
+
+CAPTURES: Select[*tuple[Any, ...]] = select(
+    CAPTURE_ROWID, CaptureRow.id, CaptureRow.eye, CaptureRow.taken_at, CaptureRow.simulated, CaptureRow.calibration_id,
+    CaptureRow.report,
+)  # fmt: skip
+CaptureColumns = Row[*tuple[Any, ...]]
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # capture id, and name of a file
+
+
+def capture_rows(session: Session, query: Select[*tuple[Any, ...]]) -> Sequence[CaptureColumns]:
+    """Return the rows of a query derived from CAPTURES (with a filter, an order or a limit), without validation."""
+    return session.execute(query).all()
+
+
+def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, object]]]) -> Capture:
+    """Return the capture of a row of CAPTURES; `files` maps each capture id to its (file name, SHA-256) pairs.
+
+    StoreDamaged if the row or a pair cannot be read, or if the capture has no files.
+    """
+    with row_validation.reading_record(row.id):
+        if not NAME.fullmatch(row_validation.text(row.id)) or row.id not in files:
+            raise ValueError("no files belong to it")
+        return Capture(
+            id=row.id,
+            eye=row_validation.one_of(row.eye, *EYES),
+            taken_at=row_validation.timestamp(row.taken_at),
+            simulated=bool(row_validation.one_of(row.simulated, 0, 1)),
+            calibration_id=row_validation.text(row.calibration_id),
+            report=parse_report(row.report),
+            files={row_validation.text(name): row_validation.text(digest) for name, digest in files[row.id]},
+        )
+
+
+def files_of(session: Session, rows: Sequence[CaptureColumns]) -> dict[str, list[tuple[object, object]]]:
+    """Return the (file name, SHA-256) pairs of these captures by capture id, sorted by file name, without validation.
+
+    Captures with an invalid id or without files are absent.
+    """
+    ids = [row.id for row in rows if isinstance(row.id, str) and NAME.fullmatch(row.id)]
+    found: dict[str, list[tuple[object, object]]] = defaultdict(list)
+    query = select(FileRow.capture_id, FileRow.name, FileRow.sha256).where(FileRow.capture_id.in_(ids))
+    for capture, name, digest in session.execute(query.order_by(FileRow.name)):
+        found[capture].append((name, digest))
+    return found

@@ -1,0 +1,267 @@
+"""Capture store: atomic and durable storage of captures, even across a kill, a power cut or a full disk.
+
+    shelf.sqlite                  database: one row per stored capture; also visits and the dose ledger
+    shelf.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
+    captures/<id>/<name>          files of each capture
+    captures/.<id>.part/          capture being written; no row yet
+    torn/<id>/                    quarantine: captures found incomplete at an opening of the store; not listed, and
+                                  kept until their space is needed (quarantine.py)
+    snapshots/                    copies of the tables before each migration (snapshots.py)
+
+Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
+folder that has all files of a capture and no row may have lost its row: the store neither moves nor removes it, and
+`Quarantine.orphans` lists it.
+"""
+
+import hashlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.orm import Session
+
+from device import atomic_io
+from device.clock import Clock, SystemClock
+from device.errors import SettingError, StoreError
+from services.errors import RecordNotFound, StoreDamaged
+from services.records import capture_rows, schema
+from services.records.capture import Capture
+from services.records.capture_target import RowWriter
+from services.records.quarantine import Quarantine
+from services.records.row_validation import REMEDY, without_damaged
+from services.records.schema import CaptureRow
+from services.records.snapshots import Snapshots
+from services.records.storage_errors import is_disk_full, storage_errors
+from services.records.store_space import StoreSpace
+from services.records.write_ahead_log import WriteAheadLog
+
+PAGE_ROWS = 500  # rows per query where all rows are read
+
+
+class CaptureStore:
+    """Store of captures in one folder; opening it migrates the tables and moves incomplete captures to quarantine.
+
+    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening. `quarantine`, `space` and
+    `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a lock
+    file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at
+    opening: StoreError, StoreFull, StoreDamaged.
+    """
+
+    newly_quarantined: tuple[str, ...]
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        reserve_bytes: int = atomic_io.RESERVE_BYTES,
+        free_bytes: Callable[[Path], int] = atomic_io.free_bytes,
+        clock: Clock | None = None,
+    ) -> None:
+        self.folder = folder
+        self._captures, self._lock = folder / "captures", folder / ".lock"
+        database, torn = folder / "shelf.sqlite", folder / "torn"
+        with storage_errors(), ExitStack() as cleanup:
+            atomic_io.make_folder(self._captures)
+            atomic_io.make_folder(torn)
+            snapshots = Snapshots(database, clock or SystemClock(), free_bytes)
+            self.engine = schema.open_engine(database)
+            cleanup.callback(self.engine.dispose)
+            self.write_ahead_log = WriteAheadLog(database, self.engine)
+            self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
+            self.space = StoreSpace(folder, self.engine, self.quarantine, reserve_bytes, free_bytes)
+            with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
+                self._refuse_without_database()
+                schema.migrate(self.engine, snapshots.create)
+                self.newly_quarantined = self.quarantine.move_incomplete()
+                self.write_ahead_log.checkpoint_if_possible()
+            cleanup.pop_all()
+
+    def close(self) -> None:
+        """Checkpoint the write-ahead log, if the disk permits, and close the database connections."""
+        self.write_ahead_log.checkpoint_if_possible()
+        self.engine.dispose()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def save(self, capture: Capture, files: Mapping[str, bytes], write_rows: RowWriter | None = None) -> Capture:
+        """Store a capture and its files (name -> content); return it with their SHA-256 once it is durable.
+
+        `write_rows` adds rows in the same transaction. Quarantined captures are deleted if their space is needed.
+        Errors: StoreFull (everything written is removed); StoreError (the id exists; or a write failed: the next
+        opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name or
+        report, or no files).
+        """
+        _refuse_names(capture.id, files)
+        capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
+        row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
+        length_bytes = sum(map(len, files.values()))
+        part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
+        with storage_errors(), atomic_io.file_lock(self._lock):
+            self._refuse_duplicate(part, kept)
+            self.space.make_room(length_bytes)
+            with _removed_when_full(part, kept):
+                atomic_io.write_folder(part, files)
+                atomic_io.replace_durably(part, kept)
+                with Session(schema.for_writing(self.engine)) as session, session.begin():
+                    session.add(row)
+                    if write_rows is not None:
+                        session.flush()
+                        write_rows(session, capture)
+        self.space.count_capture(length_bytes)
+        return capture
+
+    def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
+        """Return the newest captures, newest first; with `before`, those stored before the capture with that id.
+
+        The order is the order of storage (row number), independent of the clock. Captures whose row cannot be read are
+        omitted. At most `limit` captures. Errors: SettingError (limit below 1), RecordNotFound (`before` is unknown),
+        StoreDamaged (the database or the row of `before` is damaged).
+        """
+        if limit < 1:
+            raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
+        out: list[Capture] = []
+        with self._reading() as session:
+            for page in _pages(session, limit, None if before is None else _row(session, before).kept):
+                out += page.captures
+                if len(out) >= limit:
+                    break
+        return out[:limit]
+
+    def damaged(self) -> int:
+        """Return the number of captures whose row cannot be read.
+
+        Lists omit these captures, and `get` raises StoreDamaged.
+        """
+        with self._reading() as session:
+            return sum(page.damaged for page in _pages(session, PAGE_ROWS))
+
+    def get(self, id: str) -> Capture:
+        """Return the capture with that id; its files are not checked.
+
+        RecordNotFound if unknown, StoreDamaged if its row cannot be read or its folder is missing.
+        """
+        with self._reading() as session:
+            row = _row(session, id)
+            capture = capture_rows.capture_of(row, capture_rows.files_of(session, [row]))
+        if not (self._captures / capture.id).is_dir():
+            raise StoreDamaged(f"the folder of {capture.id} is gone")
+        return capture
+
+    def read(self, id: str, name: str) -> bytes:
+        """Return the content of one file of a capture after a SHA-256 check.
+
+        RecordNotFound for an unknown capture or file, StoreDamaged if the file is unreadable or has changed.
+        """
+        with self._reading() as session:
+            row = _row(session, id)
+            files = dict(capture_rows.files_of(session, [row]).get(row.id, ()))
+        if name not in files:
+            raise RecordNotFound(f"{id} has no file named {name!r}")
+        # The path is built from the row alone: path traversal through `id` or `name` is impossible.
+        try:
+            content: bytes = (self._captures / row.id / name).read_bytes()
+        except OSError as error:
+            raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error
+        if hashlib.sha256(content).hexdigest() != files[name]:
+            raise StoreDamaged(f"{name} of {id} is not what was kept: its SHA-256 differs")
+        return content
+
+    def check_writable(self) -> None:
+        """Write and remove a folder with a small file, as durably as a capture; StoreFull or StoreError on failure."""
+        trial = self.folder / ".trial"
+        with storage_errors(), atomic_io.file_lock(self._lock):
+            shutil.rmtree(trial, ignore_errors=True)  # left by a killed process
+            atomic_io.write_folder(trial, {"trial": b"written and removed"})
+            shutil.rmtree(trial)
+
+    @contextmanager
+    def _reading(self) -> Iterator[Session]:
+        with storage_errors(), Session(self.engine) as session:
+            yield session
+
+    def _refuse_without_database(self) -> None:
+        """Raise StoreDamaged if captures exist, but the database is missing or empty.
+
+        A new database would have no rows for these captures.
+        """
+        database = self.folder / "shelf.sqlite"
+        missing = not database.exists() or database.stat().st_size == 0
+        if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
+            raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
+
+    def _refuse_duplicate(self, *folders: Path) -> None:
+        for folder in folders:
+            if folder.exists():
+                raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+
+
+@dataclass(frozen=True)
+class _Page:
+    """One page of captures, newest first, and the number of its rows that cannot be read."""
+
+    captures: list[Capture]
+    damaged: int
+
+
+def _pages(session: Session, size: int, before: int | None = None) -> Iterator[_Page]:
+    """Yield all captures, last stored first, in pages of `size` rows; only row numbers below `before`, if given."""
+    while True:
+        query = capture_rows.CAPTURES.order_by(schema.CAPTURE_ROWID.desc()).limit(size)
+        rows = capture_rows.capture_rows(
+            session, query if before is None else query.where(before > schema.CAPTURE_ROWID)
+        )
+        if not rows:
+            return
+        files = capture_rows.files_of(session, rows)
+        found = without_damaged(rows, partial(capture_rows.capture_of, files=files))
+        yield _Page(found, len(rows) - len(found))
+        before = rows[-1].kept
+
+
+def _row(session: Session, id: str) -> capture_rows.CaptureColumns:
+    """Return the row of a capture, with the columns of CAPTURES; RecordNotFound if unknown or no valid id.
+
+    StoreDamaged if the id in the row differs from the requested one.
+    """
+    known = capture_rows.NAME.fullmatch(id) is not None
+    rows = capture_rows.capture_rows(session, capture_rows.CAPTURES.where(CaptureRow.id == id)) if known else []
+    if not rows:
+        raise RecordNotFound(f"there is no capture named {id!r}")
+    row = rows[0]
+    if row.id != id:  # the index still holds the id, the row does not
+        raise StoreDamaged(f"the entry of {id!r} has another name", REMEDY)
+    return row
+
+
+def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
+    for name in (id, *files):
+        if not capture_rows.NAME.fullmatch(name):
+            raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
+    if not files:
+        raise SettingError(f"{id} has no files, so there is nothing to keep")
+
+
+@contextmanager
+def _removed_when_full(*folders: Path) -> Iterator[None]:
+    """Remove the given folders if the block fails because the disk is full; a context manager.
+
+    After any other error the folders stay until the next opening, which looks for the row: a commit that failed in its
+    last step may still have reached the disk.
+    """
+    try:
+        yield
+    except (OSError, DBAPIError) as error:
+        if is_disk_full(error):
+            for folder in folders:
+                shutil.rmtree(folder, ignore_errors=True)  # a folder that stays has no row and is quarantined
+        raise

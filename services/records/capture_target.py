@@ -1,0 +1,36 @@
+"""Target of a capture: visit and slot, or a test picture, with the rows that are written together with it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sqlalchemy.orm import Session
+
+from services.records.capture import Capture
+
+RowWriter = Callable[[Session, Capture], None]
+Permit = Callable[[], None]
+
+
+def permit_test_picture() -> None:
+    """Permit light without a visit, for a test picture or for aiming: do nothing."""
+
+
+@dataclass(frozen=True)
+class CaptureTarget:
+    """Target of a capture: visit id, slot id and field of view; without a visit the capture is a test picture.
+
+    `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds
+    rows in the transaction that stores the capture. `permit` is called right before the light and raises ConsentMissing
+    or ConsentDeclined if the visit does not allow light.
+    """
+
+    visit: str | None = None
+    slot: str | None = None
+    tries: int = 0
+    retakes: int = 2
+    field: str | None = None
+    write_rows: RowWriter | None = None
+    permit: Permit = permit_test_picture
+
+
+TEST_PICTURE = CaptureTarget()

@@ -1,0 +1,110 @@
+"""Dose ledger in the database: the dose of each eye persists across restarts, power cuts and clock changes."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import Engine, Integer, delete, literal_column, select
+from sqlalchemy.orm import Session
+
+from device.clock import Clock, boot_id
+from device.errors import LightLimit, StoreError
+from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState, Reserved
+from device.values import EYES, Eye
+from services.records import schema
+from services.records.dose_copy import DoseCopy
+from services.records.schema import DoseRow, ObservedTimeRow
+from services.records.storage_errors import storage_errors
+
+_AS_IT_IS = {"synchronize_session": False}
+REMEDY = "The light stays off while what it gives cannot be written down. Free some space, or call the technician."
+
+
+def add_given_dose(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
+    """Add a dose (J/cm2) to `eye` for a capture that was recorded for the other eye; the limit is not checked.
+
+    The dose is added to the interval of the last observed time of the ledger, which is at or after the exposure.
+    """
+    seen = session.get(ObservedTimeRow, 1)
+    slot = int(seen.observed_s // SLOT_S) if seen is not None else 0
+    row = session.get(DoseRow, (eye, slot))
+    before = row.dose_j_per_cm2 if row is not None else 0.0
+    session.merge(DoseRow(eye=eye, slot=slot, dose_j_per_cm2=before + dose_j_per_cm2))
+
+
+class DoseLedgerStore:
+    """Dose ledger in the database of the capture store; each change is durable when its call returns.
+
+    A dose counts for at least `window_s` (s) of observed time. Opening raises every dose that is lower than in the
+    second copy (dose_copy.py), and adds the time since the last observation if it was in the same boot. Writers are
+    serialised, across processes too. StoreError if the ledger cannot be read or written.
+    """
+
+    def __init__(self, engine: Engine, clock: Clock, window_s: float, boot: str | None = None) -> None:
+        self._engine, self._clock, self._window_s = engine, clock, window_s
+        # With a random id the time between two openings does not count as observed, so doses expire later.
+        self._boot = boot or boot_id()
+        self._copy = DoseCopy(Path(str(engine.url.database)).with_name("light.copy"))
+        with self._writing() as state:
+            self._copy.raise_to_copy(state)
+            state.advance(self._boot, self._clock.now_s(), self._window_s)
+
+    def spent_j_per_cm2(self, eye: Eye) -> float:
+        """Return the dose (J/cm2) of an eye that still counts, including reservations that were never settled."""
+        with storage_errors(), Session(self._engine) as session:
+            return self._state(session).spent(eye)
+
+    def reserve(self, eyes: Sequence[Eye], dose_j_per_cm2: float, stop_j_per_cm2: float) -> Reserved:
+        """Count a dose (J/cm2) for each of the eyes before the exposure; return the reservation for `settle`.
+
+        LightLimit if the dose of an eye would exceed `stop_j_per_cm2`: then no dose is counted. The observed time is
+        stored in both cases.
+        """
+        refused: LightLimit | None = None
+        with self._writing() as state:
+            try:
+                reserved = state.reserve(eyes, dose_j_per_cm2, stop_j_per_cm2, self._window_s, self._clock.wall())
+            except LightLimit as error:
+                refused = error
+        if refused is not None:
+            raise refused
+        return reserved
+
+    def settle(self, reserved: Reserved, given_j_per_cm2: float) -> None:
+        """Replace the dose of a reservation by the dose (J/cm2) that was given, for each of its eyes."""
+        with self._writing() as state:
+            state.settle(reserved, given_j_per_cm2)
+
+    @contextmanager
+    def _writing(self) -> Iterator[DoseLedgerState]:
+        """Yield the current state of the ledger in an exclusive transaction; a context manager.
+
+        Write the state to the database and then to the second copy at the end; after an exception in the block neither.
+        """
+        try:
+            with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
+                state = self._state(session)
+                yield state
+                number = literal_column("light_doses.rowid", Integer)
+                rows = session.execute(select(number, DoseRow.eye, DoseRow.slot)).all()
+                gone = [row for row, eye, slot in rows if (eye, slot) not in state.doses]
+                if gone:
+                    session.execute(delete(DoseRow).where(number.in_(gone)), execution_options=_AS_IT_IS)
+                for (eye, slot), dose_j_per_cm2 in state.doses.items():
+                    session.merge(DoseRow(eye=eye, slot=slot, dose_j_per_cm2=dose_j_per_cm2))
+                session.merge(ObservedTimeRow(id=1, boot=state.boot, now_s=state.now_s, observed_s=state.observed_s))
+            with storage_errors():
+                self._copy.write(state)
+        except StoreError as error:
+            raise type(error)(f"the book of light cannot be written: {error.message}", REMEDY) from error
+
+    def _state(self, session: Session) -> DoseLedgerState:
+        state = DoseLedgerState()
+        for row in session.scalars(select(DoseRow)):
+            eyes = (row.eye,) if row.eye in EYES else EYES  # unreadable eye: count for both
+            state.add(eyes, row.slot, row.dose_j_per_cm2)
+        seen = session.get(ObservedTimeRow, 1)
+        if seen is not None:
+            state.observed_s, state.boot, state.now_s = seen.observed_s, seen.boot, seen.now_s
+        state.advance(self._boot, self._clock.now_s(), self._window_s)
+        return state

@@ -1,0 +1,78 @@
+"""Idempotent requests: each completed request is stored with its key, so that a repeated one has no further effect."""
+
+import hashlib
+from collections.abc import Callable
+from datetime import timedelta
+
+from sqlalchemy import Engine, delete
+from sqlalchemy.orm import Session
+
+from device.clock import Clock
+from device.errors import InputError
+from services.records import schema
+from services.records.schema import IdempotencyKeyRow
+from services.records.storage_errors import storage_errors
+
+KEY_RETENTION = timedelta(days=30)  # retention of idempotency keys, longer than any network's retries
+
+
+class IdempotentRequests:
+    """Idempotency keys of completed requests in the database; thread-safe, writers are serialised."""
+
+    def __init__(self, engine: Engine, clock: Clock) -> None:
+        self._engine, self._clock = engine, clock
+
+    def run_in_transaction(self, key: str, request: str, act: Callable[[Session], str]) -> str:
+        """Run a change and store its idempotency key and answer in one transaction; return the answer.
+
+        For a repeated key return the stored answer; InputError if the key belongs to another request.
+        """
+        with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
+            before = self.find(session, key, request)
+            if before is None:
+                answer = act(session)
+                self.store(session, key, request, answer)
+                return answer
+            return before
+
+    def run_once(self, key: str, request: str, act: Callable[[], str]) -> str:
+        """Run an action such as an export, and store its answer; for a repeated key return the stored answer instead.
+
+        `request`: text of the request; InputError if the key belongs to another request. The action runs before the
+        transaction, because other writers must not wait for it; so two simultaneous calls may both run it.
+        """
+        with storage_errors(), Session(self._engine) as session:
+            before = self.find(session, key, request)
+        if before is not None:
+            return before
+        answer = act()
+        return self.run_in_transaction(key, request, lambda _: answer)
+
+    def find(self, session: Session, key: str, request: str) -> str | None:
+        """Return the stored answer of a request; None for a new key, InputError for a key of another request."""
+        before = session.get(IdempotencyKeyRow, key)
+        if before is None:
+            return None
+        if before.request != _digest(request):
+            raise key_conflict()
+        return before.answer
+
+    def store(self, session: Session, key: str, request: str, answer: str) -> None:
+        """Add the key of a completed request to the transaction."""
+        now = schema.utc_text(self._clock.wall())
+        session.add(IdempotencyKeyRow(key=key, request=_digest(request), answer=answer, done_at=now))
+
+    def delete_expired(self, session: Session) -> None:
+        """Delete the keys that are older than KEY_RETENTION."""
+        oldest = schema.utc_text(self._clock.wall() - KEY_RETENTION)
+        session.execute(delete(IdempotencyKeyRow).where(IdempotencyKeyRow.done_at < oldest))
+
+
+def key_conflict() -> InputError:
+    """Return the error for an idempotency key that was used for another request."""
+    return InputError("key: it belongs to another request", "Reload the page and try again.")
+
+
+def _digest(request: str) -> str:
+    """Return the SHA-256 (hexadecimal) of the text of a request: a repeat can be compared without storing the text."""
+    return hashlib.sha256(request.encode("utf-8", "backslashreplace")).hexdigest()

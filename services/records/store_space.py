@@ -1,0 +1,82 @@
+"""Free space of the store, counted in captures and in visits, and room for a new capture."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sqlalchemy import Engine, distinct, func, select
+from sqlalchemy.orm import Session
+
+from device import atomic_io
+from device.errors import StoreFull
+from services.records.quarantine import Quarantine
+from services.records.schema import CaptureSlotRow, FileRow, VisitRow
+from services.records.storage_errors import storage_errors
+
+RECENT_VISITS = 100  # visits whose mean size predicts the size of the next ones
+DEFAULT_CAPTURE_BYTES = 10_000_000  # size of the first capture: 4 megapixels of raw, compressed, and a picture
+
+
+class StoreSpace:
+    """Free space of the store in `folder`; `reserve_bytes` stay free, and quarantined captures count as free space.
+
+    `free_bytes` returns the free space of a folder's file system.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        engine: Engine,
+        quarantine: Quarantine,
+        reserve_bytes: int,
+        free_bytes: Callable[[Path], int],
+    ) -> None:
+        self._folder, self._engine, self._quarantine = folder, engine, quarantine
+        self._reserve_bytes, self._free_bytes = reserve_bytes, free_bytes
+        self._sizes: tuple[int, int] | None = None  # bytes and captures; cached, because each status request needs them
+
+    def captures_left(self) -> int:
+        """Return the number of further captures that fit on the disk, from the mean size of the stored captures."""
+        if self._sizes is None:
+            every = select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(FileRow.capture_id)))
+            with storage_errors(), Session(self._engine) as session:
+                total_bytes, number = session.execute(every).one()
+            self._sizes = total_bytes, number
+        total_bytes, number = self._sizes
+        mean_bytes = max(1, total_bytes // number) if number else DEFAULT_CAPTURE_BYTES
+        return self._usable_bytes() // mean_bytes
+
+    def visits_left(self, pictures: int) -> int:
+        """Return the number of further visits that fit on the disk, from the mean size of the last 100 finished visits.
+
+        Without captures in them: `captures_left` divided by `pictures`, the number of captures per visit.
+        """
+        lately = select(VisitRow.id).where(VisitRow.finished_at.is_not(None)).order_by(VisitRow.begun_at.desc())
+        sizes = (
+            select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(CaptureSlotRow.visit)))
+            .join(CaptureSlotRow, CaptureSlotRow.capture == FileRow.capture_id)
+            .where(CaptureSlotRow.visit.in_(lately.limit(RECENT_VISITS)))
+        )
+        with storage_errors(), Session(self._engine) as session:
+            total_bytes, number = session.execute(sizes).one()
+        return self._usable_bytes() * number // total_bytes if total_bytes else self.captures_left() // pictures
+
+    def count_capture(self, length_bytes: int) -> None:
+        """Count one more stored capture of that length."""
+        if self._sizes is not None:
+            self._sizes = self._sizes[0] + length_bytes, self._sizes[1] + 1
+
+    def make_room(self, need_bytes: int) -> None:
+        """Delete quarantined captures, oldest first, until `need_bytes` and the reserve fit.
+
+        StoreFull if they still do not.
+        """
+        quarantined = iter(self._quarantine.sizes_bytes())
+        while not atomic_io.has_room(need_bytes, free := self._free_bytes(self._folder), self._reserve_bytes):
+            if (name := next(quarantined, None)) is None:
+                required = f"{need_bytes} and a reserve of {self._reserve_bytes} are needed"
+                raise StoreFull(f"{free} bytes are free; {required}")
+            self._quarantine.delete(name)
+
+    def _usable_bytes(self) -> int:
+        free_bytes = self._free_bytes(self._folder) + sum(self._quarantine.sizes_bytes().values())
+        return max(0, free_bytes - self._reserve_bytes)

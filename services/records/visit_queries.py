@@ -1,0 +1,205 @@
+"""Queries on visits; a list of visits needs a fixed number of SQL statements.
+
+An unreadable row affects only its own visit: lists omit the visit, `damaged` counts it, and `read_visit` raises
+StoreDamaged.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from datetime import date
+from typing import get_args
+
+from sqlalchemy import Integer, case, func, literal_column, select
+from sqlalchemy.orm import Session
+
+from services.errors import RecordNotFound, StoreDamaged
+from services.records import row_validation
+from services.records.capture_report import read_verdict
+from services.records.protocol import Protocol
+from services.records.row_validation import REMEDY, reading_record, without_damaged
+from services.records.schema import (
+    CAPTURE_ROWID,
+    AnswerRow,
+    CaptureRow,
+    CaptureSlotRow,
+    IdentifierRow,
+    SlotDecisionRow,
+    VisitRow,
+)
+from services.records.visit import Outcome, OutcomeCode, SlotCapture, SlotDecision, SlotState, Visit
+
+PAGE_ROWS = 500  # visits per query where all visits are read
+_ID = re.compile(r"[0-9A-Za-z-]{1,60}", re.ASCII)
+SlotKey = tuple[str, str]
+
+
+def visit_row(session: Session, id: str) -> VisitRow:
+    """Return the row of a visit; RecordNotFound if unknown, StoreDamaged if its id differs from the requested one."""
+    found = session.get(VisitRow, id) if _ID.fullmatch(id) else None
+    if found is None:
+        raise RecordNotFound("this visit is not kept here", "Choose the person from the list.")
+    if found.id != id:  # the index still holds the id, the row does not
+        raise StoreDamaged(f"the entry of the visit {id!r} has another name", REMEDY)
+    return found
+
+
+def consent(session: Session, id: str) -> tuple[str, str | None]:
+    """Return the patient's number and the recorded answer of a visit to the consent question (None: no answer).
+
+    RecordNotFound if the visit is unknown, StoreDamaged if the answer cannot be read.
+    """
+    person = visit_row(session, id).person
+    answer = session.get(AnswerRow, (id, "consent"))
+    with reading_record(id):
+        value = None if answer is None else row_validation.parsed_json(answer.value)
+        return person, None if value is None else row_validation.text(value)
+
+
+def find_rows(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
+    """Return the newest `limit` visit rows, newest first, that match all given filters; a row without an id is omitted.
+
+    `day`: date of the visit; `open`: True for unfinished, False for finished; `digits`: part of the patient's number.
+    """
+    query = select(VisitRow).order_by(VisitRow.begun_at.desc(), VisitRow.id.desc()).limit(limit)
+    if day is not None:
+        query = query.where(VisitRow.day == day)
+    if open is not None:
+        query = query.where(VisitRow.finished_at.is_(None) if open else VisitRow.finished_at.is_not(None))
+    if digits:
+        query = query.where(func.instr(VisitRow.person, digits.upper()) > 0)
+    return [row for row in session.scalars(query) if row is not None]
+
+
+def counts(session: Session, day: str | None) -> dict[str, int]:
+    """Return the numbers of finished (`done`), unfinished (`to_finish`) and `referred` visits of a day (None: all)."""
+    code = row_validation.json_extract_or_null(VisitRow.outcome, "$.code")
+    query = select(
+        func.count(VisitRow.finished_at), func.count(), func.count(case((code.like("refer%"), 1)))
+    ).select_from(VisitRow)
+    done, every, referred = session.execute(query if day is None else query.where(VisitRow.day == day)).one()
+    return {"done": done, "to_finish": every - done, "referred": referred}
+
+
+def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) -> list[Visit]:
+    """Return the visits of these rows, in the same order, without those that cannot be read."""
+    known = without_damaged(rows, _checked_row)
+    ids, fields = [row.id for row in known], _fields(session, known)
+    taken, decided = _taken(session, ids), _decided(session, ids)
+
+    def visit(row: VisitRow) -> Visit:
+        with reading_record(row.id):
+            slots = {
+                slot.id: SlotState(
+                    tuple(_taken_capture(*one) for one in taken[row.id, slot.id]), _choice(decided, row, slot.id)
+                )
+                for slot in protocol.slots
+            }
+            finished_at = None if row.finished_at is None else row_validation.timestamp(row.finished_at)
+            answers = {
+                row_validation.text(name): row_validation.form_value(row_validation.parsed_json(value))
+                for name, value in fields[row.id].items()
+            }
+            return Visit(
+                row.id, row.person, _day(row.day), row_validation.timestamp(row.begun_at), answers, slots, finished_at,
+                None if row.outcome is None else _outcome(row.outcome),
+            )  # fmt: skip
+
+    return without_damaged(known, visit)
+
+
+def read_visit(session: Session, protocol: Protocol, row: VisitRow) -> Visit:
+    """Return the visit of this row; StoreDamaged if it cannot be read."""
+    found = read_visits(session, protocol, [row])
+    if not found:
+        raise StoreDamaged(f"an entry of the visit {row.id!a} cannot be read", REMEDY)
+    return found[0]
+
+
+def damaged(session: Session, protocol: Protocol) -> int:
+    """Return the number of visits that cannot be read."""
+    many, last = 0, 0
+    number = literal_column("visits.rowid", Integer)
+    while True:
+        query = select(number, VisitRow).where(number > last).order_by(number).limit(PAGE_ROWS)
+        rows = session.execute(query).all()
+        if not rows:
+            return many
+        many += len(rows) - len(read_visits(session, protocol, [row for _, row in rows if row is not None]))
+        last = rows[-1][0]
+
+
+def _checked_row(row: VisitRow) -> VisitRow:
+    """Return the row unchanged; StoreDamaged if its id or its patient number is not valid text."""
+    with reading_record(row.id):
+        if not _ID.fullmatch(row_validation.text(row.id)):
+            raise ValueError("no name of a visit")
+        row_validation.text(row.person)
+    return row
+
+
+def _day(value: object) -> str:
+    return date.fromisoformat(row_validation.text(value)).isoformat()
+
+
+def _outcome(value: object) -> Outcome:
+    stored = row_validation.parsed_json(value)
+    if not isinstance(stored, dict):
+        raise ValueError("an outcome that is no object")
+    code: OutcomeCode = row_validation.one_of(stored["code"], *get_args(OutcomeCode))
+    return Outcome(code, row_validation.text(stored["sentence"]))
+
+
+def _fields(session: Session, rows: Sequence[VisitRow]) -> dict[str, dict[str, str]]:
+    """Return the answers and identifying fields of each visit, as JSON texts, by visit id and field name."""
+    out: dict[str, dict[str, str]] = {row.id: {} for row in rows}
+    for field in session.scalars(select(AnswerRow).where(AnswerRow.visit.in_(out))):
+        if field.visit in out:  # a damaged row may differ from the index
+            out[field.visit][field.name] = field.value
+    known: dict[str, dict[str, str]] = defaultdict(dict)
+    for one in session.scalars(select(IdentifierRow).where(IdentifierRow.person.in_({row.person for row in rows}))):
+        known[one.person][one.name] = one.value
+    return {row.id: out[row.id] | known[row.person] for row in rows}
+
+
+def _taken(session: Session, ids: Sequence[str]) -> dict[SlotKey, list[tuple[object, object]]]:
+    """Return (capture id, verdict as JSON text or None) of each capture by (visit, slot), oldest first."""
+    query = (
+        select(
+            CaptureSlotRow.visit,
+            func.coalesce(CaptureRow.slot, CaptureSlotRow.slot),  # a capture with a damaged row keeps its slot
+            CaptureSlotRow.capture,
+            CaptureRow.verdict,
+        )
+        .outerjoin(
+            CaptureRow, CaptureRow.id == CaptureSlotRow.capture
+        )  # a capture without its row still counts as taken
+        .where(CaptureSlotRow.visit.in_(ids))
+        .order_by(CAPTURE_ROWID)
+    )
+    out: dict[SlotKey, list[tuple[object, object]]] = defaultdict(list)
+    for visit, slot, capture, verdict_json in session.execute(query):
+        out[visit, slot].append((capture, verdict_json))
+    return out
+
+
+def _taken_capture(capture: object, verdict_json: object) -> SlotCapture:
+    """Return a capture of a slot; its verdict is None if it is missing or unreadable; ValueError for an invalid id."""
+    try:
+        verdict = None if verdict_json is None else read_verdict(row_validation.parsed_json(verdict_json))
+    except (ValueError, TypeError, KeyError):
+        verdict = None
+    return SlotCapture(row_validation.text(capture), verdict)
+
+
+def _decided(session: Session, ids: Sequence[str]) -> dict[SlotKey, SlotDecisionRow]:
+    query = select(SlotDecisionRow).where(SlotDecisionRow.visit.in_(ids))
+    return {(row.visit, row.slot): row for row in session.scalars(query)}
+
+
+def _choice(decided: dict[SlotKey, SlotDecisionRow], visit: VisitRow, slot: str) -> SlotDecision | None:
+    row = decided.get((visit.id, slot))
+    if row is None:
+        return None
+    capture, reason = (None if value is None else row_validation.text(value) for value in (row.capture, row.reason))
+    return SlotDecision(capture, reason)

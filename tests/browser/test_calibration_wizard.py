@@ -1,0 +1,218 @@
+"""Calibration of the simulated head on the real server: injected faults, power cuts, wrong PINs."""
+
+import re
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from device.calibration.archive import Archive
+from tests.browser.axe import axe_faults
+from tests.browser.conftest import SMALL_PLANS, Complaints, Server, copy_small_plans
+from tests.browser.looks import SIZES, look_for_faults
+from tests.simulated import small_head_toml
+
+pytestmark = pytest.mark.browser
+
+PIN = "2580"
+TABLES = """\
+[calibration]
+archive = "archive"
+
+[sim]
+object = { kind = "point" }
+sensor = { prnu = 0.01, dsnu_e = 2.0, hot_pixels = 0.0003 }
+"""
+HEAD = small_head_toml("Head on the bench", TABLES, exposure_s=0.005)
+SHAPES = [SIZES["tablet"], SIZES["portrait"], SIZES["phone"]]
+# Network errors while the server is killed.
+CUT = (
+    "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET", "ERR_INCOMPLETE_CHUNKED", "ERR_EMPTY_RESPONSE", "ERR_SOCKET",
+    "ERR_CONTENT_LENGTH_MISMATCH",
+)  # fmt: skip
+WORDS = {"cap": "The cap is on", "screen": "The screen is there", "point": "The point is there"}
+Open = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def uncalibrated_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A real server for a head that was never calibrated."""
+    folder = tmp_path_factory.mktemp("workshop")
+    (folder / "head.toml").write_text(HEAD)
+    server = Server(folder / "data", str(folder / "head.toml"))
+    copy_small_plans(server.data)
+    server.start()
+    server.wait_until_ready()
+    yield server
+    server.close()
+    if (server.data / "plans").is_dir():
+        shutil.copytree(server.data / "plans", SMALL_PLANS, dirs_exist_ok=True)
+
+
+def archive_of(server: Server) -> Archive:
+    return Archive(server.data.parent / "archive")
+
+
+def log_in(page: Page) -> None:
+    """Enter the PIN, also the first one."""
+    page.wait_for_selector("[data-view=door]")
+    for digit in PIN:
+        page.get_by_role("button", name=digit, exact=True).tap()
+    page.locator("#enter").tap()
+    expect(page.locator(".place")).not_to_have_attribute("data-view", re.compile("door|opening"), timeout=30_000)
+
+
+def start(page: Page) -> None:
+    page.wait_for_selector("[data-view=overview], [data-view=done]")
+    if page.locator("#overview").count():  # result of a calibration that this browser has not dismissed
+        page.locator("#overview").tap()
+    page.locator("#by").fill("Ada Lovelace")
+    expect(page.locator("#start")).to_have_attribute("aria-disabled", "false", timeout=60_000)
+    page.wait_for_timeout(700)  # debounce of the page
+    page.locator("#start").tap()
+
+
+def wait_for_step(page: Page, stand: str) -> None:
+    page.wait_for_selector(f"[data-state=asking] li[data-stand={stand}][data-state=now]", timeout=30_000)
+    expect(page.locator("#go")).to_contain_text(WORDS[stand])
+
+
+def measure(page: Page) -> None:
+    page.wait_for_timeout(700)
+    page.locator("#go").tap()
+
+
+def select_fault(page: Page, mishap: str) -> None:
+    if not page.locator("#mishap").is_visible():
+        page.locator(".practise summary").tap()
+    page.locator("#mishap").select_option(mishap)
+
+
+def faults_in_all_shapes(page: Page, *in_view: str) -> list[str]:
+    found = []
+    for width, height in SHAPES:
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(100)
+        found += [f"{width}: {fault}" for fault in look_for_faults(page, *in_view)]
+    page.set_viewport_size(dict(zip(("width", "height"), SIZES["tablet"], strict=True)))  # type: ignore[arg-type]
+    return found + axe_faults(page)
+
+
+def test_calibration_with_every_fault(uncalibrated_server: Server, open_page: Open, complaints: Complaints) -> None:
+    complaints.expect("423", "403", "422")
+    screener = open_page(uncalibrated_server.url)
+    expect(screener.locator(".state-bar")).to_have_attribute("data-code", "cal.missing")
+    screener.context.close()
+
+    page = open_page(f"{uncalibrated_server.url}/technician")
+    page.wait_for_selector("[data-view=door]")
+    assert faults_in_all_shapes(page, "#enter") == []
+    page.locator("#pin").fill("12")
+    page.locator("#enter").tap()
+    expect(page.locator(".alert")).to_have_attribute("data-code", "pin.short")
+    expect(page.locator("#pin")).to_have_value("12")  # the digits are kept
+    page.locator("#pin").fill("")
+    log_in(page)
+    expect(page.locator(".alert")).to_have_attribute("data-code", "calibration.missing")
+    assert faults_in_all_shapes(page) == []
+    start(page)
+
+    mishaps = {
+        "cap": {"lamp on": "lamp was on in frame", "cap off": "dark frames are bright"},
+        "screen": {"cap on": "it is dark", "finger": "differs by", "other mode": "(135, 240)"},
+        "point": {"too bright": "%", "too dark": "%", "moving": "moved by 1.0 pixels"},
+    }
+    for stand, wrong in mishaps.items():
+        wait_for_step(page, stand)
+        page.wait_for_selector("bench-live[data-frame]")
+        for mishap, words in wrong.items():
+            select_fault(page, mishap)
+            measure(page)
+            alert = page.locator(".alert[data-code='calibration.refused']")
+            expect(alert).to_contain_text(words if words != "%" else re.compile(r"\d"), timeout=20_000)
+            wait_for_step(page, stand)  # the same step: faults cannot be skipped
+        assert faults_in_all_shapes(page, "#go") == []
+        before = page.locator("bench-live").get_attribute("data-frame")
+        measure(page)
+        page.wait_for_selector(f"[data-state=measuring], li[data-stand={stand}][data-state=done], [data-view=done]")
+        expect(page.locator(f"bench-live:not([data-frame='{before}']), [data-view=done]").first).to_be_visible()
+
+    page.wait_for_selector("[data-view=done]", timeout=30_000)
+    kept = archive_of(uncalibrated_server).load()
+    assert kept.provenance.made_by == "Ada Lovelace"
+    expect(page.locator("main")).to_contain_text(kept.calibration.id)
+    expect(page.locator("[data-number=gain_e_per_dn]")).to_contain_text(re.compile(r"^5\.[67]\d* e⁻/DN$"))
+    expect(page.locator("[data-number=black_dn]")).to_contain_text(re.compile(r"^6[34](\.\d+)? DN$"))
+    assert faults_in_all_shapes(page, "header") == []
+    page.reload()  # the result is shown again
+    page.wait_for_selector("[data-view=done]")
+    page.locator("#overview").tap()
+    expect(page.locator(".card").first).to_contain_text(kept.calibration.id)
+
+
+def test_power_cut_at_every_step_keeps_finished_steps(
+    uncalibrated_server: Server, open_page: Open, complaints: Complaints
+) -> None:
+    complaints.expect("401", *CUT)
+    archive = archive_of(uncalibrated_server)
+    old = archive.active_id()
+    page = open_page(f"{uncalibrated_server.url}/technician")
+    log_in(page)
+    for done, stand in enumerate(WORDS):
+        start(page)
+        if done:
+            before = list(WORDS)[done - 1]
+            wait_for_step(page, before)
+            measure(page)
+        wait_for_step(page, stand)
+        expect(page.locator(f"li[data-stand={stand}] .last")).to_contain_text("last time")
+        page.reload()  # a reload does not change the state
+        wait_for_step(page, stand)
+        measure(page)
+        page.wait_for_selector("[data-state=measuring]")
+        uncalibrated_server.signal(signal.SIGKILL)
+        expect(page.locator(".lost")).to_be_visible(timeout=10_000)
+        uncalibrated_server.stop()
+        uncalibrated_server.start()
+        uncalibrated_server.wait_until_ready()
+        assert archive.active_id() == old
+        log_in(page)
+        assert done == 0 or page.locator(".kept").is_visible()
+    start(page)
+    wait_for_step(page, "point")
+    expect(page.locator("li[data-state=done]")).to_have_count(2)
+    measure(page)
+    page.wait_for_selector("[data-view=done]", timeout=30_000)
+    assert archive.active_id() != old
+
+    page.locator("#overview").tap()
+    expect(page.locator("#start")).to_have_attribute("aria-disabled", "false", timeout=60_000)
+    page.wait_for_timeout(700)
+    page.locator(f"[data-id='{old}']").tap()
+    expect(page.locator(".card").first).to_contain_text(old, timeout=30_000)
+    assert archive.active_id() == old
+
+
+def test_wrong_pin_locks_out_and_logout(uncalibrated_server: Server, open_page: Open, complaints: Complaints) -> None:
+    complaints.expect("403", "401")
+    page = open_page(f"{uncalibrated_server.url}/technician")
+    log_in(page)
+    while page.locator("[data-view=door]").count() == 0:  # debounce: taps within 0.6 s of a new view are ignored
+        page.locator("#lock").tap()
+        page.wait_for_timeout(700)
+    page.wait_for_timeout(700)
+    page.keyboard.press("Tab")
+    page.locator("#pin").fill("0000")
+    page.keyboard.press("Enter")
+    expect(page.locator(".alert")).to_have_attribute("data-code", "technician.pin")
+    expect(page.locator("#pin")).to_have_value("")
+    expect(page.locator("#enter")).to_have_text("Open")
+    page.wait_for_timeout(700)
+    page.locator("#pin").fill("1111")  # the second wrong PIN locks for two seconds, long enough to be visible
+    page.keyboard.press("Enter")
+    expect(page.locator("#enter")).to_contain_text("Wait")
+    expect(page.locator("#enter")).to_have_text("Open")
+    page.wait_for_timeout(700)
+    log_in(page)

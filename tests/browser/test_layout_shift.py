@@ -1,0 +1,143 @@
+"""Layout stability, labels of pictures and visits, and navigation back."""
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.looks import SIZES, look_for_faults
+from tests.browser.real import Real
+from tests.browser.walk import SHUTTER, Open, aiming, set_language, take_picture, tap
+
+pytestmark = pytest.mark.browser
+
+
+def boxes(page: Page, *selectors: str) -> dict[str, object]:
+    """Return the bounding boxes of these elements in pixels."""
+    return {selector: page.locator(selector).first.bounding_box() for selector in selectors}
+
+
+@pytest.mark.parametrize("language", ["en", "ta"])
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES.keys())
+def test_no_layout_shift_during_capture(open_page: Open, real: Real, size: tuple[int, int], language: str) -> None:
+    real.hold = "quick"
+    page = aiming(open_page, real, size)
+    set_language(page, language)
+    page.reload()
+    tap(page, SHUTTER)
+    page.wait_for_selector("[data-phase=assessed] .stage[data-mark=quick]")
+    moving = (".stage", ".card", ".tools", ".tiles", ".actions")
+    before = boxes(page, *moving)
+    value = page.locator("progress").evaluate("bar => bar.value")
+    real.hold = "stored"
+    expect(page.locator("progress")).not_to_have_js_property("value", value)
+    assert boxes(page, *moving) == before
+    real.hold = None
+    page.wait_for_selector("[data-phase=kept]")
+    assert boxes(page, *moving) == before
+    page.wait_for_selector(".stage[data-mark=final]")
+    assert boxes(page, *moving) == before
+    tap(page, "#open-details")
+    assert boxes(page, *moving) == before
+    assert look_for_faults(page) == []
+
+
+def test_result_shows_slot_label_and_one_go_on_text(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, SIZES["phone"])
+    take_picture(page)
+    expect(page.locator(".prompt")).to_contain_text("Right eye · Centre")
+    assert page.locator("main").inner_text().count("You can go on") == 1
+    expect(page.get_by_role("button", name="As taken")).to_have_attribute("aria-pressed", "true")
+
+
+def test_previous_picture_is_kept_and_back_leads_home(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    expect(page.locator("#keep-old")).to_have_count(0)
+    for slot in ("R-centre", "R-nerve"):
+        take_picture(page)
+        tap(page, "#next")
+        page.wait_for_selector(f"[data-slot='{slot}'][data-face=good]")
+    tap(page, "[data-slot='R-centre']")
+    tap(page, "#again")
+    tap(page, "#keep-old")
+    page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
+    assert real.presses == 2
+    tap(page, "#back")
+    page.wait_for_selector("[data-screen=person]")
+    tap(page, "#back")
+    page.wait_for_selector("#new")
+
+
+def test_find_offers_match_first_and_reports_no_match(open_page: Open, real: Real) -> None:
+    real.begin_visit(consent="agreed")
+    page = open_page(f"{real.url}/#/find")
+    pad = page.locator(".pad")
+    where = pad.bounding_box()
+    for digit in "0013":
+        page.locator(f"[data-key='{digit}']").tap()
+    expect(page.locator("#open-found")).to_have_text("Open A0001-3")
+    expect(page.locator("#open-found")).to_have_class("primary")
+    expect(page.locator("#start")).not_to_have_class("primary")
+    page.locator("[data-key='9']").tap()
+    expect(page.get_by_text("No match for 00139.")).to_be_visible()
+    assert pad.bounding_box() == where
+    page.locator("[data-key='erase']").tap()
+    page.locator("#open-found").tap()
+    page.wait_for_selector("[data-screen=aim]")
+    assert len(real.visits()) == 1
+
+
+def test_scanned_number_opens_visit(open_page: Open, real: Real) -> None:
+    real.begin_visit(consent="agreed")
+    page = open_page(f"{real.url}/#/find")
+    page.wait_for_selector(".people")
+    page.keyboard.type("A00013")
+    page.wait_for_selector("#open-found")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("[data-screen=aim]")
+    assert len(real.visits()) == 1
+
+
+def test_number_with_check_digit_is_found_in_both_forms(open_page: Open, real: Real) -> None:
+    real.begin_visit(consent="agreed")
+    real.begin_visit(number="SELF-7", consent="agreed")
+    page = open_page(f"{real.url}/#/find")
+    expect(page.locator(".people")).to_contain_text("A0001-3")
+    expect(page.locator(".people")).to_contain_text("SELF-7")
+    page.locator("[data-key='1']").tap()
+    expect(page.locator("#open-found")).to_have_text("Open A0001-3")
+    page.locator("[data-key='3']").tap()
+    expect(page.locator("#open-found")).to_have_text("Open A0001-3")
+    page.locator("#open-found").tap()
+    expect(page.locator("h1")).to_contain_text("A0001-3")
+
+
+def test_no_layout_shift_from_form_input(open_page: Open, real: Real) -> None:
+    visit = real.begin_visit()
+    page = open_page(f"{real.url}/#/visit/{visit['id']}/person", SIZES["portrait"])
+    page.wait_for_selector(".asking")
+    chips = [f"[data-value={value}]" for value in ("agreed", "declined", "woman", "man", "flashes", "red")]
+    before = boxes(page, *chips, ".question .pad", "[data-field=diabetes]")
+    for selector in ("[data-value=agreed]", "[data-value=woman]", "[data-value=flashes]", "[data-key='5']"):
+        page.locator(selector).tap()
+    expect(page.locator(".question output")).to_have_text("5")
+    assert boxes(page, *chips, ".question .pad", "[data-field=diabetes]") == before
+
+
+def test_compared_pictures_are_labelled(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    for _ in range(2):
+        take_picture(page)
+        tap(page, "#again")
+    visit = real.visit()
+    first, second = visit["slots"]["R-centre"]["captures"]
+    page.goto(f"{real.url}/#/visit/{visit['id']}/compare/{first}/{second}")
+    left, right = (page.locator(".two figcaption").nth(one) for one in (0, 1))
+    for caption, name in ((left, "picture 1"), (right, "picture 2")):
+        expect(caption).to_contain_text(f"Right eye · Centre, {name}")
+        expect(caption).to_contain_text(":")  # the time of day
+    expect(right).to_contain_text("Used")
+    expect(left).not_to_contain_text("Used")
+    page.get_by_role("button", name="One over the other").tap()
+    page.get_by_role("button", name="Show Right eye · Centre, picture 2").tap()
+    expect(right).to_be_visible()
+    expect(left).to_be_hidden()
+    expect(page.locator("#swap")).to_contain_text("picture 1")

@@ -1,0 +1,124 @@
+"""Accuracy explorer: measurement in a subprocess, reconstruction by recipe, and the selected time budget."""
+
+import threading
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec, load_head
+from device.errors import DiffuscopeError, SettingError
+from device.recon.reconstructor import Recipe
+from device.sim.scene_files import simulate_exposure
+from services.errors import Busy
+from services.imaging.picture_files import raw_tiff
+from services.imaging.raw_metadata import RawMetadata
+from services.instrument.accuracy_explorer import AccuracyExplorer, StoredCapture, simulated_head
+from services.instrument.background import run_in_subprocess
+from services.lab.frontier import measure_scene
+from tests.journey.conftest import SMALL_HEAD
+
+
+def _exit_early(report: Any) -> None:
+    report("going")
+    raise SystemExit(3)
+
+
+def _raise_refusal(word: str, report: Any) -> None:
+    raise SettingError(f"{word} is not one", "Take another.")
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> InstrumentSpec:
+    head = tmp_path / "head.toml"
+    head.write_text(SMALL_HEAD.replace("270", "68").replace("480", "120").replace("20.16", "80.64"))
+    return load_head(head)
+
+
+@pytest.fixture
+def messages() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def explorer(tmp_path: Path, spec: InstrumentSpec, messages: list[str]) -> AccuracyExplorer:
+    def publish(kind: str, said: str) -> None:
+        assert kind == "explorer"
+        messages.append(said)
+
+    return AccuracyExplorer(tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, publish, measure_scene)
+
+
+def test_a_diffuscope_error_crosses_the_process_boundary_with_its_remedy() -> None:
+    with pytest.raises(SettingError, match="blue is not one") as caught:
+        run_in_subprocess(_raise_refusal, "blue", report=print)
+    assert caught.value.remedy == "Take another."
+
+
+def test_a_killed_subprocess_raises_an_error() -> None:
+    received: list[str] = []
+    with pytest.raises(DiffuscopeError, match="without a result"):
+        run_in_subprocess(_exit_early, report=received.append)
+    assert received == ["going"]
+
+
+def test_a_measurement_uses_the_sensor_of_this_device_and_is_stored(
+    explorer: AccuracyExplorer, messages: list[str], tmp_path: Path, spec: InstrumentSpec
+) -> None:
+    explorer.measure()
+    with pytest.raises(Busy):
+        explorer.measure()
+    for thread in _threads("frontier"):
+        thread.join(120)
+    state = explorer.state()
+    assert state.problem is None
+    found = state.measured
+    assert found is not None
+    assert found.model_dump()["frame"] == {"rows": 68, "cols": 120}
+    assert "Small simulated head" in found.scene
+    assert (found.measured_at or "").startswith("2026-01-01")
+    assert any(point.pareto for point in found.points)
+    assert any("timing, turn" in message for message in messages)
+    assert messages[-1] == ""
+    again = AccuracyExplorer(
+        tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, lambda kind, said: None, measure_scene
+    )
+    assert again.state().measured == found
+
+
+def test_a_capture_is_reconstructed_by_another_method_and_marked_as_simulated(
+    explorer: AccuracyExplorer, spec: InstrumentSpec
+) -> None:
+    scene = simulate_exposure(spec)
+    raw = raw_tiff(scene.counts, RawMetadata())
+    dark = raw_tiff(np.full_like(scene.counts, 64), RawMetadata())
+    kept = StoredCapture(raw, dark, scene.calibration, simulated=True)
+    picture = Image.open(BytesIO(explorer.reconstruct(kept, Recipe("gradient", 1))))
+    assert picture.text["simulated"] == "true"
+    assert np.asarray(picture).std() > 10
+    with pytest.raises(SettingError, match="no method guess"):
+        explorer.reconstruct(kept, Recipe("guess", 1))
+
+
+def test_the_selected_time_budget_is_stored(explorer: AccuracyExplorer, tmp_path: Path, spec: InstrumentSpec) -> None:
+    assert (explorer.pace, explorer.budget_s) == ("standard", 5.0)
+    explorer.choose("best")
+    again = AccuracyExplorer(
+        tmp_path / "explorer", tmp_path / "plans", VirtualClock(), spec, lambda kind, said: None, measure_scene
+    )
+    assert (again.pace, again.budget_s) == ("best", 30.0)
+    (tmp_path / "explorer" / "choice.json").write_bytes(b"{half a fi")
+    assert again.pace == "standard"
+
+
+def test_a_recording_without_optics_is_measured_on_the_default_scene(spec: InstrumentSpec) -> None:
+    without_optics = spec.model_copy(update={"optics": None})
+    assert simulated_head(without_optics, spec) is spec
+
+
+def _threads(name: str) -> list[Any]:
+    return [thread for thread in threading.enumerate() if thread.name == name]

@@ -1,0 +1,71 @@
+"""Export of the event log by the technician: download and copy to a USB drive."""
+
+import json
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from services.delivery.usb_drives import UsbDrives
+from services.health.event_log import EventLog
+from services.http.app import create_app
+from services.http.routes.event_log import event_log_routes
+from tests.journey.conftest import Rig
+from tests.journey.test_visit_export import write_mounts
+
+log = logging.getLogger("services.instrument.test")
+
+
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    folder = tmp_path / "media" / "USB STICK"
+    folder.mkdir(parents=True)
+    write_mounts(tmp_path / "mounts", folder)
+    return folder
+
+
+@pytest.fixture
+def rig(build: Callable[..., Rig], tmp_path: Path, stick: Path) -> Iterator[Rig]:
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo, wait=False)
+        event_log = EventLog(tmp_path / "diary")
+        undo.callback(event_log.close)
+        routers = (event_log_routes(event_log, UsbDrives((tmp_path / "media",), tmp_path / "mounts"), rig.clock),)
+        rig.application = create_app(rig.arbiter, rig.authenticator, technician_routers=routers)
+        yield rig
+
+
+@pytest.fixture
+def ask(rig: Rig) -> Callable[..., Any]:
+    """Requests with the technician's login cookie."""
+    entered = rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
+    cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
+    return lambda method, path, **more: rig.request(method, f"/api/technician/diary{path}", headers=cookie, **more)
+
+
+def test_event_log_is_downloaded_as_text(ask: Callable[..., Any]) -> None:
+    log.warning("press failed: %s", "the camera is gone", extra={"code": "camera.missing"})
+    answer = ask("GET", ".txt")
+    assert answer.headers["content-type"] == "text/plain; charset=utf-8"
+    assert 'filename="diary-' in answer.headers["content-disposition"]
+    assert "WARNING: press failed: the camera is gone (camera.missing)" in answer.text
+
+
+def test_second_copy_to_a_usb_drive_keeps_the_first(ask: Callable[..., Any], stick: Path) -> None:
+    log.info("a picture was kept")
+    first, second = (ask("POST", "/export", json={"folder": str(stick)}).json()["folder"] for _ in range(2))
+    assert second == f"{first}-2"
+    assert "a picture was kept" in (stick / first / "diary.txt").read_text()
+    lines = (stick / second / "diary.jsonl").read_text().splitlines()
+    assert "a picture was kept" in [json.loads(line)["text"] for line in lines]
+
+
+def test_export_needs_a_present_usb_drive_and_the_login(ask: Callable[..., Any], rig: Rig, tmp_path: Path) -> None:
+    refused = ask("POST", "/export", json={"folder": str(tmp_path)})
+    assert (refused.status_code, refused.json()["code"]) == (503, "stick.gone")
+    for method, path in (("GET", "/diary"), ("GET", "/diary.txt"), ("POST", "/diary/export")):
+        away = {"json": {"folder": str(tmp_path)}} if method == "POST" else {}
+        assert rig.request(method, f"/api/technician{path}", **away).json()["code"] == "technician.locked"

@@ -1,0 +1,163 @@
+"""Export of a visit: complete, verifiable and de-identified; errors of USB drives."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from services.delivery.usb_drives import UsbDrives, copy_to_drive
+from services.delivery.visit_export import zip_archive
+from services.errors import UsbDriveFull, UsbDriveUnavailable
+from services.http.app import create_app
+
+keys = (f"{number:016x}" for number in count(1))
+FILES = {"R-centre-1.png": b"p" * 5000, "visit.json": b"{}"}
+
+
+def write_mounts(table: Path, *folders: Path) -> None:
+    """Write a mount table as the kernel does, with its escapes of blanks."""
+    lines = [f"/dev/sda1 {str(folder).replace(' ', chr(92) + '040')} vfat rw 0 0\n" for folder in folders]
+    table.write_text("proc /proc proc rw 0 0\n" + "".join(lines))
+
+
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    folder = tmp_path / "media" / "USB STICK"
+    folder.mkdir(parents=True)
+    return folder
+
+
+@pytest.fixture
+def visit(rig: Any, tmp_path: Path, stick: Path) -> Any:
+    """Return a visit with a retake and identifying fields, on an instrument with one USB drive."""
+    write_mounts(tmp_path / "mounts", stick)
+    rig.application = create_app(
+        rig.arbiter, rig.authenticator, usb_drives=UsbDrives((tmp_path / "media",), tmp_path / "mounts")
+    )
+    begun = rig.request("POST", "/api/visits", json={"key": next(keys)}).json()
+    at = f"/api/visits/{begun['id']}"
+    fields = {"consent": "agreed", "name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}
+    for field, value in fields.items():
+        rig.request("PATCH", at, json={"key": next(keys), "field": field, "value": value})
+    for _ in range(2):
+        press = {"key": next(keys), "eye": "OD", "visit": begun["id"], "slot": "R-centre"}
+        assert rig.request("POST", "/api/captures", json=press).status_code == 201
+    return rig.request("GET", at).json()
+
+
+def check(folder: Path) -> None:
+    """Verify the checksums with sha256sum."""
+    subprocess.run(["sha256sum", "--check", "--quiet", "--strict", "SHA256SUMS"], cwd=folder, check=True)
+
+
+def test_the_zip_holds_pictures_reports_and_valid_checksums_and_no_identifying_field(
+    rig: Any, visit: Any, tmp_path: Path
+) -> None:
+    answer = rig.request("GET", f"/api/visits/{visit['id']}/export.zip")
+    assert answer.headers["content-type"] == "application/zip"
+    assert visit["number"] in answer.headers["content-disposition"]
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert archive.testzip() is None
+        archive.extractall(tmp_path / "out")
+    folder = tmp_path / "out" / f"{visit['number']}-{visit['id']}"
+    check(folder)
+    names = {path.name for path in folder.iterdir()}
+    pictures = {f"R-centre-{number}.{kind}" for number in (1, 2) for kind in ("png", "json")}
+    assert names == {"visit.json", "SHA256SUMS"} | pictures
+    for number, capture in enumerate(visit["slots"]["R-centre"]["captures"], 1):
+        assert (folder / f"R-centre-{number}.png").read_bytes() == rig.store.read(capture, "picture.png")
+    exported = json.loads((folder / "visit.json").read_text())
+    assert exported["fields"] == {"age": 54, "consent": "agreed"}
+    assert exported["slots"] == visit["slots"]
+    for secret in (b"Meena", b"Nowhere", b"12345"):
+        assert secret not in answer.content
+
+
+def test_a_date_before_1980_does_not_fail_the_zip() -> None:
+    content = zip_archive("A", FILES, datetime(1970, 1, 1, tzinfo=UTC))
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert {info.date_time[0] for info in archive.infolist()} == {1980}
+
+
+def test_a_copy_on_a_usb_drive_is_complete_and_an_earlier_one_stays(rig: Any, visit: Any, stick: Path) -> None:
+    listed = rig.request("GET", "/api/exports").json()["folders"]
+    assert [(one["id"], one["name"]) for one in listed] == [(str(stick), "USB STICK")]
+    assert listed[0]["free_bytes"] > 0
+    order = {"key": next(keys), "folder": str(stick)}
+    at = f"/api/visits/{visit['id']}/export"
+    made = rig.request("POST", at, json=order).json()
+    assert rig.request("POST", at, json=order).json() == made
+    check(Path(made["folder"]))
+    other = rig.request("POST", at, json={**order, "key": next(keys)}).json()
+    check(Path(other["folder"]))
+    assert {path.name for path in stick.iterdir()} == {Path(one["folder"]).name for one in (made, other)}
+    assert len(list(stick.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "folder", ["/", "/etc", "{stick}/..", "{stick}/", "{stick}/../USB STICK", "..", "\x00", "{other}"]
+)
+def test_only_a_mounted_usb_drive_is_written(rig: Any, visit: Any, stick: Path, folder: str) -> None:
+    other = stick.parent / "not mounted"
+    other.mkdir()
+    order = {"key": next(keys), "folder": folder.format(stick=stick, other=other)}
+    answer: httpx.Response = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
+    assert (answer.status_code, answer.json()["code"]) == (503, "stick.gone")
+    assert list(stick.iterdir()) == list(other.iterdir()) == []
+
+
+def test_a_removed_usb_drive_is_an_error_and_the_same_request_succeeds_later(
+    rig: Any, visit: Any, stick: Path, tmp_path: Path
+) -> None:
+    order, at = {"key": next(keys), "folder": str(stick)}, f"/api/visits/{visit['id']}/export"
+    shutil.rmtree(stick)  # the mount table still lists it
+    assert rig.request("GET", "/api/exports").json() == {"folders": []}
+    gone = rig.request("POST", at, json=order)
+    assert (gone.status_code, gone.json()["code"]) == (503, "stick.gone")
+    assert "Nothing was lost" in gone.json()["remedy"]
+    stick.mkdir()
+    assert rig.request("POST", at, json=order).status_code == 200
+
+
+def test_a_damaged_picture_fails_the_export_with_its_own_error(rig: Any, visit: Any) -> None:
+    capture = visit["slots"]["R-centre"]["captures"][0]
+    (rig.store.folder / "captures" / capture / "picture.png").write_bytes(b"x")
+    answer = rig.request("GET", f"/api/visits/{visit['id']}/export.zip")
+    assert (answer.status_code, answer.json()["code"]) == (500, "store.damaged")
+
+
+def test_an_interrupted_copy_is_replaced(stick: Path) -> None:
+    (stick / ".A.part").mkdir()
+    (stick / ".A.part" / "visit.json").write_bytes(b"half")
+    assert copy_to_drive(stick, "A", FILES) == stick / "A"
+    assert {path.name for path in stick.iterdir()} == {"A"}
+    with pytest.raises(UsbDriveUnavailable):
+        copy_to_drive(stick / "gone", "A", FILES)
+
+
+def test_a_full_usb_drive_is_an_error_and_no_partial_copy_remains(tmp_path: Path) -> None:
+    """A limit on the length of a file simulates the full drive; it needs no privileges."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", __file__, str(tmp_path)], cwd=Path(__file__).parents[2], check=True,
+        capture_output=True, text=True, env={"PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    assert result.stdout.split() == ["UsbDriveFull", "[]"]
+
+
+if __name__ == "__main__":
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, resource.RLIM_INFINITY))
+    try:
+        copy_to_drive(Path(sys.argv[1]), "A", FILES)
+    except UsbDriveFull as full:
+        print(type(full).__name__, [path.name for path in Path(sys.argv[1]).iterdir()])  # noqa: T201

@@ -1,0 +1,161 @@
+"""Report of a capture: whatever JSON a release stored is returned by the writer, and the columns agree with it."""
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from device.values import Report
+from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
+from services.records.capture_report import read_report, report_as_json
+from tests.earlier import store_of_version
+
+# Keys of the reports of each release on `main`, with a value as that release wrote it.
+SOLVER = {
+    "method": "variation", "bin": 1, "rounds": 12, "stopped": "done", "seconds": {"expose": 0.2, "solve": 0.5},
+    "psf_index": 0, "psf_scale": 1.0, "refraction_dpt": {"sphere": -1.25, "sd": 0.5}, "regularisation": {"tau": 1e-3},
+    "noise_dn": 9.5, "residual": 0.84, "quality": {"coverage": 0.98, "resolution_um": None}, "warnings": ["dim"],
+}  # fmt: skip
+LIGHT = {
+    "dose_j_per_cm2": 9.9e-6, "dose_24h_j_per_cm2": {"OD": 9.9e-6, "OS": 0}, "dose_stop_j_per_cm2": 0.1584,
+    "dose_high": [],
+}  # fmt: skip
+VISIT = {"visit": "20260302T120000-ddeeba", "slot": "R-centre"}
+VERDICT = {"verdict": {"word": "again", "code": "shot.moved", "numbers": {"smear": 0.4339, "residual": None}}}
+LATERALITY = {"test": False, "laterality": {"eye": "OS", "confidence": 0.99, "disc": [10.5, 20]}, "budget_s": 5.0}
+CORRECTED = {
+    "moved": [{"from_eye": "OS", "from_slot": "L-centre", "eye": "OD", "at": "2026-03-02T12:16:00+00:00", "by": None}],
+    "confirmed": {"eye": "OD", "at": "2026-03-02T12:17:00+00:00", "by": "tablet 2"},
+}
+RELEASES: list[dict[str, Any]] = [
+    SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
+]  # fmt: skip
+KEYS = sorted(RELEASES[-1])
+
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+numbers = st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False)
+values = st.recursive(
+    st.none() | st.booleans() | numbers | texts,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(texts, inner, max_size=3),
+    max_leaves=6,
+)
+unknown = st.dictionaries(texts, values, max_size=3)
+
+
+@st.composite
+def stored_reports(draw: st.DrawFn) -> dict[str, Any]:
+    """Return the report of a release, without some keys, with unknown ones, and with some values of any type."""
+    report = dict(draw(st.sampled_from(RELEASES)))
+    for name in draw(st.sets(st.sampled_from(KEYS), max_size=4)):
+        report.pop(name, None)
+    for name in draw(st.sets(st.sampled_from(KEYS), max_size=2)):
+        report[name] = draw(values)
+    for name in ("verdict", "laterality"):
+        if isinstance(report.get(name), dict):
+            report[name] = report[name] | draw(unknown)
+    return draw(unknown) | report
+
+
+def same(one: object, other: object) -> bool:
+    """Return whether two values are the same JSON; 1, 1.0 and true differ."""
+    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+
+
+@given(stored_reports())
+def test_the_writer_returns_every_stored_entry(stored: dict[str, Any]) -> None:
+    try:
+        report = read_report(stored)
+    except (ValueError, KeyError):
+        return  # an entry on which the program acts has a wrong type: a damaged record, whose text stays as it is
+    written = report_as_json(report)
+    assert {name: value for name, value in stored.items() if not same(written.get(name), value)} == {}
+    assert read_report(written) == report
+    assert same(report_as_json(read_report(written)), written)
+
+
+@given(values)
+def test_any_json_is_read_or_refused_as_a_damaged_record(stored: Any) -> None:
+    with suppress(ValueError, KeyError):
+        read_report(stored)
+
+
+@pytest.mark.parametrize("stored", RELEASES)
+def test_the_report_of_each_release_is_read_and_missing_entries_have_their_default(stored: dict[str, Any]) -> None:
+    report, default = read_report(stored), CaptureReport()
+    assert report.others == {}
+    assert report.reconstruction.method == "variation"
+    assert (report.visit, report.is_test) == (stored.get("visit"), "visit" not in stored)
+    assert (report.verdict is None) == ("verdict" not in stored)
+    if "laterality" not in stored:
+        assert (report.laterality, report.budget_s) == (default.laterality, default.budget_s)
+    assert (report.moved != (), report.confirmed is not None) == ("moved" in stored, "confirmed" in stored)
+
+
+def test_an_empty_report_has_every_default_and_no_correction() -> None:
+    assert read_report({}) == CaptureReport()
+    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED)
+
+
+@given(stored_reports(), st.sampled_from(["R-nerve", "L-nerve"]))
+def test_a_correction_changes_slot_and_moves_only(stored: dict[str, Any], slot: str) -> None:
+    try:
+        before = read_report(stored)
+    except (ValueError, KeyError):
+        return
+    move = EyeCorrection("OD", "R-centre", "OS", "2026-03-02T12:16:00+00:00", "tablet 1")
+    written, earlier = report_as_json(before.with_correction(slot, move)), report_as_json(before)
+    assert written["slot"] == slot
+    moved = written["moved"]
+    assert isinstance(moved, list)
+    assert same(moved[:-1], earlier.get("moved") or [])
+    assert read_report(written).moved == (*before.moved, move)
+    other = {name: value for name, value in written.items() if name not in ("slot", "moved")}
+    assert same(other, {name: value for name, value in earlier.items() if name not in ("slot", "moved")})
+    confirmed = report_as_json(before.with_confirmation(EyeConfirmation("OD")))
+    assert confirmed["confirmed"] == {"eye": "OD", "at": None, "by": None}
+
+
+@given(st.dictionaries(texts, numbers, max_size=3), st.integers(0, 100), st.booleans())
+def test_what_is_built_is_read_again(seconds: dict[str, float], rounds: int, test: bool) -> None:
+    built = CaptureReport(
+        Report("evidence", rounds=rounds, seconds=seconds, warnings=("dim",)),
+        visit=None if test else "v",
+        slot=None if test else "R-centre",
+        moved=(EyeCorrection("OS", "L-centre", "OD"),),
+    )
+    assert read_report(json.loads(json.dumps(report_as_json(built)))) == built
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> Iterator[sqlite3.Connection]:
+    """Return a connection to migrated tables with one capture, which an earlier release wrote."""
+    folder: Path = store_of_version(tmp_path_factory.mktemp("columns"), "r0005")
+    with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as connection:
+        row = ("c", "OD", "2026-03-01T12:00:00.000000+00:00", 1, "00ff", "{}")
+        connection.execute("BEGIN")
+        connection.execute(
+            "INSERT INTO captures (id, eye, taken_at, simulated, calibration_id, report) VALUES (?, ?, ?, ?, ?, ?)", row
+        )
+        yield connection
+
+
+@given(stored_reports())
+@settings(deadline=None)
+def test_the_columns_are_the_entries_of_the_report(tables: sqlite3.Connection, stored: dict[str, Any]) -> None:
+    tables.execute("UPDATE captures SET report = ?", (json.dumps(stored),))
+    (row,) = tables.execute("SELECT visit, slot, verdict, laterality FROM captures").fetchall()
+    for name, kind, column in zip(("visit", "slot", "verdict", "laterality"), (str, str, dict, dict), row, strict=True):
+        entry = stored.get(name)
+        if not isinstance(entry, kind):
+            assert column is None
+        elif kind is str:
+            assert column == entry
+        else:
+            assert json.loads(column) == entry

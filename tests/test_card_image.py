@@ -1,0 +1,128 @@
+"""Card image: its files as read by firmware, rpi-image-gen, systemd, NetworkManager and avahi.
+
+No Raspberry Pi and no package archive is needed; checks with the real programs are in `tests/systemd/` and
+`tests/appliance/`.
+"""
+
+import configparser
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from device.config.head_file import load_head
+from services.identity.certificates import ACCESS_POINT_ADDRESS, NETWORKS, SHARED_HOST_NAME
+from tests.project_files import ROOT, text
+
+CARD = "systemd/image/card"
+LAYERS = {"layer/diffuscope.yaml": "diffuscope", "image/diffuscope-card.yaml": "diffuscope-card"}
+# Layers of rpi-image-gen that are used here, as listed in its documentation in August 2026.
+THEIRS = {
+    "rpi5", "image-base", "debian-bookworm-arm64-multi", "rpi-debian-bookworm", "rpi-essential-base", "systemd-min",
+    "network-manager",
+}  # fmt: skip
+RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
+
+
+def metadata(name: str) -> dict[str, str]:
+    """Return the fields between METABEGIN and METAEND, with continued lines joined."""
+    block = re.search(r"^# METABEGIN\n(.*?)^# METAEND$", text(f"{CARD}/{name}"), re.M | re.S)
+    assert block is not None, "no metadata"
+    lines = re.sub(r"\n# {2,}", " ", block[1]).splitlines()
+    rows = [re.fullmatch(r"# (X-Env-[\w-]+): *(.*)", line) for line in lines if line != "#"]
+    assert all(rows), "a line that rpi-image-gen cannot read"
+    return {row[1]: row[2] for row in rows if row}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_layer_metadata_has_the_fields_of_rpi_image_gen(name: str) -> None:
+    fields = metadata(name)
+    assert fields["X-Env-Layer-Name"] == LAYERS[name]
+    assert {"X-Env-Layer-Category", "X-Env-Layer-Desc", "X-Env-VarPrefix"} <= set(fields)
+    assert re.fullmatch(r"\d+\.\d+\.\d+", fields["X-Env-Layer-Version"])
+    assert set(fields["X-Env-Layer-Requires"].split(",")) <= THEIRS
+    variables = {match[1] for key in fields if (match := re.fullmatch(r"X-Env-Var-([a-z_]+)", key))}
+    for variable in variables:
+        about = {what: fields[f"X-Env-Var-{variable}-{what}"] for what in ("Desc", "Required", "Valid", "Set")}
+        assert about["Required"] in ("y", "n")
+        assert about["Set"] in ("y", "n", "lazy", "force")
+        assert re.fullmatch(RULES, about["Valid"]), f"{variable}: {about['Valid']}"
+
+
+def test_layer_hooks_name_existing_scripts_and_variables() -> None:
+    fields = metadata("layer/diffuscope.yaml")
+    body = yaml.safe_load(text(f"{CARD}/layer/diffuscope.yaml"))
+    assert body["mmdebstrap"]["packages"] == list(dict.fromkeys(body["mmdebstrap"]["packages"]))
+    hooks = "\n".join(body["mmdebstrap"]["customize-hooks"])
+    for script in re.findall(r"\$IGconf_diffuscope_checkout/(\S+)", hooks):
+        assert (ROOT / script).stat().st_mode & 0o111, f"{script} is not there, or cannot be run"
+    for variable in re.findall(r"\$IGconf_diffuscope_([a-z]+)", hooks):
+        assert f"X-Env-Var-{variable}" in fields
+    assert text("pyproject.toml").split('version = "')[1].startswith(fields["X-Env-Var-version"] + '"')
+
+
+def test_configuration_names_existing_layers() -> None:
+    named = yaml.safe_load(text(f"{CARD}/config/diffuscope.yaml"))
+    layers = {named["device"]["layer"], named["image"]["layer"], *named["layer"].values()}
+    assert layers <= {*LAYERS.values(), *THEIRS}
+    assert f"image {named['image']['name']}.img {{" in text(f"{CARD}/image/genimage.cfg")
+
+
+def test_config_txt_is_readable_and_enables_the_head() -> None:
+    lines = text(f"{CARD}/config.txt").splitlines()
+    for line in lines:
+        assert len(line) <= 98, "the firmware reads no more of a line"
+        assert re.fullmatch(r"|#.*|\[(all|boot_partition=\d)\]|[a-z0-9_]+=[\w=.,-]+", line), line
+    assert lines[-1] == "[all]", "lines added at the end apply to all boards"
+    wanted = {"spi=on", "i2c_arm=on", "strict_gpiod", "watchdog=on"}
+    assert wanted <= {line.removeprefix("dtparam=") for line in lines}
+    head = re.search(r"heads\\/(\w+)\.toml/'", text(f"{CARD}/board"))
+    assert head is not None
+    spec = load_head(ROOT / f"hardware/heads/{head[1]}.toml")
+    assert spec.camera.backend == "picamera2"
+    assert f"dtoverlay={head[1]}" in lines
+    assert "camera_auto_detect=0" in lines
+
+
+def test_kernel_command_line_is_one_line() -> None:
+    assert text(f"{CARD}/cmdline.txt").count("\n") == 1
+
+
+def test_access_point_is_off_and_has_no_shared_password() -> None:
+    """A released password would be the same on all devices; tests/systemd reads the file with NetworkManager."""
+    profile = configparser.ConfigParser(interpolation=None)
+    profile.read_string(text("systemd/image/access-point.nmconnection"))
+    assert profile["wifi-security"]["psk"] == "@WIFI@"
+    assert profile["wifi"]["ssid"] == "@NAME@"
+    assert profile["wifi-security"]["key-mgmt"] == "wpa-psk"
+    assert profile["connection"]["autoconnect"] == "false", "the page has no sign-in yet"
+    assert profile["ipv4"]["address1"] == f"{ACCESS_POINT_ADDRESS}/{NETWORKS[0].prefixlen}"
+
+
+def test_avahi_host_name_is_in_the_certificate() -> None:
+    conf = configparser.ConfigParser()
+    conf.read_string(text("systemd/image/avahi-daemon.conf"))
+    assert f"{conf['server']['host-name']}.local" == SHARED_HOST_NAME
+
+
+def test_journal_size_is_limited() -> None:
+    conf = configparser.ConfigParser()
+    conf.optionxform = str  # type: ignore[assignment, method-assign]  # keys of systemd are case-sensitive
+    conf.read_string(text("systemd/image/journald.conf"))
+    assert conf["Journal"]["Storage"] == "persistent"
+    assert int(conf["Journal"]["SystemMaxUse"].removesuffix("M")) <= 200
+
+
+def test_every_file_beside_the_recipe_is_installed() -> None:
+    """Files beside the release recipe must be used by it."""
+    recipe = text("systemd/image/release")
+    beside = {path.name for path in (ROOT / "systemd/image").iterdir() if path.is_file()}
+    brought = {name for name in beside if f"$here/{name}" in recipe}
+    tools = {"README.md", "base", "bundle", "install", "keys", "release", "requirements.lock", "sbom.py", "wheels"}
+    assert beside - tools <= brought
+    assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
+        "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
+        "diffuscope-wish.path",
+    }  # fmt: skip
+    assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

@@ -1,0 +1,131 @@
+"""Capture pipeline by itself, in virtual time: exposure, verdict, steps of the reconstruction, record, live picture."""
+
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from device.clock import VirtualClock
+from device.config.head_file import load_head
+from device.errors import CameraMissing, LightFault
+from device.head import Head, hazard_of
+from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.guard import GuardedLight
+from device.recon.reconstructor import RoundDone, StageResult
+from device.sim.camera import SimCamera
+from device.sim.light import SimLight
+from device.sim.simulated_calibration import simulated_calibration
+from device.sim.world import World
+from device.values import Reconstruction
+from services.instrument.capture import ExposedCapture, Press
+from services.instrument.capture_pipeline import CapturePipeline
+from services.records.capture_target import CaptureTarget
+from tests.journey.conftest import SMALL_HEAD
+from tests.property.exam_sequences import ROUND_S, ROUNDS, TINY, Conditions, PlainFeedback, TinyReconstructor
+
+
+@dataclass
+class Bench:
+    """Pipeline of a small simulated head whose reconstruction is a stand-in, and its parts."""
+
+    world: World
+    clock: VirtualClock
+    conditions: Conditions
+    head: Head
+    pipeline: CapturePipeline
+
+    def exposed(self) -> ExposedCapture:
+        """Return one exposed capture of the right eye."""
+        exposure = self.pipeline.expose("OD")
+        press = Press(Future(), "OD", CaptureTarget(visit="v", slot="R-centre"), None)
+        return ExposedCapture(
+            press, "20260101T000000-OD-000001", self.clock.wall(), exposure.lit, exposure.dark, exposure.duration_s,
+            light=self.head.light.dose_report(), verdict=self.pipeline.assess(exposure),
+        )  # fmt: skip
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    (tmp_path / "small.toml").write_text(SMALL_HEAD.replace("haemorrhages = 3", 'kind = "point"'))
+    spec = load_head(tmp_path / "small.toml")
+    spec = spec.model_copy(update={"camera": spec.camera.model_copy(update=TINY)})
+    clock, conditions = VirtualClock(), Conditions()
+    world = World(spec, clock)
+    light = GuardedLight(SimLight(world), clock, 30.0, hazard_of(spec), MemoryLedger(clock))
+    head = Head(spec, SimCamera(world), light, simulated_calibration(world), present_eye=world.present_eye)
+    reconstructor = TinyReconstructor(clock, conditions)
+    return Bench(world, clock, conditions, head, CapturePipeline(head, clock, reconstructor, reconstructor,
+                                                                 PlainFeedback()))  # fmt: skip
+
+
+def test_an_exposure_is_a_lit_and_a_dark_frame_and_leaves_the_lamp_off(bench: Bench) -> None:
+    exposure = bench.pipeline.expose("OS")
+    assert exposure.lit.illumination is not None
+    assert exposure.dark.illumination is None
+    assert exposure.duration_s == pytest.approx(2 * bench.head.spec.camera.exposure_s)
+    assert bench.world.eye == "OS"
+    assert bench.world.illumination is None
+
+
+@pytest.mark.parametrize(("fault", "error"), [("camera.missing", CameraMissing), ("light.fault", LightFault)])
+def test_a_failed_exposure_leaves_the_lamp_off(bench: Bench, fault: str, error: type[Exception]) -> None:
+    bench.world.faults.add(fault)
+    with pytest.raises(error):
+        bench.pipeline.expose("OD")
+    with pytest.raises(error):
+        bench.pipeline.expose_live(("OD",))
+    assert bench.world.illumination is None
+
+
+def test_a_reconstruction_yields_a_quick_look_its_rounds_and_the_picture(bench: Bench) -> None:
+    shot = bench.exposed()
+    begin_s = bench.clock.now_s()
+    steps = list(bench.pipeline.reconstruct(shot, budget_s=5.0))
+    assert [type(step) for step in steps] == [StageResult, *[RoundDone] * ROUNDS, StageResult, Reconstruction]
+    assert bench.clock.now_s() - begin_s == pytest.approx(ROUNDS * ROUND_S)
+    assert bench.world.frames == 2, "a reconstruction exposes nothing"
+
+
+def test_a_quick_look_between_two_rounds_is_of_the_other_capture(bench: Bench) -> None:
+    first, second = bench.exposed(), bench.exposed()
+    steps = bench.pipeline.reconstruct(first, budget_s=5.0)
+    assert isinstance(next(steps), StageResult)
+    assert isinstance(next(steps), RoundDone)
+    quick = bench.pipeline.quick_look(second)
+    assert not np.array_equal(quick, bench.pipeline.quick_look(first))
+    assert isinstance(list(steps)[-1], Reconstruction)
+
+
+def test_a_useless_frame_gives_the_raw_frame_with_the_error_in_its_report(bench: Bench) -> None:
+    shot = bench.exposed()
+    bench.conditions.is_frame_useless = True
+    (made,) = bench.pipeline.reconstruct(shot, budget_s=5.0)
+    assert isinstance(made, Reconstruction)
+    assert (made.report.method, made.report.stopped) == ("none", "input.frame")
+    assert np.array_equal(made.picture, shot.frame.counts)
+    assert made.simulated
+
+
+def test_a_record_holds_the_report_and_every_file(bench: Bench) -> None:
+    shot = bench.exposed()
+    *_, made = bench.pipeline.reconstruct(shot, budget_s=5.0)
+    assert isinstance(made, Reconstruction)
+    record = bench.pipeline.record(shot, made, bench.pipeline.reassess(shot, made.report), 5.0)
+    capture = record.capture
+    assert (capture.id, capture.eye, capture.simulated) == (shot.id, "OD", True)
+    assert (capture.report.visit, capture.report.slot, capture.report.budget_s) == ("v", "R-centre", 5.0)
+    assert capture.report.reconstruction.seconds["expose"] == pytest.approx(shot.expose_s)
+    assert set(record.files(None)) == {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
+
+
+def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:
+    seen = bench.pipeline.expose_live(("OD",))
+    jpeg, aim = bench.pipeline.live_picture(seen)
+    assert seen.frame.illumination is not None
+    assert seen.frame.illumination.colour == bench.head.spec.light.preview_colour
+    assert seen.dark_s - seen.exposed_s == pytest.approx(bench.head.spec.camera.preview_exposure_s)
+    assert jpeg[:2] == b"\xff\xd8"
+    assert aim.code == "noeye"
+    assert bench.world.illumination is None

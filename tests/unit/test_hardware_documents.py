@@ -1,0 +1,261 @@
+"""Consistency of the build documents (parts, wiring, assembly) with one another, the head files and the optics."""
+
+import csv
+import re
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from math import radians, tan
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from device.config.head_file import ChainSpec, load_head
+from device.optics.budget import design_of_head, optical_budget
+from device.optics.light_path import load_light_path, relay_of
+from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm, ring_for_pupil
+from services.lab.light_path_plot import draw_light_path
+from tests.drawings import boxes, overlapping
+from tests.project_files import ROOT, text
+from tests.test_project_files import code_in, unknown_words
+
+HARDWARE = ROOT / "hardware"
+PAPERS = ("hardware/wiring.md", "hardware/assembly.md")
+RING = "hardware/decisions/0005-ring-of-10-mm.md"
+HEADS = sorted((HARDWARE / "heads").glob("*.toml"))
+HEADER: dict[int, str] = {  # pins of the 40-pin header of a Raspberry Pi
+    1: "3.3 V", 2: "5 V", 3: "GPIO2", 4: "5 V", 5: "GPIO3", 6: "ground", 7: "GPIO4", 8: "GPIO14", 9: "ground",
+    10: "GPIO15", 11: "GPIO17", 12: "GPIO18", 13: "GPIO27", 15: "GPIO22", 16: "GPIO23", 19: "GPIO10", 21: "GPIO9",
+    23: "GPIO11", 24: "GPIO8", 25: "ground",
+}  # fmt: skip
+BUSES = {
+    "MOSI": ("GPIO10", "spidev0"),
+    "SCLK": ("GPIO11", "spidev0"),
+    "SDA": ("GPIO2", "i2c-1"),
+    "SCL": ("GPIO3", "i2c-1"),
+}
+SHOWN_AS = {"edge capacitor": "100 pF", "pull-down": "10 k"}  # values in the drawing
+
+
+@cache
+def parts() -> dict[str, dict[str, str]]:
+    with (HARDWARE / "parts.csv").open(encoding="utf-8", newline="") as lines:
+        return {row["part"]: row for row in csv.DictReader(lines)}
+
+
+@cache
+def wires() -> dict[int, tuple[str, str, str, str]]:
+    """Return line, signal, destination and head-file entry by pin."""
+    rows = re.findall(r"^\| (\d+) \| (.*?) \| (.*?) \| (.*?) \| (.*?) ?\|$", text("hardware/wiring.md"), re.M)
+    return {int(pin): (line, signal, to, entry) for pin, line, signal, to, entry in rows}
+
+
+def wired_values(key: str) -> set[str]:
+    """Return the values of a head-file key in the last column of the wiring table."""
+    return {
+        value.strip('"')
+        for *_, entry in wires().values()
+        for value in re.findall(rf"`{re.escape(key)} = ([^`]+)`", entry)
+    }
+
+
+def named(paper: str) -> set[str]:
+    """Return the names in bold."""
+    return set(re.findall(r"\*\*([^*]+)\*\*", text(paper)))
+
+
+def test_bill_of_materials_is_complete() -> None:
+    with (HARDWARE / "parts.csv").open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    assert len(rows) == len(parts()) > 20, "a part has two rows"
+    for row in rows:
+        assert None not in row, f"{row['part']}: a comma too many"
+        assert int(row["quantity"]) > 0
+        assert float(row["estimate_eur_each"]) > 0
+        assert row["status"] in {"paper", "data sheet", "never built"}
+        assert row["what_for"]
+        assert row["from"]
+
+
+def test_sum_of_the_bill_is_that_of_the_readme() -> None:
+    total = sum(int(row["quantity"]) * float(row["estimate_eur_each"]) for row in parts().values())
+    claimed = re.search(r"about (\d+) EUR", text("hardware/README.md"))
+    assert claimed is not None
+    assert float(claimed[1]) == pytest.approx(total, abs=10)
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_every_named_part_is_on_the_bill(paper: str) -> None:
+    assert len(named(paper)) > 8
+    assert named(paper) - set(parts()) == set()
+
+
+def test_every_part_of_the_bill_is_used() -> None:
+    """A part on the bill that no instruction uses is either not needed or forgotten."""
+    assert set(parts()) - set.union(*map(named, PAPERS)) == set()
+
+
+def test_pins_of_the_wiring_match_the_header() -> None:
+    assert len(wires()) >= 9
+    for pin, (line, signal, *_) in wires().items():
+        assert HEADER[pin] == line, f"pin {pin}"
+        if signal in BUSES:
+            assert BUSES[signal][0] == line
+    once = Counter(line for line, *_ in wires().values() if line.startswith("GPIO"))
+    assert max(once.values()) == 1
+
+
+def test_signal_is_on_the_bus_of_its_device() -> None:
+    for line, signal, _, entry in wires().values():
+        if signal in BUSES:
+            assert BUSES[signal][1] in entry, f"{line} is no line of {entry}"
+
+
+def test_heartbeat_line_is_pulled_down_from_reset() -> None:
+    """GPIO 9 to 27 are pulled down from reset; a heartbeat on another line would be high before any software runs."""
+    (heartbeat,) = wired_values("gpio.heartbeat")
+    assert 9 <= int(heartbeat) <= 27
+    assert "**pull-down**" in next(to for line, _, to, _ in wires().values() if line == f"GPIO{heartbeat}")
+
+
+@pytest.mark.parametrize("head", HEADS, ids=lambda path: path.stem)
+def test_wiring_matches_the_head_file(head: Path) -> None:
+    spec = load_head(head)
+    if spec.light.chain is not None:
+        assert wired_values("light.chain.device") == {spec.light.chain.device}
+    if spec.bus is not None:
+        assert wired_values("bus.device") == {spec.bus.device}
+        sda = wires()[3][2]
+        for part, address in (("thermometer", spec.bus.thermometer), ("fuel gauge", spec.bus.battery),
+                              ("head memory", spec.bus.memory)):  # fmt: skip
+            assert address is None or f"**{part}** 0x{address:02x}" in sda
+    if spec.gpio is not None:
+        assert wired_values("gpio.heartbeat") == {str(spec.gpio.heartbeat)}
+        assert wired_values("gpio.button") == {str(spec.gpio.button)}
+
+
+def test_head_file_lines_of_the_instructions_load(tmp_path: Path) -> None:
+    lines = re.findall(r"^```\n(\[gpio\]\n.*?)^```", text("hardware/wiring.md"), re.M | re.S)
+    (head := tmp_path / "head.toml").write_text(text("hardware/heads/imx296.toml") + "\n" + lines[0])
+    gpio = load_head(head).gpio
+    assert gpio is not None
+    assert {str(gpio.heartbeat)} == wired_values("gpio.heartbeat")
+    assert {str(gpio.button)} == wired_values("gpio.button")
+
+
+def test_dead_man_gate_closes_in_time_with_the_parts_of_the_bill() -> None:
+    """0.3 to 0.5 s (hardware/dead-man.md): R C for the 74LVC1G123, TI's SLVA720A; 0.45 R C for the alternative."""
+    uf = float(re.findall(r"([\d.]+) uF", parts()["timing capacitor"]["what_for"])[0])
+    ours_k, others_k = map(float, re.findall(r"(\d+) k\b", parts()["timing resistor"]["what_for"]))
+    assert parts()["one-shot"]["from"] == "74LVC1G123"
+    assert 0.3 < ours_k * uf / 1000 < 0.5
+    assert 0.3 < 0.45 * others_k * uf / 1000 < 0.5
+    assert f"{ours_k:g} k, {uf:g} uF" in text("hardware/pictures/wiring.svg")
+    assert f"C {uf:g} uF, and R {ours_k:g} k for a 74LVC1G123" in text("hardware/dead-man.md")
+
+
+def test_wiring_drawing_shows_the_table() -> None:
+    root = ElementTree.fromstring(text("hardware/pictures/wiring.svg"))
+    found = boxes(root)
+    assert overlapping(found) == []
+    lines = {re.sub(r"\s+", " ", box.words) for box in found}
+    for pin, (line, signal, to, _) in wires().items():
+        words = next((words for words in lines if re.match(rf"pin {pin} ", words)), "")
+        assert line in words, f"pin {pin}"
+        assert signal in ("supply", "ground") or signal in words
+        for part in re.findall(r"\*\*([^*]+)\*\*", to):
+            assert any(SHOWN_AS.get(part, part) in words for words in lines), part
+    assert {"0x48", "0x36", "0x50"} <= lines
+
+
+def test_light_path_drawing_is_up_to_date() -> None:
+    """Made by `diffuscope optics --head hardware/heads/imx296.toml --svg hardware/pictures/light-path.svg`."""
+    design = design_of_head(load_light_path(HARDWARE / "optics.toml"), load_head(HARDWARE / "heads" / "imx296.toml"))
+    assert text("hardware/pictures/light-path.svg") == draw_light_path(design)
+
+
+def test_figures_of_the_assembly_match_the_optics() -> None:
+    path = load_light_path(HARDWARE / "optics.toml")
+    design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296.toml"))
+    budget, relay = optical_budget(design), design.relay
+    small = optical_budget(replace(design, pupil_mm=3.0))
+    wide = optical_budget(replace(design, optics=path.optics.model_copy(update={"field_deg": 50.0})))
+    beside = ChainSpec(axis=(3, 3), leds=(18, 19, 20, 26, 28, 34, 35, 36))
+    figures = [
+        f"{relay.first_mm:g} mm before the first", f"{relay.first_mm + relay.second_mm:g} mm on two",
+        f"{relay.second_mm:g} mm behind the second lens", f"10 mm measure {10 * relay.pupil_magnification:.1f} mm",
+        f"the iris is {budget.iris_at_eye_mm:.2f} mm wide", f"has {budget.pupil_margin_mm:.2f} mm of margin",
+        f"one of 3 mm has {small.pupil_margin_mm:.2f} mm", f"0.1 mm are {10 / relay.diffuser_to_sensor_mm:.1f} %",
+        f"{path.relay.splitter_to_iris_mm:g} mm before the iris", f"beam is {budget.splitter_mm:.1f} mm wide there",
+        f"plate shows {path.relay.splitter_mm / 2**0.5:.1f} mm", f"ring of {budget.ring_at_pupil_mm:.2f} mm",
+        f"full cone of {budget.led_cone_deg:.2f} degrees", f"{budget.light.cornea_mw:.3f} mW of green",
+        f"about {200 * tan(radians(budget.field_deg / 2)) + budget.ring_at_pupil_mm:.1f} mm",
+        f"LEDs {', '.join(map(str, ring(path.ring)))}", f"reflex ({2 * budget.reflex_free_mm:.2f} mm)",
+        f"36: {ring_at_pupil_mm(beside, 0.75):.2f} mm", f"and {inner_ring_at_pupil_mm(beside, 0.75):.2f} mm at its",
+        f"the inner four: {ring_at_pupil_mm(ring_for_pupil(path.ring, 7, 0.75), 0.75):.2f} mm at the pupil",
+        f"its beam is {wide.splitter_mm:.1f} mm wide",
+    ]  # fmt: skip
+    guide = " ".join(f"{text('hardware/assembly.md')} {text(RING)}".split())
+    assert [figure for figure in figures if figure not in guide] == []
+
+
+def test_dioptre_steps_of_the_model_eye_match_the_guide() -> None:
+    """The guide has the vergence 1/s - 1/f at 21 and 29 mm behind a 25 mm lens, and the caustic's width."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    guide = " ".join(text("hardware/assembly.md").split())
+    shrinks_per_dpt = relay.diffuser_to_sensor_mm * relay.angular_magnification**2 / 1000
+    for distance_mm, kind, goes in ((21, "hyperopia", "wider"), (29, "myopia", "narrower")):
+        dpt = abs(1000 / distance_mm - 1000 / 25)
+        assert re.search(rf"{dpt:.2f}( dioptres)? of {kind}", guide)
+        assert re.search(rf"{100 * shrinks_per_dpt * dpt:.1f} % {goes}", guide)
+    assert f"bright disc, {7.7 * relay.pupil_magnification:.1f} mm" in guide
+
+
+def printed() -> set[str]:
+    """Return the names of the printed parts, one per file of models."""
+    stems = {path.stem for path in (HARDWARE / "parts" / "printed").glob("[a-z]*.py")}
+    return {stem.replace("_", " ").replace("led ", "LED ") for stem in stems}
+
+
+def test_bill_lists_exactly_the_printed_parts() -> None:
+    assert len(printed()) > 10
+    assert {name for name, row in parts().items() if row["from"].startswith("printed")} == printed()
+    guide = re.search(r"The (\w+) printed parts", text("hardware/assembly.md"))
+    assert guide is not None
+    assert {"fifteen": 15}[guide[1]] == len(printed())
+
+
+@pytest.mark.parametrize("name", ["printed", "exploded", "section", "eye"])
+def test_part_pictures_are_legible(name: str) -> None:
+    """The guide shows each picture; its names are on the bill, no name covers another, and the file is small."""
+    file = f"hardware/pictures/parts-{name}.svg"
+    assert f"(pictures/parts-{name}.svg)" in text("hardware/assembly.md")
+    found = boxes(ElementTree.fromstring(text(file)))
+    assert overlapping(found) == []
+    assert len({box.words for box in found} & {*parts(), *printed()}) >= 4
+    assert len(text(file)) < 150_000
+
+
+def test_every_printed_part_has_pictures() -> None:
+    """Each part is shown alone as printed, and in its place."""
+    shown = {name: text(f"hardware/pictures/parts-{name}.svg") for name in ("printed", "exploded", "eye")}
+    assert not [part for part in printed() if f">{part}<" not in shown["printed"]]
+    together = shown["exploded"] + shown["eye"]
+    assert [part for part in printed() if f">{part}<" not in together] == ["dust cap"]
+
+
+@pytest.mark.parametrize("ring_mm", [4.49, 10.04, 13.47, 16.19])
+def test_rings_of_the_led_board_match_the_guide(ring_mm: float) -> None:
+    """The rings lie on the board's own grid, 3.175 mm; neither 8 nor 9.5 mm lies on it."""
+    count = len(ring(ChainSpec(ring_mm=ring_mm, tolerance_mm=0.02)))
+    assert re.search(rf"{ring_mm:.2f} mm \({count}", text(RING))
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_commands_and_links_of_the_documents_exist(paper: str) -> None:
+    assert not [word for line in code_in(text(paper)) for word in unknown_words(line)]
+    for link in re.findall(r"\]\(([^)]+)\)", text(paper)):
+        assert (HARDWARE / link).is_file(), link
+    for name in re.findall(r"`([\w/-]+\.(?:md|csv|toml))`", text(paper)):
+        assert (HARDWARE / name).is_file(), name

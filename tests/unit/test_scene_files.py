@@ -1,0 +1,66 @@
+"""Simulated scenes as files, and the plan of their effects."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from device.config.head_file import load_head
+from device.errors import StoreError
+from device.sim.effects import EFFECTS
+from device.sim.scene_files import simulate
+
+SCENES = Path(__file__).parents[2] / "device" / "sim" / "scenes"
+
+
+def coarse(name):
+    """Return a scene with pixels four times as wide."""
+    spec = load_head(SCENES / name)
+    camera = spec.camera
+    smaller = {"rows": camera.rows // 4, "cols": camera.cols // 4, "pitch_um": 4 * camera.pitch_um}
+    return spec.model_copy(update={"camera": camera.model_copy(update=smaller)})
+
+
+def with_field(spec, field_deg):
+    return spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": field_deg})})
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_scene_can_be_simulated(path, tmp_path):
+    spec = coarse(path.name)
+    simulate(spec, tmp_path)
+    shape = (spec.camera.rows, spec.camera.cols)
+    raw, truth = tifffile.imread(tmp_path / "raw.tiff"), np.load(tmp_path / "truth.npy")
+    psf = tifffile.imread(tmp_path / "psf.tiff")
+    assert (raw.dtype, raw.shape) == (np.dtype(np.uint16), shape)
+    assert (truth.dtype, truth.shape) == (np.dtype(np.float32), shape)
+    assert (psf.dtype, psf.shape) == (np.dtype(np.float32), shape)
+    assert (raw == spec.camera.white_dn).mean() <= 2 * spec.sim.sensor.hot_pixels  # nothing else saturates
+    if spec.sim.object.kind == "retina":
+        vessels = np.asarray(Image.open(tmp_path / "vessels.png"))
+        assert vessels.shape == shape
+        assert set(np.unique(vessels)) == {0, 255}
+        assert truth[vessels > 0].mean() < truth[(vessels == 0) & (truth > 0)].mean()
+
+
+def test_plan_json_lists_every_effect(tmp_path):
+    simulate(coarse("healthy.toml"), tmp_path)
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert set(plan) == {effect.name for effect in EFFECTS}
+    for effect in plan.values():
+        assert set(effect) == {"simulated", "eta", "why", "cost_ms"}
+        assert math.isfinite(effect["eta"])
+        assert effect["simulated"] == (effect["eta"] >= 0.05)
+        assert effect["simulated"] or effect["cost_ms"] == 0
+    assert not plan["refraction"]["simulated"]
+    assert plan["shot"]["simulated"]
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_with_a_remedy(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot be written"):
+        simulate(coarse("healthy.toml"), tmp_path / "file" / "inside")

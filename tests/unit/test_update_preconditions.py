@@ -1,0 +1,86 @@
+"""Preconditions of an update for valid, empty and malformed answers of the instrument, and for other forms."""
+
+from datetime import UTC, datetime
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
+
+import pytest
+
+from services.errors import UpdateCapturesAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow
+from services.update.preconditions import refuse_while_in_use
+
+NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
+NO_JSON = [b"", b"not JSON", b'{"visits": [', b"\xff\xfe\xfd"]
+NO_OBJECT = [b"5", b"null", b"true", b"[1, 2]", b"[[]]", b"[{}]", b'"busy"']
+VISIT, CHECK = b'{"number": "PN-0007-K", "begun_at": "2026-11-20T11:50:00Z"}', b'{"name": "captures", "ok": false}'
+
+
+def failed_checks(**bodies: bytes | None) -> tuple[str, ...]:
+    """Return the failing checks of an instrument with these bodies of status, visits and health; None: error 500."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            body = bodies.get(self.path.removeprefix("/api/").partition("?")[0], b"{}")
+            self.send_response(500 if body is None else 200)
+            self.end_headers()
+            self.wfile.write(body or b"")
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        try:
+            return refuse_while_in_use(f"http://127.0.0.1:{server.server_port}", 0.5, NOW)
+        finally:
+            server.shutdown()
+
+
+@pytest.mark.parametrize("body", [None, *NO_JSON])
+def test_an_instrument_without_a_valid_status_counts_as_unreachable(body: bytes | None) -> None:
+    """It takes no pictures, so nothing else is read: the visit and the failed check do not count."""
+    assert failed_checks(status=body, visits=b'{"visits": [%s]}' % VISIT, health=b'{"battery": 0.1}') == ()
+
+
+@pytest.mark.parametrize("body", [None, *NO_JSON, b"[]", b"{}"])
+@pytest.mark.parametrize("name", ["visits", "health"])
+def test_an_answer_that_is_missing_malformed_or_empty_has_no_entries(name: str, body: bytes | None) -> None:
+    assert failed_checks(**{name: body}) == ()
+
+
+@pytest.mark.parametrize("status", [b"[]", b"{}", b'{"state": null}', b'{"state": "aim"}'])
+def test_visits_battery_and_checks_count_whether_or_not_the_status_names_a_state(status: bytes) -> None:
+    with pytest.raises(UpdateDuringExam, match="visit PN-0007-K is open, begun 10 minutes ago"):
+        failed_checks(status=status, visits=b'{"visits": [%s]}' % VISIT)
+    with pytest.raises(UpdatePowerLow):
+        failed_checks(status=status, health=b'{"battery": 0.49}')
+    with pytest.raises(UpdateCapturesAtRisk, match="unreadable"):
+        failed_checks(status=status, health=b'{"checks": [{"name": "captures", "ok": false, "value": "unreadable"}]}')
+    checks = b'{"battery": null, "checks": [{"name": "heat", "ok": false, "value": "70"}]}'
+    assert failed_checks(status=status, health=checks) == ("heat",)
+
+
+@pytest.mark.parametrize(
+    ("name", "body"),
+    [
+        *[(name, body) for name in ("status", "visits", "health") for body in NO_OBJECT],
+        ("status", b'{"state": 5}'),
+        ("visits", b'{"visits": 5}'),
+        ("visits", b'{"visits": null}'),
+        ("visits", b'{"visits": [5]}'),
+        ("visits", b'{"visits": [{"number": "PN-0007-K"}]}'),
+        ("visits", b'{"visits": [{"begun_at": "2026-11-20T11:50:00Z"}]}'),
+        ("visits", b'{"visits": [{"number": "PN-0007-K", "begun_at": "yesterday"}]}'),
+        ("visits", b'{"visits": [{"number": "PN-0007-K", "begun_at": "2026-11-20T11:50:00"}]}'),
+        ("health", b'{"battery": "half"}'),
+        ("health", b'{"checks": {"name": "heat"}}'),
+        ("health", b'{"checks": [%s]}' % CHECK),
+        ("health", b'{"checks": [{"ok": true, "value": ""}]}'),
+        ("health", b'{"checks": [{"name": "heat", "ok": "perhaps", "value": ""}]}'),
+    ],
+)
+def test_an_answer_of_another_form_refuses_the_update_with_a_remedy(name: str, body: bytes) -> None:
+    with pytest.raises(UpdateFailed, match=rf"to /api/{name}\S* has another form than expected") as refused:
+        failed_checks(**{name: body})
+    assert isinstance(refused.value, UpdateError)
+    assert refused.value.remedy == UpdateFailed.default_remedy

@@ -1,0 +1,172 @@
+// Templates that several screens share: tiles, thumbnails, patient labels, alert bar and chips, button groups, number
+// pad.
+
+import { captureFileUrl } from "../core/api.js";
+import { displayNumber } from "../core/numbers.js";
+import { icon, target } from "./icons.js";
+import { get, lostShots, slotPlan } from "../core/state.js";
+import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
+import { html, nothing } from "../vendor/lit-html.js";
+import { has, t } from "../i18n/translate.js";
+
+/** Return the translated eye and field of a slot: {eye, part}. */
+export const slotLabel = (state, slot) => {
+  const plan = slotPlan(state, slot);
+  return plan ? { eye: t(`eye.${plan.eye}`), part: fieldLabel(plan.field) } : { eye: "", part: "" };
+};
+
+// A field without a translation is shown by its name in the programme.
+export const fieldLabel = (field) => (has(`field.${field}`) ? t(`field.${field}`) : field);
+
+/** Return number, sex and age as one label. */
+export function patientLabel({ number: plain, fields }) {
+  const number = displayNumber(plain);
+  const sex = fields.sex ? t(`sex.${fields.sex}`) : "";
+  const details = [sex, fields.age].filter(Boolean).join(", ");
+  return details ? `${number} · ${details}` : number;
+}
+
+// ---- slot tiles: every picture is shown, also a poor one, with an icon for its state
+
+const TILE_FACES = {
+  empty: ["circle", "tile.empty"], // known fields show their drawing instead
+  good: ["star", "tile.good"],
+  poor: ["pen", "tile.poor"],
+  could_not: ["cross", "tile.could_not"],
+  making: ["wait", "tile.making"],
+  lost: ["warn", "tile.lost"],
+};
+
+function faceOf(state, id) {
+  const { shots, visit } = state;
+  const slot = visit?.slots[id];
+  if (shots.some((shot) => shot.visit === visit?.id && shot.slot === id && !shot.over)) return "making";
+  if (!slot || slot.state === "empty") return lostShots(state).some((shot) => shot.slot === id) ? "lost" : "empty";
+  if (slot.state === "could_not") return "could_not";
+  return slot.verdict?.word === "again" ? "poor" : "good";
+}
+
+/** Row of slot tiles. */
+export function tiles(state, actions) {
+  return html`
+    <div class="tiles" role="group" aria-label=${t("part.tiles")}>
+      ${(state.protocol?.slots ?? []).map((plan) => tile(state, actions, plan))}
+    </div>
+  `;
+}
+
+function tile(state, actions, { id, eye, field }) {
+  const face = faceOf(state, id);
+  const [mark, word] = TILE_FACES[face];
+  const capture = state.visit?.slots[id]?.capture ?? state.visit?.slots[id]?.captures.at(-1);
+  const short = `${t(`eye.${eye}.letter`)} · ${fieldLabel(field)}`;
+  const name = t("tile.name", { short, eye: t(`eye.${eye}`), state: t(word) }); // starts with the visible text (WCAG 2.5.3)
+  return html`
+    <button
+      type="button"
+      data-slot=${id}
+      data-face=${face}
+      aria-label=${name}
+      aria-current=${state.route.slot === id ? "step" : "false"}
+      ?disabled=${Boolean(state.visit?.finished_at) && !capture}
+      @click=${() => actions.chooseTile(id)}
+    >
+      <span class="thumb">${capture ? thumb(capture, actions) : nothing}<span class="mark">${face === "empty" && has(`field.${field}`) ? target(eye, field) : icon(mark)}</span></span>
+      <span class="tile-word">${short}</span>
+    </button>
+  `;
+}
+
+export const thumb = (capture, actions) =>
+  html`<img src=${captureFileUrl(capture, "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} />`;
+
+const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an exam
+
+// ---- alerts: one bar for a blocking alert, at most two chips
+
+/** Return the alert of the prompt bar: the blocking alert of highest priority, else the latest refused request. */
+export function topAlert(state) {
+  return visibleAlerts(state).stop ?? state.alerts.find(({ level }) => level === "refused") ?? null;
+}
+
+/** Bar of one alert with its text, countdown and buttons. */
+export function alertBar(one, actions) {
+  const left = timeLeft(one.until);
+  const text = one.assertive ? html`<p role="alert">${alertText(one)}</p>` : html`<p>${alertText(one)}</p>`;
+  const open = get().route.slot && !get().visit?.finished_at;
+  const shownButtons = one.buttons.filter((name) => open || !EXAM_BUTTONS.has(name));
+  const buttons = one.from === "press" ? [...shownButtons, "ok"] : shownButtons;
+  return html`
+    <div class="state-bar" data-code=${one.code}>
+      ${icon(one.code === "link.lost" ? "nolink" : "warn")} ${text} ${left ? html`<b class="clock">${left}</b>` : nothing}
+      ${buttons.length ? html`<span class="does">${buttons.map((name) => alertButton(one, name, actions))}</span>` : nothing}
+    </div>
+  `;
+}
+
+/** List of advisory alerts. */
+export function chips(state, actions) {
+  // The Send screen shows the text of these two alerts itself.
+  const shown = visibleAlerts(state).chips.filter(({ code }) => state.route.screen !== "send" || !code.startsWith("send."));
+  if (!shown.length) return nothing;
+  return html`
+    <ul class="notices" aria-label=${t("part.notices")}>
+      ${shown.map(
+        (one) => html`<li data-code=${one.code}>
+          <p role=${one.assertive ? "alert" : nothing}>${alertText(one)}</p>
+          ${one.until ? html`<b class="clock">${timeLeft(one.until)}</b>` : nothing} ${one.buttons.map((name) => alertButton(one, name, actions))}
+        </li>`,
+      )}
+    </ul>
+  `;
+}
+
+const ALERT_LINKS = { technician: "/technician", pin: "/technician", setClock: "/technician" };
+
+export const alertButton = (one, name, actions) =>
+  ALERT_LINKS[name]
+    ? html`<a class="button" href=${ALERT_LINKS[name]}>${t(`do.${name}`)}</a>`
+    : html`<button type="button" data-do=${name} @click=${() => actions.runAlertButton(name, one)}>${t(`do.${name}`)}</button>`;
+
+/** Group of toggle buttons: one choice, or several with `many`. */
+export function choice({ label, field, value, options, choose, many = false }) {
+  const on = (one) => (many ? (value ?? []).includes(one) : value === one);
+  return html`
+    <div class="choice" role="group" aria-label=${label} data-field=${field}>
+      ${options.map(
+        ([one, word]) => html`<button
+          type="button"
+          data-value=${String(one)}
+          aria-pressed=${on(one)}
+          @click=${() => choose(one)}
+        >
+          ${icon("check")}<span>${word}</span>
+        </button>`,
+      )}
+    </div>
+  `;
+}
+
+/** Reasons of the programme why a picture could not be taken, as buttons. */
+export function reasons({ protocol, route }, actions) {
+  return html`
+    <div class="reasons" role="group" aria-labelledby="why">
+      <h2 id="why">${t("result.why")}</h2>
+      ${protocol.reasons.map(
+        (reason) => html`<button type="button" data-reason=${reason} @click=${() => actions.couldNot(route.slot, reason)}>
+          ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
+        </button>`,
+      )}
+      <button class="quiet" type="button" id="not-asked" @click=${actions.closeReasons}>${t("back")}</button>
+    </div>
+  `;
+}
+
+/** Number pad, so that no keyboard is needed. */
+export function numberPad(press) {
+  const key = (value, word = value) =>
+    html`<button type="button" data-key=${value} @click=${() => press(value)}>${word}</button>`;
+  return html`<div class="pad">
+    ${["1", "2", "3", "4", "5", "6", "7", "8", "9"].map((digit) => key(digit))} ${key("erase", t("find.erase"))} ${key("0")}
+  </div>`;
+}

@@ -1,0 +1,107 @@
+// Picture area: live preview and taken picture in the same place, without layout shift, and the prompt line below.
+
+import { icon } from "./icons.js";
+import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
+import { slotLabel, topAlert, alertBar } from "./components.js";
+import { html } from "../vendor/lit-html.js";
+import { clockTime, has, t } from "../i18n/translate.js";
+
+export const isExamScreen = ({ route }) => route.screen === "aim" || route.screen === "picture";
+
+/** Live preview, picture viewer and prompt line; hidden outside the exam screens. */
+export function pictureArea(state, actions) {
+  const shot = currentShot(state);
+  const none = state.picture === "none" || !shot;
+  return html`
+    <section class="stage-area" aria-label=${t("part.live")} ?hidden=${!isExamScreen(state)}>
+      <div class="stage" data-mark=${none ? "none" : state.picture}>
+        <eye-live
+          class=${none ? "" : "behind"}
+          .head=${state.status}
+          .link=${state.link}
+          .eye=${eyeOf(state, state.route.slot)}
+          .visit=${allowsLight(state) ? state.route.visit : null}
+          .hint=${topAlert(state) ? null : state.prompt}
+          .active=${state.route.screen === "aim" && allowsLight(state)}
+          @refused=${actions.previewRefused}
+          @aim=${actions.previewAim}
+          @late=${actions.previewLate}
+        ></eye-live>
+        <eye-pic
+          id="picture"
+          class=${none ? "behind" : ""}
+          tabindex=${none ? "-1" : "0"}
+          aria-label=${pictureName(state, shot)}
+          .head=${state.status}
+          .subject=${shot?.key ?? null}
+          .redfree=${state.redfree}
+          .brightness=${state.brightness}
+          .contrast=${state.contrast}
+          .loupe=${state.loupe}
+          .src=${sourceOf(shot)}
+          @drawn=${actions.pictureDrawn}
+          @fault=${actions.pictureFault}
+          @zoomed=${actions.zoomed}
+          @loupe=${actions.loupeChanged}
+        ></eye-pic>
+      </div>
+      ${isExamScreen(state) ? prompt(state, actions) : ""}
+    </section>
+  `;
+}
+
+function sourceOf(shot) {
+  if (shot?.capture) return { url: shot.capture.links.picture, mark: "final" };
+  return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
+}
+
+// ---- prompt line: a blocking alert, the mark of the picture, or the aiming hint
+
+function prompt(state, actions) {
+  const stop = topAlert(state);
+  const [tone, name, text] = stop ? ["stop"] : promptOf(state);
+  const { eye, part } = slotLabel(state, state.route.slot);
+  const title = state.route.screen === "picture" && eye ? html`<b class="title">${eye} · ${part}</b> ` : "";
+  return html`<div class="prompt" role="status" data-tone=${tone}>
+    ${stop ? alertBar(stop, actions) : html`${icon(name)} <span>${title}${text}</span>`}
+  </div>`;
+}
+
+const HINT_ICONS = {
+  ready: "check",
+  still: "hand",
+  closer: "up",
+  back: "down",
+  left: "left",
+  right: "next",
+  up: "up",
+  down: "down",
+  dark: "sun",
+  bright: "sun",
+};
+
+function promptOf(state) {
+  const { route, note, activity, prompt: hint } = state;
+  if (note) return ["wait", "wait", note];
+  if (route.screen === "picture") return markPrompt(state);
+  if (state.visit && consentOf(state.visit) === "saving") return ["wait", "wait", t("save.waiting")];
+  if (activity === "starting") return ["wait", "wait", t("aim.starting")];
+  if (activity !== "aim" && activity !== "making") return ["wait", "wait", t("aim.busy")];
+  if (!hint || !has(`aim.${hint.code}`)) return ["plain", "ring", t("aim.prompt")];
+  return [hint.code === "ready" ? "ready" : "plain", HINT_ICONS[hint.code] ?? "ring", t(`aim.${hint.code}`)];
+}
+
+function markPrompt(state) {
+  const shot = currentShot(state);
+  if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
+  if (state.picture === "final") return ["done", "check", t("mark.final")];
+  if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
+  return shot.stage.name === "expose" && !shot.verdict ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
+}
+
+function pictureName(state, shot) {
+  if (!shot || state.picture === "none") return t("pic.none");
+  const time = shot.capture ? clockTime(shot.capture.taken_at) : "";
+  const { eye, part } = slotLabel(state, shot.slot);
+  return t("pic.name", { mark: t(`mark.${state.picture}`), eye: eye || t(`eye.${eyeOf(state, shot.slot)}`), part, time });
+}

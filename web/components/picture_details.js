@@ -1,0 +1,40 @@
+// Details dialog of a picture: reconstruction data, files to download, and the change to the other eye.
+
+import { icon } from "./icons.js";
+import { html, nothing } from "../vendor/lit-html.js";
+import { number, t } from "../i18n/translate.js";
+
+const dialog = () => document.querySelector("#details");
+export const open = () => dialog()?.showModal();
+const close = () => dialog()?.close();
+
+export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
+  const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
+  const rows = [
+    ["method", report.method],
+    ["rounds", report.rounds],
+    ["stopped", report.stopped],
+    ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
+    ["calibration", calibration],
+    ["id", id],
+  ];
+  const move = () => {
+    close();
+    actions.moveToOtherEye(slot, id);
+  };
+  return html`<dialog id="details" aria-labelledby="details-title">
+    <h2 id="details-title">${t("result.details")}</h2>
+    ${(report.warnings ?? []).map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
+    ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
+    <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
+    <p class="links">
+      ${visit?.finished_at
+        ? nothing
+        : html`<button type="button" id="other-eye" @click=${move}>
+            ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
+          </button>`}
+      ${["picture", "raw", "report"].map((key) => html`<a class="button" href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
+    </p>
+    <button class="primary" type="button" @click=${close}>${t("menu.close")}</button>
+  </dialog>`;
+}

@@ -1,0 +1,314 @@
+// <eye-pic>: picture viewer with zoom, pan, loupe, red-free, brightness and contrast. Gestures: gestures.js; tools:
+// renderer.js; drawing: canvas.js. Light DOM, so that style sheet and tests reach its parts. Loaded on demand.
+
+import { getBitmap } from "../../core/api.js";
+import { clamp, fitCanvas, homeBox } from "../../core/viewport.js";
+import { Gestures } from "./gestures.js";
+import { drawLoupe, drawPicture } from "./canvas.js";
+import { pictureRenderer } from "./renderer.js";
+import { NEUTRAL } from "./lookup_table.js";
+
+const ZOOM_MAX = 8;
+const DOUBLE_TAP_ZOOM = 3;
+const STEP = 1.5;
+const FADE_MS = 200;
+const WHOLE_VIEW = Object.freeze({ zoom: 1, u: 0, v: 0, loupe: null });
+const EARLY_PROPERTIES = ["view", "subject", "src", "head", "redfree", "brightness", "contrast", "loupe"];
+
+/** Custom element <eye-pic>; dispatches "drawn", "fault", "zoomed", "looked" and "loupe". */
+export class PictureViewer extends HTMLElement {
+  #src = null;
+  #subject = null;
+  #head = null;
+  #tools = NEUTRAL;
+  #bitmap = null;
+  #mark = "";
+  #previous = null; // the previous picture during the fade
+  #fadeStartMs = 0;
+  #loading = new AbortController(); // pending requests of this subject
+  #frame = 0;
+  // Positions are fractions of the picture width from the centre, independent of its resolution.
+  #view = WHOLE_VIEW; // loupe: {u, v, held} or null; `held` during a long press
+  #canvas = document.createElement("canvas");
+  #onChange = () => this.#redraw();
+
+  constructor() {
+    super();
+    new Gestures(this);
+    new ResizeObserver(this.#onChange).observe(this);
+    this.#canvas.addEventListener("contextrestored", this.#onChange);
+  }
+
+  connectedCallback() {
+    this.tabIndex = 0;
+    this.setAttribute("role", "img");
+    this.append(this.#canvas);
+    pictureRenderer().addEventListener("changed", this.#onChange);
+    document.addEventListener("visibilitychange", this.#onChange);
+    for (const name of EARLY_PROPERTIES.filter((one) => Object.hasOwn(this, one))) {
+      const value = this[name]; // set by the page before this module was loaded
+      delete this[name];
+      this[name] = value;
+    }
+    this.#publishState();
+    this.#redraw();
+  }
+
+  disconnectedCallback() {
+    pictureRenderer().removeEventListener("changed", this.#onChange);
+    document.removeEventListener("visibilitychange", this.#onChange);
+    this.#clear();
+  }
+
+  /** The page's renderer, for diagnostics. */
+  static get renderer() {
+    return pictureRenderer().renderer;
+  }
+
+  /** The view of another viewer, for synchronised zoom and loupe: {zoom, u, v, loupe}. */
+  set view({ zoom, u, v, loupe }) {
+    this.#setView({ zoom, u, v, loupe: loupe ?? null }, false);
+  }
+
+  /** Identity of the picture: a new subject resets the view, the same one keeps it. */
+  set subject(name) {
+    if (name === this.#subject) return;
+    this.#subject = name;
+    this.#clear();
+    this.showAll();
+  }
+
+  /** {url or blob, mark: "quick" | "final"} or null. The mark is published after its pixels are drawn. */
+  set src(src) {
+    if (src?.url === this.#src?.url && src?.blob === this.#src?.blob) return;
+    if (!src) this.#clear();
+    this.#src = src;
+    if (src) this.#load(src);
+  }
+
+  set head(head) {
+    this.#head = head;
+    this.#redraw();
+  }
+
+  set redfree(redfree) {
+    this.#setTools({ redfree });
+  }
+
+  set brightness(brightness) {
+    this.#setTools({ brightness });
+  }
+
+  set contrast(contrast) {
+    this.#setTools({ contrast });
+  }
+
+  /** Whether the loupe is shown; drag, tap and arrow keys move it. */
+  set loupe(on) {
+    if (Boolean(on) === this.hasLoupe) return;
+    const { u, v } = this.#view;
+    this.#setView({ loupe: on ? { u, v, held: false } : null });
+  }
+
+  get hasLoupe() {
+    return Boolean(this.#view.loupe && !this.#view.loupe.held);
+  }
+
+  zoomIn() {
+    this.zoomBy(STEP);
+  }
+
+  zoomOut() {
+    this.zoomBy(1 / STEP);
+  }
+
+  showAll() {
+    const { loupe } = this.#view;
+    this.#view = { ...WHOLE_VIEW, loupe: loupe && { ...loupe, u: 0, v: 0 } };
+    this.#viewChanged();
+  }
+
+  // ---- picture and tools
+
+  async #load({ url, blob, mark }) {
+    const { signal } = this.#loading;
+    try {
+      const bitmap = await (blob ? createImageBitmap(blob) : getBitmap(url, signal));
+      // The quick look is shown only until the final picture is loaded.
+      if (signal.aborted || (mark === "quick" && this.#mark === "final")) return;
+      this.#show(bitmap, mark);
+      const grey = pictureRenderer().isGrey(bitmap);
+      this.dispatchEvent(new CustomEvent("drawn", { detail: { url, mark, grey } }));
+    } catch {
+      if (!signal.aborted) this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
+    }
+  }
+
+  #show(bitmap, mark) {
+    const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.#releaseBitmap(this.#previous);
+    this.#previous = this.#bitmap;
+    this.#fadeStartMs = bitmap && !reducedMotion ? performance.now() : -Infinity;
+    this.#bitmap = bitmap;
+    this.#mark = mark;
+    this.dataset.drawn = ""; // written after the final draw
+    this.#publishState();
+    this.#redraw();
+  }
+
+  #releaseBitmap(bitmap) {
+    if (!bitmap) return;
+    pictureRenderer().release(bitmap);
+    bitmap.close();
+  }
+
+  #clear() {
+    this.#loading.abort();
+    this.#loading = new AbortController();
+    this.#src = null;
+    for (const bitmap of [this.#previous, this.#bitmap]) this.#releaseBitmap(bitmap);
+    this.#previous = this.#bitmap = null;
+    this.#show(null, "");
+  }
+
+  #setTools(patch) {
+    this.#tools = { ...this.#tools, ...patch };
+    this.#redraw();
+  }
+
+  // ---- drawing
+
+  #redraw() {
+    if (!this.#frame) this.#frame = requestAnimationFrame(() => this.#draw());
+  }
+
+  #draw() {
+    this.#frame = 0;
+    if (document.hidden || !fitCanvas(this.#canvas)) return; // drawn when the page is visible
+    const context = this.#canvas.getContext("2d", { alpha: false });
+    context.fillStyle = "#000";
+    context.fillRect(0, 0, this.#canvas.width, this.#canvas.height);
+    if (!this.#bitmap) return;
+    const fade = this.#previous ? clamp((performance.now() - this.#fadeStartMs) / FADE_MS, 0, 1) : 1;
+    if (fade < 1) this.#drawBitmap(context, this.#previous);
+    context.globalAlpha = fade;
+    this.#drawBitmap(context, this.#bitmap);
+    context.globalAlpha = 1;
+    this.dataset.painter = PictureViewer.renderer.name;
+    if (fade < 1) return this.#redraw();
+    this.#releaseBitmap(this.#previous);
+    this.#previous = null;
+    const { redfree, brightness, contrast } = this.#tools;
+    this.dataset.drawn = `${this.#mark} ${redfree ? "red-free" : "colour"} ${brightness} ${contrast}`;
+  }
+
+  #drawBitmap(context, bitmap) {
+    const { zoom, u, v, loupe } = this.#view;
+    const { width, height } = this.#bitmap; // a smaller quick look is scaled to the size of the final picture
+    const scale = this.#baseScale() * zoom;
+    const shown = pictureRenderer().render(bitmap, this.#tools);
+    drawPicture(context, shown, { u, v, width: width * scale, height: height * scale });
+    if (loupe) drawLoupe(context, shown, { u, v, width: width * scale, height: height * scale, loupe });
+  }
+
+  /** Canvas pixels per picture pixel at zoom 1. */
+  #baseScale() {
+    const home = homeBox(this.#head, this.#bitmap.width, this.#bitmap.height);
+    return Math.min(this.#canvas.width / home.width, this.#canvas.height / home.height);
+  }
+
+  // Publish the state as data attributes, for tests.
+  #publishState() {
+    const { zoom, loupe } = this.#view;
+    this.dataset.zoom = zoom.toFixed(2);
+    this.dataset.mark = this.#mark;
+    this.dataset.loupe = loupe ? `${loupe.u.toFixed(3)},${loupe.v.toFixed(3)}` : "";
+    this.dispatchEvent(new CustomEvent("zoomed", { detail: zoom }));
+  }
+
+  // ---- view
+
+  #viewChanged(notify = true) {
+    this.#publishState();
+    this.#redraw();
+    if (notify) this.dispatchEvent(new CustomEvent("looked", { detail: this.#view }));
+  }
+
+  /** Set the view, limited to the picture. */
+  #setView(patch, notify = true) {
+    if (!this.#bitmap) return;
+    const requested = { ...this.#view, ...patch };
+    const { width, height } = this.#bitmap;
+    const home = homeBox(this.#head, width, height);
+    const zoom = clamp(requested.zoom, 1, ZOOM_MAX);
+    const scale = this.#baseScale() * zoom;
+    const [visibleU, visibleV] = [this.#canvas.width, this.#canvas.height].map((size) => size / scale / width / 2);
+    const limitU = Math.max(0, home.width / width / 2 - visibleU);
+    const limitV = Math.max(0, home.height / width / 2 - visibleV);
+    const u = clamp(requested.u, -limitU, limitU);
+    const v = clamp(requested.v, -limitV, limitV);
+    const loupe = requested.loupe && {
+      held: requested.loupe.held,
+      u: clamp(requested.loupe.u, u - visibleU, u + visibleU),
+      v: clamp(requested.loupe.v, v - visibleV, v + visibleV),
+    };
+    this.#view = { zoom, u, v, loupe };
+    this.#viewChanged(notify);
+  }
+
+  /** Zoom about the point (x, y), in CSS pixels from the centre. */
+  zoomBy(factor, x = 0, y = 0) {
+    if (!this.#bitmap) return;
+    const { zoom, u, v } = this.#view;
+    const next = clamp(zoom * factor, 1, ZOOM_MAX);
+    const perPixel = this.#perCssPixel();
+    this.#setView({ zoom: next, u: u + (x / zoom - x / next) * perPixel, v: v + (y / zoom - y / next) * perPixel });
+  }
+
+  panBy(x, y) {
+    if (!this.#bitmap) return;
+    const { zoom, u, v } = this.#view;
+    const perPixel = this.#perCssPixel() / zoom;
+    this.#setView({ u: u - x * perPixel, v: v - y * perPixel });
+  }
+
+  doubleTap(x, y) {
+    if (this.#view.zoom > 1.01) this.showAll();
+    else this.zoomBy(DOUBLE_TAP_ZOOM, x, y);
+  }
+
+  /** Move the loupe; at the edge of the visible part the picture follows. */
+  moveLoupe(x, y) {
+    const { zoom, u, v, loupe } = this.#view;
+    if (!this.#bitmap || !loupe) return;
+    const perPixel = this.#perCssPixel() / zoom;
+    const requested = { ...loupe, u: loupe.u + x * perPixel, v: loupe.v + y * perPixel };
+    this.#setView({ loupe: requested });
+    const actual = this.#view.loupe;
+    this.#setView({ u: u + requested.u - actual.u, v: v + requested.v - actual.v, loupe: requested });
+  }
+
+  /** Place the loupe at a point, in CSS pixels from the centre; `held` during a long press. */
+  placeLoupe([x, y], held) {
+    if (!this.#bitmap) return;
+    const { zoom, u, v } = this.#view;
+    const perPixel = this.#perCssPixel() / zoom;
+    this.#setView({ loupe: { u: u + x * perPixel, v: v + y * perPixel, held } });
+  }
+
+  hideLoupe() {
+    this.#setView({ loupe: null });
+  }
+
+  toggleLoupe() {
+    this.loupe = !this.hasLoupe;
+    this.dispatchEvent(new CustomEvent("loupe", { detail: this.hasLoupe }));
+  }
+
+  /** Return picture widths per CSS pixel at zoom 1. */
+  #perCssPixel() {
+    return this.#canvas.width / this.#canvas.clientWidth / this.#baseScale() / this.#bitmap.width;
+  }
+}
+
+customElements.define("eye-pic", PictureViewer);

@@ -1,0 +1,227 @@
+// User actions by tap or key: one object of handlers that templates and keyboard share.
+
+import { captureFileUrl, getFolders, requestControl } from "./api.js";
+import { clamp, homeBox } from "./viewport.js";
+import { get, saveSetting, set, currentShot } from "./state.js";
+import { displayNumber, applyKey } from "./numbers.js";
+import { playCue, resetPictureTools, takePicture, acceptTap } from "./capture.js";
+import { qrCode } from "./qr_code.js";
+import { navigate } from "./router.js";
+import { dismissAlert, lowerAlerts, raiseAlert } from "./alerts.js";
+import * as visits from "./visit.js";
+import { loadLanguage, t, today } from "../i18n/translate.js";
+
+const $ = (selector) => document.querySelector(selector);
+const currentRoute = () => get().route;
+const PUPIL_REST_MS = 60_000;
+const TOOL_STEPS = 5; // largest step of brightness and contrast, in either direction
+
+const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit, slot });
+
+const navigationActions = {
+  go: navigate,
+  begin: (number) => acceptTap() && visits.begin(number),
+  resume: visits.resume,
+  retryUploads: visits.retryUploads,
+  startAiming: () => acceptTap() && navigate({ screen: "aim", visit: get().visit.id, slot: get().visit.next_slot ?? visits.nextSlot() }),
+  setField: visits.setField,
+  typeNumber(key) {
+    const typed = applyKey(get().typed, key, 12);
+    set({ typed });
+    visits.refreshList(typed ? { q: typed, limit: "20" } : { day: today(), limit: "20" });
+  },
+  /** Resume the visit with exactly this number; otherwise begin a new visit. */
+  enterNumber() {
+    const same = (get().visits ?? []).find(({ number }) => [number, displayNumber(number)].includes(get().typed));
+    if (same) visits.resume(same);
+    else navigationActions.begin(get().typed);
+  },
+  setListFilter: (listFilter) => set({ listFilter }),
+
+  /** Go up one level: picture -> patient -> Home; on other screens, back in the browser history. */
+  back() {
+    const { screen, visit, capture } = currentRoute();
+    const fromExam = screen === "aim" || (screen === "picture" && !capture && !get().visit?.finished_at);
+    if (get().asking) set({ asking: false });
+    else if (fromExam) navigate({ screen: "person", visit });
+    else if (history.state?.depth && screen !== "person" && screen !== "outcome") history.back();
+    else navigate({ screen: "home" }, { replace: !history.state?.depth });
+  },
+
+  /** Show the picture of a slot; if the slot is empty, aim at it. */
+  chooseTile(slot) {
+    const { visit, shots } = get();
+    const pendingShots = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
+    lowerAlerts(({ from }) => from === "press");
+    if (pendingShots || visit.finished_at || visit.slots[slot].captures.length) navigate({ screen: "picture", visit: visit.id, slot });
+    else goToAim(slot);
+  },
+};
+
+const examActions = {
+  take: takePicture,
+  again: () => acceptTap() && goToAim(currentRoute().slot),
+  keepPrevious: () => acceptTap() && navigate({ screen: "picture", visit: currentRoute().visit, slot: currentRoute().slot }),
+  next: () => acceptTap() && visits.goToNextSlot(currentRoute().slot),
+  keepThis: () => acceptTap() && visits.keepPoor(currentShot(get()).id, currentRoute().slot),
+  useThis: () => acceptTap() && visits.useInSlot(currentRoute().slot, currentRoute().capture),
+  ask: () => acceptTap() && set({ asking: true }),
+  closeReasons: () => set({ asking: false }),
+  couldNot: (slot, reason) => acceptTap() && visits.couldNot(slot, reason),
+  finish: () => acceptTap() && visits.finish(),
+  reopen: () => acceptTap() && visits.reopen(),
+  backToOutcome: () => navigate({ screen: "outcome", visit: currentRoute().visit }),
+  moveToOtherEye: (slot, capture) => acceptTap() && visits.moveToOtherEye(slot, capture),
+  print: () => window.print(),
+
+  async toggleQrCode() {
+    const drawn = await qrCode(visits.qrText(get()));
+    set({ code: get().code ? undefined : drawn });
+  },
+
+  openFilm: (visit) => {
+    set({ visit });
+    navigate({ screen: "film", visit: visit.id });
+  },
+  openDetails: () => get().modules.details?.open(),
+  openPicture: (slot, capture) => navigate({ screen: "picture", visit: currentRoute().visit, slot, capture }),
+  pick(id) {
+    const { picked } = get();
+    set({ picked: picked.includes(id) ? picked.filter((one) => one !== id) : [...picked, id].slice(-2) });
+  },
+  compare: () => navigate({ screen: "compare", visit: currentRoute().visit, capture: get().picked[0], other: get().picked[1] }),
+  setBlink: (blink) => set({ blink, front: 0 }),
+  swap: () => set({ front: get().front ? 0 : 1 }),
+  linkZoom({ target, detail }) {
+    for (const pic of document.querySelectorAll(".two eye-pic")) if (pic !== target) pic.view = detail;
+  },
+  listFolders: async () => set({ folders: (await visits.alertOnError(getFolders)) ?? null, copied: null, zipped: false }),
+  zipped: () => set({ folders: null, copied: null, zipped: true }),
+  copyTo: visits.copyTo,
+};
+
+// Cache of one source object per capture, so that a render does not reload a picture.
+const finals = new Map();
+
+const pictureActions = {
+  finalSource(id) {
+    if (!finals.has(id)) finals.set(id, { url: captureFileUrl(id, "picture.png"), mark: "final" });
+    return finals.get(id);
+  },
+
+  // Show the mark "final" only after the viewer has drawn the final picture.
+  pictureDrawn({ detail }) {
+    set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
+  },
+
+  pictureFault({ detail }) {
+    if (detail.mark === "quick") return; // the final picture is still to come
+    raiseAlert({ code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy"), from: "press" });
+  },
+
+  zoomed: ({ detail }) => set({ zoom: detail }),
+  zoomIn: () => $("#picture").zoomIn(),
+  zoomOut: () => $("#picture").zoomOut(),
+  setRedfree: (redfree) => set({ redfree }),
+  contrastBy: (step) => set({ contrast: clamp(get().contrast + step, -TOOL_STEPS, TOOL_STEPS) }),
+  brightnessBy: (step) => set({ brightness: clamp(get().brightness + step, -TOOL_STEPS, TOOL_STEPS) }),
+  setLoupe: (loupe) => set({ loupe }),
+  loupeChanged: ({ detail }) => set({ loupe: detail }),
+
+  reset() {
+    set({ brightness: 0, contrast: 0, loupe: false });
+    $("#picture").showAll();
+  },
+
+  // Scale a thumbnail to its illuminated disc, without the dark frame around it.
+  thumbLoaded({ target }) {
+    const { naturalWidth: width, naturalHeight: height } = target;
+    const home = homeBox(get().status, width, height);
+    target.style.transform = `scale(${Math.min(width, height) / Math.min(home.width, home.height)})`;
+  },
+};
+
+// ---- buttons of alerts, by the name in the table of alerts.js
+
+const alertButtons = {
+  ok: ({ code }) => lowerAlerts(code),
+  later: dismissAlert,
+  dateIsRight: dismissAlert,
+  retry: () => pageHooks.refreshStatus(),
+  useHere: async () => {
+    const answer = await visits.alertOnError(() => requestControl(true));
+    if (answer) pageHooks.setControl(answer);
+  },
+  otherEye() {
+    const { protocol } = get();
+    const now = protocol.slots.find(({ id }) => id === currentRoute().slot);
+    lowerAlerts(({ code }) => code.startsWith("light."));
+    goToAim(protocol.slots.find(({ eye, field }) => eye !== now.eye && field === now.field).id);
+  },
+  finish: () => examActions.finish(),
+  ask: () => navigate({ screen: "person", visit: currentRoute().visit }),
+  how: () => navigate(currentRoute().visit ? { screen: "film", visit: currentRoute().visit } : { screen: "history" }),
+  takeNow({ visit, slot }) {
+    lowerAlerts("power.lost");
+    if (visit && slot) navigate({ screen: "aim", visit, slot });
+  },
+  see: () => navigate({ screen: "send" }),
+  why: () => navigate({ screen: "send" }),
+  tryNow({ code }) {
+    lowerAlerts(code);
+    visits.retryUploads();
+  },
+  next: () => examActions.next(),
+  again: () => examActions.again(),
+  couldNot: () => examActions.ask(),
+  timer: () => set({ timer: Date.now() + PUPIL_REST_MS, now: Date.now() }),
+  change({ id, slot }) {
+    lowerAlerts("eye.side");
+    visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentShot(get()).id);
+  },
+  keepEye({ code, id, slot }) {
+    dismissAlert({ code }); // hide the question until the server has the answer
+    visits.confirmEye(slot ?? currentRoute().slot, id ?? currentShot(get()).id);
+  },
+  uncross: visits.undoCouldNot,
+};
+
+const settingsActions = {
+  openMenu: () => $("#menu").showModal(),
+  closeMenu: () => $("#menu").close(),
+
+  setTheme(theme) {
+    saveSetting("theme", theme);
+    set({ theme });
+  },
+  setLetters({ target }) {
+    saveSetting("letters", target.checked ? "on" : "off");
+    set({ letters: target.checked });
+  },
+  setSound({ target }) {
+    saveSetting("sound", target.checked ? "on" : "off");
+    set({ sound: target.checked });
+    playCue("good");
+  },
+  setAuto({ target }) {
+    saveSetting("auto", target.checked ? "on" : "off");
+    set({ auto: target.checked });
+  },
+  async setLanguage(language) {
+    await loadLanguage(language);
+    saveSetting("language", language);
+    set({ language });
+  },
+};
+
+/** Functions that app.js provides for the alert buttons. */
+export const pageHooks = { refreshStatus: () => {}, setControl: () => {} };
+
+export const actions = {
+  ...navigationActions,
+  ...examActions,
+  ...pictureActions,
+  ...settingsActions,
+  resetPictureTools,
+  runAlertButton: (name, state) => alertButtons[name](state),
+};

@@ -1,0 +1,167 @@
+// Alerts: one table of all states that the page can show, and the rules that choose what is visible. Texts:
+// "state.CODE" in en.js. A blocking alert is shown in the prompt bar and in the shutter ("stop.CODE"), an advisory one
+// as a chip.
+
+import { consentOf, get, lostShots, set } from "./state.js";
+import { calendarDay, has, t } from "../i18n/translate.js";
+
+const ASSERTIVE = /^(link\.lost|light\.|heat\.)/;
+
+// Highest priority first. Levels: `stop` blocks captures; `tell` is an advisory chip; `shot` belongs to one picture and
+// is shown on its card; `ask` is a question on that card. `wait_s`: seconds until the alert ends by itself; "n": the n
+// minutes that the server sent. A `wait_s` from the server takes precedence.
+const TABLE = [
+  ["link.lost", "stop", []],
+  ["link.other", "stop", ["useHere"]],
+  ["light.fault", "stop", ["technician"]],
+  ["camera.missing", "stop", ["retry", "technician"]],
+  ["heat.hot", "stop", [], { wait_s: 300 }],
+  ["batt.empty", "stop", []],
+  ["consent.declined", "stop", ["finish"]],
+  ["consent.missing", "stop", ["ask"]],
+  ["light.day", "stop", ["finish"]],
+  ["light.limit", "stop", ["otherEye"], { wait_s: "n" }],
+  ["store.full", "stop", ["how"]],
+  ["cal.missing", "stop", ["technician"]],
+  ["cal.mismatch", "stop", ["technician"]],
+  ["light.cut", "refused", []],
+  ["shot.lost", "tell", ["takeNow"]],
+  ["shot.crossed", "tell", ["uncross"], { wait_s: 10 }],
+  ["camera.stalled", "tell", []],
+  ["power.lost", "tell", ["takeNow"]],
+  ["link.slow", "tell", []],
+  ["batt.low", "tell", []],
+  ["store.low", "tell", []],
+  ["clock.wrong", "tell", ["dateIsRight", "setClock"]],
+  ["send.stuck", "tell", ["why", "tryNow"]],
+  ["make.slow", "tell", ["next"]],
+  ["heat.warm", "tell", []],
+  ["send.waiting", "tell", ["see"]],
+  ["cal.old", "tell", ["later"]],
+  ["eye.side", "ask", ["change", "keepEye"]],
+  ["make.failed", "shot", ["again", "next"]],
+  ["shot.poor", "shot", ["couldNot", "again"]],
+  ["shot.pupil", "shot", ["timer", "again"]],
+  ...["shot.saturated", "shot.dark", "shot.moved", "shot.blink", "shot.noeye", "shot.edge", "shot.halo"].map((code) => [
+    code,
+    "shot",
+    ["again"],
+  ]),
+];
+
+export const ALERTS = Object.freeze(
+  Object.fromEntries(
+    TABLE.map(([code, level, buttons, more], rank) => [
+      code,
+      Object.freeze({ code, level, buttons, rank, assertive: ASSERTIVE.test(code), ...more }),
+    ]),
+  ),
+);
+
+// Server codes that are one alert on this page.
+const SAME = {
+  "head.hot": "heat.hot",
+  "power.low": "batt.empty",
+  "calibration.missing": "cal.missing",
+  "calibration.damaged": "cal.missing",
+  "calibration.old": "cal.missing",
+  "calibration.mode": "cal.mismatch",
+  "calibration.stale": "cal.mismatch",
+  "head.mismatch": "cal.mismatch",
+};
+
+// Defaults for a code that is not in the table: a server status blocks captures, a refused request is advisory.
+const UNKNOWN = { buttons: [], assertive: false };
+
+/** Return the text of an alert: translated, or the server's text where a number is missing. */
+export function alertText({ code, message, remedy, ...vars }) {
+  const key = `state.${code}`;
+  const values = translatedValues(vars);
+  if (has(key, values)) return t(key, values);
+  return message ? `${message} ${remedy ?? ""}`.trim() : t("fault.unknown");
+}
+
+const translatedValues = ({ eye, other, slot, ...vars }) => ({
+  ...vars,
+  ...(eye ? { eye: t(`eye.${eye}`) } : {}),
+  ...(other ? { other: t(`eye.${other}.word`) } : {}),
+  ...(/^\d{4}-/.test(vars.date) ? { date: calendarDay(vars.date) } : {}),
+  ...(slot ? { part: t(`field.${slot.split("-")[1] ?? slot}`) } : {}),
+});
+
+const dismissed = new Set(); // codes that the user dismissed; hidden until the alert ends
+
+/** Hide an alert on this page until it ends. */
+export function dismissAlert({ code }) {
+  dismissed.add(code);
+  lowerAlerts(code);
+}
+
+/** Replace the server's alerts with the list `all`; those that are missing from the list have ended. */
+export function syncNotices(all) {
+  const codes = new Set(all.map(({ code }) => code));
+  for (const code of dismissed) if (!codes.has(code)) dismissed.delete(code);
+  lowerAlerts(({ from, level, code }) => from === "notice" && level !== "ask" && !codes.has(code));
+  for (const one of all) raiseAlert({ ...one, from: "notice" });
+}
+
+/** End an alert of the server; it is shown if it begins again. */
+export function endNotice(code) {
+  dismissed.delete(code);
+  lowerAlerts(code);
+}
+
+/**
+ * Begin or update an alert. `from` names what ends it: "status" (the next status without a problem), "press" (OK,
+ * another screen or the next press), "notice" (the server), or "page".
+ */
+export function raiseAlert({ code: reported, from, ...vars }) {
+  const code = SAME[reported] ?? reported;
+  if (from === "notice" && dismissed.has(code)) return;
+  const known = ALERTS[code] ?? { ...UNKNOWN, code, level: from === "press" ? "refused" : "stop", rank: 3 };
+  const wait = vars.wait_s ?? (known.wait_s === "n" ? vars.n * 60 : known.wait_s);
+  const before = get().alerts.find((state) => state.code === code);
+  const until = before?.until || (wait ? Date.now() + wait * 1000 : 0);
+  const state = Object.freeze({ ...known, ...vars, code, from, until });
+  set({ alerts: Object.freeze([...get().alerts.filter((other) => other.code !== code), state].sort(worstFirst)) });
+}
+
+/** End the alerts with this code, or those for which `test(alert)` is true. */
+export function lowerAlerts(test) {
+  const code = SAME[test] ?? test;
+  const gone = typeof code === "function" ? code : (state) => state.code === code;
+  const left = get().alerts.filter((state) => !gone(state));
+  if (left.length !== get().alerts.length) set({ alerts: Object.freeze(left) });
+}
+
+const worstFirst = (one, other) => one.rank - other.rank;
+
+/** Return the blocking alert of a visit without consent. */
+function consentAlerts({ route, visit }) {
+  if (route.screen !== "aim" || visit?.id !== route.visit) return [];
+  const known = ALERTS[`consent.${consentOf(visit)}`];
+  return known ? [{ ...known, from: "visit" }] : [];
+}
+
+/** Return at most one blocking alert and two chips, highest priority first, and a chip for each lost picture. */
+export function visibleAlerts(state) {
+  const { alerts } = state;
+  const lost = lostShots(state).map((shot) => ({ ...shot, ...ALERTS["shot.lost"], assertive: true }));
+  return {
+    stop: [...consentAlerts(state), ...alerts].sort(worstFirst).find(({ level }) => level === "stop") ?? null,
+    chips: [...lost, ...alerts.filter(({ level }) => level === "tell").slice(0, 2)],
+  };
+}
+
+/** Return the remaining time as "4:12"; empty without an end time. */
+export function timeLeft(until) {
+  const left = Math.ceil((until - Date.now()) / 1000);
+  return until && left > 0 ? `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")}` : "";
+}
+
+// One timer for all countdowns; it changes the state only while a countdown is active.
+setInterval(() => {
+  const { alerts, timer } = get();
+  lowerAlerts(({ until }) => until && until <= Date.now());
+  if (timer || alerts.some(({ until }) => until)) set({ now: Date.now() });
+}, 1000);

@@ -1,0 +1,172 @@
+// API client: JSON requests, event stream (server-sent events) and preview frames. Restricted to interfaces that work
+// without HTTPS: no service worker, no crypto.randomUUID, no web locks.
+
+import { t } from "../i18n/translate.js";
+
+/** Error answer of the server: code, message and remedy; "link.cut" when no answer came. */
+export class ApiError extends Error {
+  constructor({ code, message, remedy, ...vars }) {
+    super(message);
+    this.code = code;
+    this.remedy = remedy;
+    this.vars = vars; // values for the translated text, such as minutes to wait
+  }
+}
+
+async function requestJson(path, options) {
+  let response;
+  try {
+    response = await fetch(path, { cache: "no-store", ...options });
+  } catch {
+    throw new ApiError({ code: "link.cut", message: t("link.cut"), remedy: t("link.cut.remedy") });
+  }
+  const body = await response.json().catch(() => null);
+  if (response.ok && body) return body;
+  if (body?.message) throw new ApiError(body);
+  throw new ApiError({ code: `http.${response.status}`, message: t("fault.unknown"), remedy: t("fault.unknown.remedy") });
+}
+
+export const getStatus = () => requestJson("/api/status");
+export const getProtocol = () => requestJson("/api/protocol");
+export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
+export const getVisits = (query) => requestJson(`/api/visits?${new URLSearchParams(query)}`);
+export const getCapture = (id) => requestJson(`/api/captures/${encodeURIComponent(id)}`);
+export const getOutbox = () => requestJson("/api/outbox");
+export const getFolders = async () => (await requestJson("/api/exports")).folders;
+export const captureFileUrl = (capture, name) => `/api/captures/${encodeURIComponent(capture)}/${name}`;
+export const visitZipUrl = (visit) => `/api/visits/${encodeURIComponent(visit)}/export.zip`;
+
+/** Send a change with an idempotency key, so that a duplicated or repeated request has one effect. */
+export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) {
+  return requestJson(path, {
+    method,
+    headers: { "Content-Type": "application/json", "X-Controller": controllerKey() },
+    body: JSON.stringify({ ...body, key }),
+  });
+}
+
+/** Request or renew the control lease, which one page holds at a time; `take` takes it from another page. */
+export const requestControl = (take) =>
+  send("POST", "/api/controller", take ? { key: controllerKey(), take } : { key: controllerKey() });
+
+/** Release the control lease when the page closes; a beacon is sent even after the page is gone. */
+export const releaseControl = () =>
+  navigator.sendBeacon?.(
+    "/api/controller",
+    new Blob([JSON.stringify({ key: controllerKey(), release: true })], { type: "application/json" }),
+  );
+
+// Return a random idempotency key of 16 hex digits; crypto.randomUUID needs HTTPS.
+export function newIdempotencyKey() {
+  return Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+let cachedKey = null;
+
+// Return the key of this browser tab for the control lease: kept on a reload, different in each tab.
+function controllerKey() {
+  if (cachedKey) return cachedKey;
+  try {
+    cachedKey = sessionStorage.getItem("diffuscope.controller") ?? newIdempotencyKey();
+    sessionStorage.setItem("diffuscope.controller", cachedKey);
+  } catch {
+    cachedKey = newIdempotencyKey();
+  }
+  return cachedKey;
+}
+
+/** Fetch the first preview frame after number `after`; null when none came. ApiError when light is not allowed. */
+export async function getPreview(after, eye, visit, signal) {
+  const headers = { "X-Controller": controllerKey() }; // the server switches the lamp on only for the page with the lease
+  const query = new URLSearchParams({ after, eye, visit });
+  const response = await fetch(`/api/preview?${query}`, { cache: "no-store", headers, signal });
+  if (response.status === 204) return null;
+  if (!response.ok) throw new ApiError((await response.json().catch(() => null)) ?? { code: `http.${response.status}` });
+  return {
+    number: Number(response.headers.get("X-Frame")),
+    ageMs: Number(response.headers.get("X-Age-Ms")),
+    aim: parseAim(response.headers.get("X-Aim")),
+    bitmap: await createImageBitmap(await response.blob()),
+  };
+}
+
+function parseAim(header) {
+  try {
+    return header ? JSON.parse(header) : null;
+  } catch {
+    return null; // an unreadable hint does not discard the frame
+  }
+}
+
+/** Fetch a picture and decode it. */
+export async function getBitmap(url, signal) {
+  const response = await fetch(url, { signal });
+  if (!response.ok) throw new Error(`picture ${response.status}`);
+  return createImageBitmap(await response.blob());
+}
+
+const HEARTBEAT_TIMEOUT_MS = 3500; // heartbeat timeout; the server sends one event per second
+const RECONNECT_MS = 2500; // a half-open connection can look connected for minutes, so the stream is reopened
+const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "notice"];
+
+/**
+ * Event stream of the visible page, with heartbeat timeout and reconnection. A hidden page closes its stream, because
+ * browsers allow six connections per origin.
+ * Calls `handlers[type](data)` for each event and `handlers.link("live" | "lost")` on a change. Only received events
+ * count: navigator.onLine does not describe the connection to this device.
+ */
+export class EventStream {
+  #handlers;
+  #source = null;
+  #lastEventMs = 0;
+  #openedMs = 0;
+  #link = "opening";
+
+  constructor(handlers) {
+    this.#handlers = handlers;
+    document.addEventListener("visibilitychange", () => this.#resume());
+    addEventListener("pagehide", () => this.#close());
+    addEventListener("pageshow", (event) => event.persisted && this.#resume());
+    setInterval(() => this.#checkTimeout(), 250);
+    this.#resume();
+  }
+
+  #resume() {
+    if (document.hidden) return this.#close();
+    this.#lastEventMs = performance.now(); // a page that becomes visible gets a full timeout
+    return this.#open();
+  }
+
+  #open() {
+    this.#close();
+    this.#openedMs = performance.now();
+    this.#source = new EventSource("/api/events");
+    for (const type of EVENTS) {
+      this.#source.addEventListener(type, (event) => {
+        this.#lastEventMs = performance.now();
+        this.#setLink("live");
+        this.#handlers[type]?.(event.data ? JSON.parse(event.data) : {});
+      });
+    }
+  }
+
+  #close() {
+    this.#source?.close();
+    this.#source = null;
+  }
+
+  #checkTimeout() {
+    if (!this.#source) return;
+    const now = performance.now();
+    if (now - this.#lastEventMs < HEARTBEAT_TIMEOUT_MS) return;
+    this.#setLink("lost");
+    const wait_ms = this.#source.readyState === EventSource.CLOSED ? RECONNECT_MS / 2 : RECONNECT_MS;
+    if (now - this.#openedMs > wait_ms) this.#open();
+  }
+
+  #setLink(link) {
+    if (link === this.#link) return;
+    this.#link = link;
+    this.#handlers.link(link);
+  }
+}

@@ -1,0 +1,226 @@
+// Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
+
+import { newIdempotencyKey, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
+import { eyeOf, get, lostShots, moveShot, set, pendingShots } from "./state.js";
+import { navigate } from "./router.js";
+import { lowerAlerts, raiseAlert } from "./alerts.js";
+
+/** Run a request; on an error of the server raise an alert and return undefined. */
+export async function alertOnError(task) {
+  try {
+    return await task();
+  } catch (problem) {
+    if (!(problem instanceof ApiError)) throw problem;
+    const { code, message, remedy, vars } = problem;
+    raiseAlert({ code, message, remedy, ...vars, from: "press" });
+    return undefined;
+  }
+}
+
+const visitUrl = (visit, what) => `/api/visits/${encodeURIComponent(visit)}${what ? `/${what}` : ""}`;
+
+function storeVisit(visit) {
+  if (visit && get().route.visit === visit.id) set({ visit: withUnsaved(Object.freeze(visit)) });
+  return visit;
+}
+
+/** Reload a visit. */
+export const refreshVisit = (id) => alertOnError(async () => storeVisit(await getVisit(id)));
+
+/** Load the visits that match the query, and the counts of the day. */
+export async function refreshList(query) {
+  const screen = get().route.screen;
+  const result = await alertOnError(() => getVisits(query));
+  if (result && get().route.screen === screen) set({ visits: result.visits, counts: result.counts });
+}
+
+/** Begin a visit with this number, or with an automatic one. */
+export async function begin(number) {
+  const visit = await alertOnError(() => send("POST", "/api/visits", number ? { number } : {}));
+  if (!visit) return;
+  set({ visit: Object.freeze(visit) });
+  navigate({ screen: "person", visit: visit.id });
+}
+
+/** Continue a visit on the screen of its next step. */
+export function resume(visit) {
+  set({ visit: Object.freeze(visit) });
+  if (visit.finished_at) navigate({ screen: "outcome", visit: visit.id });
+  else if (visit.fields.consent !== "agreed" || !visit.next_slot) navigate({ screen: "person", visit: visit.id });
+  else navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot });
+}
+
+// ---- form fields: optimistic update, sent at once, and repeated with the same idempotency key after a lost connection
+
+let unsaved = []; // {visit, field, value, key}
+
+/** Set a form field at once and send the change. */
+export async function setField(field, value) {
+  const { visit } = get();
+  const change = { visit: visit.id, field, value, key: newIdempotencyKey() };
+  unsaved = [...unsaved.filter((other) => other.visit !== visit.id || other.field !== field), change];
+  set({ visit: withUnsaved(visit) });
+  await flushUnsaved();
+}
+
+const withUnsaved = (visit) => {
+  const mine = unsaved.filter((change) => change.visit === visit.id);
+  const fields = Object.fromEntries(mine.map(({ field, value }) => [field, value]));
+  return Object.freeze({ ...visit, fields: { ...visit.fields, ...fields }, waiting: mine.map(({ field }) => field) });
+};
+
+let flushing = null;
+
+/** Send unsaved changes one by one, in order. */
+export function flushUnsaved() {
+  flushing ??= sendUnsaved().finally(() => {
+    flushing = null;
+  });
+  return flushing;
+}
+
+async function sendUnsaved() {
+  while (unsaved.length) {
+    const change = unsaved[0];
+    const { visit, ...body } = change;
+    try {
+      const result = await send("PATCH", visitUrl(visit), body);
+      unsaved = unsaved.filter((other) => other !== change);
+      storeVisit(result);
+    } catch (problem) {
+      if (!(problem instanceof ApiError)) throw problem;
+      if (problem.code === "link.cut") return; // repeated when the connection is back
+      unsaved = unsaved.filter((other) => other !== change);
+      raiseAlert({ code: problem.code, message: problem.message, remedy: problem.remedy, from: "press" });
+      await refreshVisit(visit);
+    }
+  }
+}
+
+// ---- slots
+
+const change = (what, body) =>
+  alertOnError(async () => storeVisit(await send("POST", visitUrl(get().route.visit, what), body)));
+
+/** Mark a slot as "could not"; a chip offers undo for ten seconds. */
+export async function couldNot(slot, reason) {
+  set({ asking: false });
+  const { visit, protocol } = get();
+  const before = visit.slots[slot].capture;
+  if (!(await change("could-not", { slot, reason }))) return;
+  navigate({ screen: "aim", visit: visit.id, slot: nextSlot(slot) ?? slot });
+  const { eye } = protocol.slots.find(({ id }) => id === slot);
+  lowerAlerts("shot.crossed");
+  raiseAlert({ code: "shot.crossed", visit: visit.id, slot, eye, before, from: "page" });
+}
+
+/** Undo "could not". */
+export async function undoCouldNot({ visit, slot, before }) {
+  lowerAlerts("shot.crossed");
+  const result = await alertOnError(() => send("POST", visitUrl(visit, "slots"), { slot, capture: before }));
+  if (!result) return;
+  storeVisit(result);
+  navigate({ screen: "aim", visit, slot });
+}
+
+/** Accept a poor picture for its slot and go to the next slot. */
+export async function keepPoor(capture, slot) {
+  const kept = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/keep`));
+  if (!kept) return;
+  await refreshVisit(get().route.visit);
+  goToNextSlot(slot);
+}
+
+/** Select another picture of a slot. */
+export const useInSlot = (slot, capture) => change("slots", { slot, capture });
+
+/** Move a picture to the slot of the same field of the other eye. */
+export async function moveToOtherEye(slot, capture) {
+  const { protocol } = get();
+  const from = protocol.slots.find(({ id }) => id === slot);
+  const to = protocol.slots.find(({ eye, field }) => field === from.field && eye !== from.eye);
+  if (!to) return;
+  const visit = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: to.eye }));
+  if (!visit) return;
+  storeVisit(visit);
+  moveShot(capture, to);
+  navigate({ screen: "picture", visit: visit.id, slot: to.id, capture });
+}
+
+/** Confirm the eye of a picture, which answers the laterality question. */
+export const confirmEye = (slot, capture) =>
+  alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: eyeOf(get(), slot) }));
+
+/** Return the next empty slot after `after` in the order of the programme; null if there is none. */
+export function nextSlot(after) {
+  const { visit, protocol } = get();
+  if (!visit || !protocol) return null;
+  const ids = protocol.slots.map(({ id }) => id);
+  const order = [...ids.slice(ids.indexOf(after) + 1), ...ids.slice(0, ids.indexOf(after))];
+  const making = pendingShots(get(), visit.id).map(({ slot }) => slot);
+  const missing = order.filter((id) => id !== after && visit.slots[id]?.state === "empty" && !making.includes(id));
+  return missing[0] ?? null;
+}
+
+/** Go to the next empty slot; without one, finish the visit. */
+export function goToNextSlot(after) {
+  const slot = nextSlot(after);
+  if (slot) navigate({ screen: "aim", visit: get().route.visit, slot });
+  else finish();
+}
+
+// ---- upload queue
+
+export async function refreshOutbox() {
+  const outbox = await alertOnError(getOutbox);
+  if (outbox) set({ outbox });
+}
+
+/** Retry the uploads of one visit, or of all, at once. */
+export async function retryUploads(visit) {
+  const outbox = await alertOnError(() => send("POST", "/api/outbox/try", visit ? { visit } : {}));
+  if (outbox) set({ outbox });
+}
+
+// ---- finishing
+
+/** Finish the visit; while a capture is in progress, show its progress first and finish afterwards. */
+export async function finish() {
+  const { visit } = get().route;
+  lowerAlerts("shot.crossed"); // undo would need a reopened visit
+  if (pendingShots(get(), visit).length) {
+    navigate({ screen: "outcome", visit });
+    set({ finishing: visit });
+    return;
+  }
+  if (await change("finish")) navigate({ screen: "outcome", visit });
+}
+
+/** Finish a waiting visit after its last capture; if a capture was lost, go to its slot instead. */
+export function finishWhenComplete() {
+  const { finishing, route, visit } = get();
+  if (!finishing || visit?.id !== finishing || pendingShots(get(), finishing).length) return;
+  set({ finishing: null });
+  if (route.visit !== finishing || route.screen !== "outcome") return;
+  const [lost] = lostShots(get());
+  if (lost) navigate({ screen: "aim", visit: finishing, slot: lost.slot }, { replace: true });
+  else finish();
+}
+
+/** Reopen the finished visit. */
+export async function reopen() {
+  const visit = await change("reopen");
+  if (visit) resume(visit);
+}
+
+/** Copy the visit to a USB drive; `id` is the drive's in the server's list. */
+export async function copyTo({ id: folder, name }) {
+  const done = await alertOnError(() => send("POST", visitUrl(get().route.visit, "export"), { folder }));
+  if (done) set({ copied: name });
+}
+
+/** Return the content of the QR code: number, date, outcome, telephone of the centre. Never a picture, name or age. */
+export function qrText({ visit, protocol }) {
+  const day = (visit.finished_at ?? visit.begun_at).slice(0, 10);
+  return [visit.number, day, visit.outcome.code, protocol?.programme?.centre_phone].filter(Boolean).join("\n");
+}

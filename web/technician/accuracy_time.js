@@ -1,0 +1,225 @@
+// <accuracy-time>: accuracy against reconstruction time as measured on this device, comparison of a capture at a
+// measured point with the kept picture, and choice of the time limit. The table holds the same values as the plot.
+
+import { html, render, svg } from "../vendor/lit-html.js";
+import { ApiError } from "../core/api.js";
+import "../components/viewer/viewer.js";
+import { clockTime, number, t } from "../i18n/translate.js";
+
+const WIDTH = 720, HEIGHT = 400, LEFT = 64, RIGHT = 16, TOP = 16, BELOW = 56;
+const POLL_MS = 1000;
+const TICKS_S = [0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30];
+const ZOOMS = [1, 2, 4];
+const ALL = Object.freeze({ zoom: 1, u: 0, v: 0 });
+
+class AccuracyTime extends HTMLElement {
+  #state = { explorer: null, head: null, captures: [], capture: null, point: null, recomputed: null, viewport: ALL, all: false, alert: null };
+  #timer = 0;
+
+  connectedCallback() {
+    this.#load();
+  }
+
+  disconnectedCallback() {
+    clearTimeout(this.#timer);
+  }
+
+  #set(patch) {
+    this.#state = { ...this.#state, ...patch };
+    render(view(this.#state, this.#actions), this);
+  }
+
+  // Synchronise the views of the two pictures.
+  #setView(viewport, from = null) {
+    for (const pic of this.querySelectorAll("eye-pic")) if (pic !== from) pic.view = viewport;
+    this.#set({ viewport });
+  }
+
+  async #load() {
+    await this.#showErrors(async () => {
+      const [explorer, captures, head] = await Promise.all([fetchTechnician("GET"), recentCaptures(), fetchStatus()]);
+      this.#set({ explorer, captures, head, capture: this.#state.capture ?? captures[0] ?? null });
+      this.#poll();
+    });
+  }
+
+  // Poll every second while a measurement runs.
+  #poll() {
+    clearTimeout(this.#timer);
+    if (!this.#state.explorer?.busy || !this.isConnected) return;
+    this.#timer = setTimeout(() => this.#showErrors(async () => {
+      this.#set({ explorer: await fetchTechnician("GET") });
+      this.#poll();
+    }), POLL_MS);
+  }
+
+  async #showErrors(task) {
+    try {
+      await task();
+    } catch (error) {
+      this.#set({ alert: error });
+    }
+  }
+
+  #actions = {
+    measure: () => this.#showErrors(async () => {
+      this.#set({ alert: null, explorer: await fetchTechnician("POST", "explorer", {}) });
+      this.#poll();
+    }),
+
+    choose: (pace) => this.#showErrors(async () => {
+      this.#set({ alert: null, explorer: await fetchTechnician("PUT", "pace", { pace }) });
+    }),
+
+    pick: ({ target }) => {
+      const capture = this.#state.captures.find((one) => one.id === target.value);
+      this.#set({ capture, point: null, recomputed: null, viewport: ALL });
+    },
+
+    recompute: (point) => this.#showErrors(async () => {
+      this.#set({ alert: null, point, recomputed: null });
+      const { method, bin, rounds } = point;
+      const path = `/api/technician/captures/${this.#state.capture.id}/again.png`;
+      const response = await request("GET", `${path}?method=${method}&bin=${bin}&rounds=${rounds}`);
+      const blob = await response.blob();
+      if (this.#state.point === point) this.#set({ recomputed: blob });
+    }),
+
+    zoom: (zoom) => this.#setView({ ...this.#state.viewport, zoom }),
+    showAll: ({ target }) => this.#set({ all: target.checked }),
+
+    moved: ({ target, detail }) => this.#setView(detail, target),
+    drawn: ({ target }) => {
+      target.view = this.#state.viewport; // the second picture is loaded later and takes the current view
+    },
+    fault: () => this.#set({ alert: { message: t("fault.picture"), remedy: t("fault.picture.remedy") } }),
+  };
+}
+
+customElements.define("accuracy-time", AccuracyTime);
+
+const recentCaptures = async () => (await (await request("GET", "/api/captures?limit=12")).json()).captures;
+const fetchStatus = async () => (await request("GET", "/api/status")).json();
+const fetchTechnician = async (method, resource = "explorer", body = undefined) => (await request(method, `/api/technician/${resource}`, body)).json();
+
+async function request(method, path, body) {
+  const options = { method, cache: "no-store" };
+  if (body) Object.assign(options, { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  const response = await fetch(path, options);
+  if (!response.ok) throw new ApiError(await response.json());
+  return response;
+}
+
+function view(state, actions) {
+  const { explorer, alert } = state;
+  if (!explorer) return html`<p role="status">${alert ? alert.message : t("explore.loading")}</p>`;
+  return html`
+    <h2>${t("explore.title")}</h2>
+    <p>${t("explore.says")}</p>
+    ${alert ? html`<p class="bad" role="alert">${alert.message} ${alert.remedy}</p>` : ""}
+    ${paceButtons(explorer, actions)}
+    ${measuring(explorer, actions)}
+    ${explorer.measured ? points(state, actions) : ""}
+    ${state.point ? comparison(state, actions) : ""}
+  `;
+}
+
+function paceButtons({ pace, paces_s: paceButtons }, actions) {
+  return html`
+    <h3 id="pace-title">${t("explore.pace")}</h3>
+    <div class="row" role="group" aria-labelledby="pace-title">
+      ${Object.entries(paceButtons).map(([name, seconds]) => html`
+        <button type="button" aria-pressed=${name === pace} @click=${() => actions.choose(name)}>
+          ${t(`pace.${name}`)} <small>${t("pace.seconds", { s: number(seconds) })}</small>
+        </button>`)}
+    </div>
+  `;
+}
+
+function measuring({ busy, said: progressText, problem, measured }, actions) {
+  return html`
+    <p role="status" aria-live="polite">
+      ${busy ? `${t("explore.busy")} ${progressText}` : measured ? t("explore.when", {
+        day: measured.measured_at.slice(0, 10), time: clockTime(measured.measured_at), scene: measured.scene,
+      }) : t("explore.never")}
+      ${problem ? html`<span class="bad">${problem.message} ${problem.remedy}</span>` : ""}
+    </p>
+    <button type="button" aria-disabled=${busy} @click=${() => busy || actions.measure()}>${t("explore.measure")}</button>
+  `;
+}
+
+function points({ explorer, all, capture, captures }, actions) {
+  const { points, budget_s: budget } = explorer.measured;
+  const rows = points.filter((one) => all || one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
+  return html`
+    ${plot(points, budget, actions, capture !== null)}
+    <div class="row">
+      <label><input type="checkbox" .checked=${all} @change=${actions.showAll} /> ${t("explore.all")}</label>
+    </div>
+    ${capture ? html`<label>${t("explore.capture")}
+      <select @change=${actions.pick}>${captures.map((one) => html`
+        <option value=${one.id} ?selected=${one === capture}>
+          ${t(`eye.${one.eye}`)} ${clockTime(one.taken_at)}${one.test ? ` · ${t("explore.test")}` : ""}
+        </option>`)}
+      </select></label>` : html`<p class="muted">${t("explore.nothing")}</p>`}
+    <table>
+      <caption>${t("explore.table")}</caption>
+      <thead><tr>
+        ${["method", "seconds", "psnr", "see"].map((name) => html`<th scope="col">${t(`explore.${name}`)}</th>`)}
+      </tr></thead>
+      <tbody>${rows.map((one) => html`<tr>
+        <th scope="row">${t("explore.again", one)}${one.pareto ? " ★" : ""}</th>
+        <td>${number(one.seconds_median, 3)}</td><td>${number(one.psnr_db, 1)}</td>
+        <td><button type="button" aria-disabled=${!capture} @click=${() => capture && actions.recompute(one)}
+          aria-label=${t("explore.see.one", one)}>${t("explore.see")}</button></td>
+      </tr>`)}</tbody>
+    </table>
+  `;
+}
+
+function plot(points, budget, actions, live) {
+  const times = points.map((one) => one.seconds_median).concat(budget);
+  const psnrs_db = points.map((one) => one.psnr_db);
+  const [first, last] = [Math.log10(Math.min(...times)) - 0.1, Math.log10(Math.max(...times)) + 0.1];
+  const [low, high] = [Math.floor(Math.min(...psnrs_db) - 0.5), Math.ceil(Math.max(...psnrs_db) + 0.5)];
+  const x = (seconds) => LEFT + ((Math.log10(seconds) - first) / (last - first)) * (WIDTH - LEFT - RIGHT);
+  const y = (db) => HEIGHT - BELOW - ((db - low) / (high - low)) * (HEIGHT - TOP - BELOW);
+  const step = Math.max(1, Math.ceil((high - low) / 6));
+  const psnrTicks_db = Array.from({ length: Math.floor((high - low) / step) + 1 }, (_, k) => low + k * step);
+  const paretoFront = points.filter((one) => one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
+  // Hidden from screen readers; the table holds the same values.
+  return html`<svg class="plot" viewBox="0 0 ${WIDTH} ${HEIGHT}" aria-hidden="true" focusable="false">
+    ${psnrTicks_db.map((db) => svg`<line class="grid" x1=${LEFT} x2=${WIDTH - RIGHT} y1=${y(db)} y2=${y(db)} />
+      <text x=${LEFT - 8} y=${y(db) + 5} text-anchor="end">${db}</text>`)}
+    ${TICKS_S.filter((s) => Math.log10(s) > first && Math.log10(s) < last).map((s) => svg`
+      <text x=${x(s)} y=${HEIGHT - BELOW + 22} text-anchor=${x(s) > WIDTH - 40 ? "end" : "middle"}>${s < 1 ? `${number(s * 1000)} ms` : `${number(s)} s`}</text>`)}
+    <text x=${(LEFT + WIDTH) / 2} y=${HEIGHT - 8} text-anchor="middle">${t("explore.x")}</text>
+    <text x="4" y=${TOP - 2}>${t("explore.y")}</text>
+    <line class="limit" x1=${x(budget)} x2=${x(budget)} y1=${TOP} y2=${HEIGHT - BELOW} />
+    <polyline class="edge" points=${paretoFront.map((one) => `${x(one.seconds_median)},${y(one.psnr_db)}`).join(" ")} />
+    ${points.map((one) => svg`<circle class=${one.pareto ? "best" : "other"} r=${one.pareto ? 8 : 4}
+      cx=${x(one.seconds_median)} cy=${y(one.psnr_db)} @click=${() => live && actions.recompute(one)}>
+      <title>${t("explore.see.one", one)}</title></circle>`)}
+  </svg>`;
+}
+
+function comparison({ capture, head, point, recomputed, viewport }, actions) {
+  const pic = (src, name) => html`<eye-pic class="compared" aria-label=${name} .head=${head} .subject=${capture.id} .src=${src}
+    @looked=${actions.moved} @drawn=${actions.drawn} @fault=${actions.fault}></eye-pic>`;
+  return html`
+    <h3>${t("explore.beside", point)}</h3>
+    <div class="row" role="group" aria-label=${t("explore.zoom")}>
+      ${ZOOMS.map((one) => html`<button type="button" aria-pressed=${one === viewport.zoom} @click=${() => actions.zoom(one)}>${one}×</button>`)}
+    </div>
+    <div class="pair">
+      <figure>
+        ${pic({ url: capture.links.picture, mark: "final" }, t("explore.kept.alt"))}
+        <figcaption>${t("explore.kept")}</figcaption>
+      </figure>
+      <figure>
+        ${recomputed ? pic({ blob: recomputed, mark: "final" }, t("explore.again.alt")) : html`<p>${t("explore.making")}</p>`}
+        <figcaption>${t("explore.again", point)}</figcaption>
+      </figure>
+    </div>
+  `;
+}

@@ -1,0 +1,89 @@
+// <instrument-diary>: event log of the instrument, of everything or of one picture; code and details are collapsed.
+// Export as a file or to a USB drive.
+
+import { html, nothing, render } from "../vendor/lit-html.js";
+import { calendarDay, clockTime, t } from "../i18n/translate.js";
+
+const LEVELS = { warning: "!", error: "✕", critical: "✕" };
+const EXPORT = { method: "POST", headers: { "Content-Type": "application/json" } };
+
+class EventLog extends HTMLElement {
+  #state = { entries: null, warningsOnly: false, about: null, folders: null, message: "", error: "" };
+
+  connectedCallback() {
+    this.#load();
+  }
+
+  #set(more) {
+    Object.assign(this.#state, more);
+    render(view(this.#state, this.#actions), this);
+  }
+
+  /** Return the JSON answer of a request; on an error show the server's message and return null. */
+  async #request(path, options) {
+    const response = await fetch(path, { cache: "no-store", ...options }).catch(() => null);
+    const body = await response?.json().catch(() => null);
+    if (response?.ok && body) return body;
+    this.#set({ error: body?.message ? `${body.message} ${body.remedy}` : t("diary.failed"), message: "" });
+    return null;
+  }
+
+  async #load() {
+    const { about } = this.#state;
+    const query = about ? { limit: 300, about } : { limit: 300 };
+    const answer = await this.#request(`/api/technician/diary?${new URLSearchParams(query)}`);
+    if (answer) this.#set({ entries: answer.entries, error: "" });
+  }
+
+  #actions = {
+    again: () => this.#load(),
+    warningsOnly: () => this.#set({ warningsOnly: !this.#state.warningsOnly }),
+    showOnly: (about) => {
+      this.#state.about = about;
+      this.#load();
+    },
+    saved: () => this.#set({ folders: null, message: t("film.zipped"), error: "" }),
+    listDrives: async () => {
+      const answer = await this.#request("/api/exports");
+      if (answer) this.#set({ folders: answer.folders, message: answer.folders.length ? "" : t("film.nofolder"), error: "" });
+    },
+    copy: async ({ id, name }) => {
+      const done = await this.#request("/api/technician/diary/export", { ...EXPORT, body: JSON.stringify({ folder: id }) });
+      if (done) this.#set({ folders: null, message: t("diary.copied", { folder: `${name}/${done.folder}` }), error: "" });
+    },
+  };
+}
+
+customElements.define("instrument-diary", EventLog);
+
+function view({ entries, warningsOnly, about, folders, message, error }, actions) {
+  const shown = (entries ?? []).filter((one) => !warningsOnly || one.level in LEVELS);
+  return html`
+    <h2>${t("diary.title")}</h2>
+    <div class="row">
+      <button type="button" @click=${actions.again}>${t("diary.again")}</button>
+      <button type="button" aria-pressed=${warningsOnly} @click=${actions.warningsOnly}>${t("diary.worst")}</button>
+      <a class="button" href="/api/technician/diary.txt" download @click=${actions.saved}>${t("diary.save")}</a>
+      <button type="button" id="to-usb" @click=${actions.listDrives}>${t("film.copy")}</button>
+      ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} @click=${() => actions.copy(stick)}>
+        ${stick.name}
+      </button>`)}
+    </div>
+    ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}
+    <p role="note">${message}</p>
+    ${about ? html`<div class="row"><b>${t("diary.about", { about })}</b>
+      <button type="button" @click=${() => actions.showOnly(null)}>${t("diary.all")}</button></div>` : nothing}
+    <p role="status">${entries && (shown.length ? t("diary.count", { n: shown.length }) : t("diary.empty"))}</p>
+    <ol class="diary">${shown.map((one) => entryItem(one, actions, about))}</ol>
+  `;
+}
+
+const entryItem = (one, actions, about) => html`<li class=${one.level}>
+  <p><time datetime=${one.at}>${calendarDay(one.at)}, ${clockTime(one.at)}</time>
+    ${one.level in LEVELS ? html`<b>${LEVELS[one.level]} ${t(`diary.${one.level}`)}</b>` : nothing} ${one.text}</p>
+  ${one.code || one.about || one.detail ? html`<details><summary>${t("diary.more")}</summary>
+    <p>${[one.code, one.about].filter(Boolean).join(" · ")}</p>
+    ${one.detail ? html`<pre>${one.detail}</pre>` : nothing}
+    ${one.about && !about ? html`<button type="button" @click=${() => actions.showOnly(one.about)}>${t("diary.only")}</button>` : nothing}
+  </details>` : nothing}
+</li>`;

@@ -1,0 +1,28 @@
+// Navigation of the technician page; each section is an element that loads its own data.
+
+import "./event_log.js";
+import "./accuracy_time.js";
+import "./health.js";
+import "./software_update.js";
+import { html } from "../vendor/lit-html.js";
+import { t } from "../i18n/translate.js";
+
+const SECTIONS = {
+  calibration: null, // drawn by the wizard
+  health: html`<instrument-health class="column"></instrument-health>`,
+  explorer: html`<accuracy-time class="column"></accuracy-time>`,
+  diary: html`<instrument-diary class="column"></instrument-diary>`,
+  update: html`<software-update class="column"></software-update>`,
+};
+
+/** Navigation bar and current section; `calibration` draws the first one. */
+export function navigation(state, actions, calibration) {
+  return html`
+    <nav class="rooms" aria-label=${t("rooms")}>
+      ${Object.keys(SECTIONS).map((name) => html`<button
+        type="button" data-room=${name} aria-current=${name === state.section ? "page" : "false"} @click=${() => actions.openSection(name)}
+      >${t(`room.${name}`)}</button>`)}
+    </nav>
+    ${SECTIONS[state.section] ?? calibration(state, actions)}
+  `;
+}

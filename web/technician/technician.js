@@ -1,0 +1,233 @@
+// Controller of the technician page: PIN login and calibration. The state of a calibration is polled from the server,
+// so a reload or restart loses nothing.
+
+import { ApiError } from "../core/api.js";
+import "./sensor_preview.js";
+import { createStore } from "../core/store.js";
+import { render } from "../vendor/lit-html.js";
+import { technicianPage } from "./calibration_wizard.js";
+import { useLanguage, t } from "../i18n/translate.js";
+import { TECHNICIAN } from "../i18n/en_technician.js";
+
+const POLL_MS = 700;
+const DEBOUNCE_MS = 600; // debounce: the second half of a double tap must not press a control of the next view
+const ACTIVITY_MS = 30_000; // at most one activity report in this time
+
+useLanguage("en", TECHNICIAN);
+
+const store = createStore({
+  view: "opening", // opening | door | overview | wizard | done
+  section: "calibration", // section of the overview
+  cal: null, // latest calibration state of the server
+  hasPin: true,
+  pin: "",
+  wait: 0, // lock-out: seconds until the next PIN attempt
+  by: loadSetting("technician", ""),
+  levels: null,
+  mishap: "",
+  error: null, // of the last action
+  busy: false,
+  lost: false,
+  theme: loadSetting("theme", "dim"),
+});
+const { get, set } = store;
+let ignoreTapsUntil = 0;
+let activityMs = 0;
+let dismissed = readStorage("dismissed");
+
+// ---- requests
+
+async function request(path, body) {
+  const init = { cache: "no-store", signal: AbortSignal.timeout(60_000) };
+  if (body !== undefined) {
+    Object.assign(init, {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
+    });
+  }
+  let response;
+  try {
+    response = await fetch(path, init);
+  } catch {
+    throw new ApiError({ code: "link.cut", message: t("tech.lost"), remedy: "" });
+  }
+  const json = await response.json().catch(() => null);
+  if (response.ok && json) return json;
+  throw new ApiError(json?.message ? json : { code: "fault", message: t("fault.unknown"), remedy: t("fault.unknown.remedy") });
+}
+
+async function poll() {
+  for (;;) {
+    if (!document.hidden) await refresh();
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+  }
+}
+
+async function refresh() {
+  try {
+    if (get().view === "door") return set({ wait: Math.max(0, get().wait - POLL_MS / 1000) });
+    if (get().view === "opening") {
+      const { open } = await request("/api/technician");
+      if (!open) return showLogin();
+    }
+    showCalibration(await request("/api/calibration"));
+    set({ lost: false });
+  } catch (problem) {
+    if (problem.code === "technician.locked") await showLogin();
+    else if (problem.code === "link.cut") set({ lost: true });
+    else throw problem;
+  }
+  return undefined;
+}
+
+function showCalibration(cal) {
+  const before = get().cal;
+  const inProgress = cal.state === "asking" || cal.state === "measuring";
+  const view = inProgress ? "wizard" : cal.made && cal.made.id !== dismissed ? "done" : "overview";
+  if (view !== get().view || cal.state !== before?.state || cal.stand !== before?.stand) ignoreTaps();
+  if (cal.stand !== before?.stand || cal.state === "measuring") set({ error: null });
+  set({ cal: Object.freeze(cal), view });
+}
+
+async function loginState() {
+  const { has_pin: hasPin, wait_s: wait } = await request("/api/technician");
+  return { hasPin, wait, pin: "" };
+}
+
+async function showLogin() {
+  try {
+    set({ view: "door", ...(await loginState()), error: null, lost: false, busy: false });
+  } catch (problem) {
+    if (!(problem instanceof ApiError)) throw problem;
+    set({ lost: true });
+  }
+}
+
+// Send one request per tap; show the server's error.
+async function submit(path, body, then = showCalibration) {
+  if (get().busy || performance.now() < ignoreTapsUntil) return;
+  set({ busy: true, error: null });
+  try {
+    then(await request(path, body));
+  } catch (problem) {
+    if (!(problem instanceof ApiError)) throw problem;
+    if (problem.code === "technician.locked" && get().view !== "door") await showLogin();
+    else {
+      const wait = get().view === "door" ? await loginState().catch(() => null) : null; // the lock-out time is known before the next tap
+      set({ ...wait, error: { code: problem.code, message: problem.message, remedy: problem.remedy } });
+    }
+  } finally {
+    set({ busy: false });
+    ignoreTaps();
+  }
+}
+
+function ignoreTaps() {
+  ignoreTapsUntil = performance.now() + DEBOUNCE_MS;
+}
+
+// ---- user actions
+
+const actions = {
+  digit: (digit) => set({ pin: `${get().pin}${digit}`.slice(0, 12) }),
+  deleteDigit: () => set({ pin: get().pin.slice(0, -1) }),
+  pinTyped: ({ target }) => set({ pin: target.value }),
+
+  async enter(event) {
+    event.preventDefault();
+    const { pin, hasPin, wait } = get();
+    if (wait > 0 || !pin) return;
+    if (pin.length < 4) return set({ error: { code: "pin.short", message: t("pin.short"), remedy: "" } }); // keep the digits
+    await submit(hasPin ? "/api/technician/unlock" : "/api/technician/pin", { pin }, () => set({ view: "opening" }));
+    if (get().view === "opening") await refresh();
+  },
+
+  lock: () => submit("/api/technician/lock", {}, showLogin),
+  openSection: (section) => set({ section }),
+
+  setName({ target }) {
+    saveSetting("technician", target.value);
+    set({ by: target.value });
+  },
+
+  start(event) {
+    event.preventDefault();
+    const { by, cal } = get();
+    if (!by.trim() || cal.state === "starting") return;
+    const form = event.target.elements;
+    const source = Number(form.source.value.replace(",", "."));
+    const options = { by: by.trim() };
+    if (form.serial.value.trim()) options.serial = form.serial.value.trim();
+    if (form.source.value.trim()) options.source_deg = Number.isFinite(source) ? source : form.source.value;
+    submit("/api/calibration", options);
+  },
+
+  ready() {
+    const { cal, mishap } = get();
+    if (cal.state !== "asking") return;
+    set({ mishap: "" });
+    submit("/api/calibration/ready", { stand: cal.stand, ...(mishap && { mishap }) });
+  },
+
+  cancel: () => submit("/api/calibration/cancel", {}),
+  use: (id) => submit("/api/calibration/use", { id }),
+  choose: ({ target }) => set({ mishap: target.value }),
+  levels: ({ detail }) => set({ levels: detail }),
+
+  dismiss() {
+    dismissed = get().cal.made?.id ?? "";
+    writeStorage("dismissed", dismissed);
+    showCalibration(get().cal);
+  },
+
+  setTheme(theme) {
+    saveSetting("theme", theme);
+    set({ theme });
+  },
+};
+
+// Report activity on touch, which extends the login; polling does not.
+function reportActivity() {
+  const { view } = get();
+  if (view === "door" || view === "opening" || performance.now() - activityMs < ACTIVITY_MS) return;
+  activityMs = performance.now();
+  request("/api/technician/here", {}).catch(() => {}); // the next poll shows the error
+}
+addEventListener("pointerdown", reportActivity);
+addEventListener("keydown", reportActivity);
+
+// ---- storage: theme and technician's name in localStorage; the dismissed result in sessionStorage
+
+function saveSetting(key, value) {
+  writeStorage(key, value, localStorage);
+}
+
+function loadSetting(key, otherwise) {
+  return readStorage(key, localStorage) ?? otherwise;
+}
+
+function writeStorage(key, value, where = sessionStorage) {
+  try {
+    where.setItem(`diffuscope.${key}`, value);
+  } catch {
+    // Without storage, the settings are lost on a reload.
+  }
+}
+
+function readStorage(key, where = sessionStorage) {
+  try {
+    return where.getItem(`diffuscope.${key}`);
+  } catch {
+    return null;
+  }
+}
+
+// ---- render
+
+function renderPage(state) {
+  document.documentElement.dataset.theme = state.theme;
+  render(technicianPage(state, actions), document.querySelector("#app"));
+}
+
+store.subscribe(renderPage);
+renderPage(get());
+poll();
