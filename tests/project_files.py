@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 BIN = Path(sys.executable).parent
 TOP_FOLDERS = ("device", "services", "web", "systemd", "tests", "hardware")
 TOP_FILES = {
-    ".ci", ".git-blame-ignore-revs", ".github", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
+    ".ci", ".github", ".gitignore", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
     "LICENSE", "LICENSES", "Makefile", "README.md", "REUSE.toml", "pyproject.toml", "requirements.lock",
 }  # fmt: skip
 

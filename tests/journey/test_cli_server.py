@@ -121,11 +121,9 @@ def test_server_restarts_with_stored_captures_after_a_kill_and_ends_on_sigterm(
         assert server.ask("POST", "/api/captures", {"eye": "OD"})["id"] not in listed
         with ExitStack() as undo:
             streams = [undo.enter_context(server.listening()) for _ in range(3)]
-            before = time.monotonic()
             process.send_signal(signal.SIGTERM)
             process.wait(10)
-            assert time.monotonic() - before < 3
             for stream in streams:
                 stream.read()  # a truncated chunked body would raise
     assert "Traceback" not in server.output()
-    assert "Cancel" not in server.output()
+    assert "Cancel" not in server.output()  # the server's word when it waited for streams in vain
