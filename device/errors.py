@@ -55,6 +55,7 @@ class DiffuscopeError(Exception):
         super().__init__(message)
         self.message, self.n, self.wait_s = message, n, wait_s
         self.remedy = remedy if remedy is not None else self.default_remedy
+        self.add_note(self.remedy)  # so that a Python traceback ends with it
 
 
 class InputError(DiffuscopeError, ValueError):

@@ -300,14 +300,14 @@ def _name(recipe: Recipe) -> str:
 
 
 def _recipes(shape: tuple[int, int], working: int, methods: Mapping[str, Method]) -> list[Recipe]:
-    """Return every method at every usable bin, iterative methods at each number in ROUNDS.
+    """Return every method at every usable bin, iterative ones at each number in ROUNDS and at their default number.
 
     Bins go up to MOST_BIN, or to the `working` bin of the default schedule if that is larger.
     """
     bins = [n for n in range(1, max(MOST_BIN, working) + 1) if n == 1 or min(shape) // n >= LEAST_SAMPLES]
     wanted = []
     for method in methods.values():
-        rounds = ROUNDS if method.round_pairs else (None,)
+        rounds = sorted({*ROUNDS, method.rounds}) if method.round_pairs else (None,)
         wanted += [Recipe(method.name, n, k) for n in bins for k in rounds]
     return wanted
 

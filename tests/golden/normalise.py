@@ -15,6 +15,7 @@ NAMED = (  # names are numbered by first appearance, so that equal names stay eq
 MEASURED = {"report", "numbers", "verdict", "measured", "found", "x-aim"}  # floats below these keys are measured
 COUNTS = {"free_bytes", "size_bytes", "space_left", "people_left", "takes_s", "took_s", "left_s", "spent_s"}
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
+MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier
 OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer
 
 
@@ -41,6 +42,8 @@ class Normaliser:
     def json(self, value: Any, key: str = "", measured: bool = False) -> Any:
         """Return a JSON value with its texts and its measured floats replaced."""
         measured = measured or key in MEASURED
+        if key in MACHINE and not isinstance(value, Mapping):  # a mapping is a schema of the interface
+            return "<of the computer>"
         if isinstance(value, str):
             replaced = "<version>" if value == version("diffuscope") else self.text(value)
             return re.sub(r"-?\d+\.\d+", "<number>", replaced) if measured else replaced
