@@ -39,10 +39,10 @@ class LitProcess:
         return line.split()[1:]
 
     def kill(self, how: signal.Signals, after_s: float) -> KillResult:
-        """Send a signal after a delay, and wait until the ring is off."""
+        """Send a signal after a delay, and wait until the ring is off; the victim stops itself for SIGSTOP."""
         time.sleep(after_s)
         sent_s = time.monotonic()
-        self._process.send_signal(how)
+        self._process.send_signal(signal.SIGUSR1 if how == signal.SIGSTOP else how)
         if how == signal.SIGKILL:
             self._process.wait()
         return self._wait_until_dark(how.name, sent_s)
