@@ -2,13 +2,15 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Row, Select, select
 from sqlalchemy.orm import Session
 
 from device.values import EYES
+from services.errors import StoreDamaged
 from services.records import row_validation
 from services.records.capture import Capture
 from services.records.capture_report import parse_report
@@ -25,6 +27,31 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # capture id, and name o
 def capture_rows(session: Session, query: Select[*tuple[Any, ...]]) -> Sequence[CaptureColumns]:
     """Return the rows of a query derived from CAPTURES (with a filter, an order or a limit), without validation."""
     return session.execute(query).all()
+
+
+@dataclass(frozen=True)
+class Page:
+    """One page of captures, newest first, and its rows that cannot be read."""
+
+    captures: list[Capture]
+    damaged: list[CaptureColumns]
+
+
+def pages(session: Session, size: int, before: int | None = None) -> Iterator[Page]:
+    """Yield all captures, last stored first, in pages of `size` rows; only row numbers below `before`, if given."""
+    while True:
+        query = CAPTURES.order_by(CAPTURE_ROWID.desc()).limit(size)
+        rows = capture_rows(session, query if before is None else query.where(before > CAPTURE_ROWID))
+        if not rows:
+            return
+        files, page = files_of(session, rows), Page([], [])
+        for row in rows:
+            try:
+                page.captures.append(capture_of(row, files))
+            except StoreDamaged:
+                page.damaged.append(row)
+        yield page
+        before = rows[-1].kept
 
 
 def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, object]]]) -> Capture:

@@ -3,13 +3,15 @@
     shelf.sqlite                  database: one row per stored capture; also visits and the dose ledger
     shelf.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
     captures/<id>/<name>          files of each capture
+    captures/<id>/record.json     what the rows of the capture hold (capture_record.py)
     captures/.<id>.part/          capture being written; no row yet
     torn/<id>/                    quarantine: captures found incomplete at an opening of the store; not listed, and
                                   kept until their space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
-folder that has all files of a capture and no row may have lost its row: the store neither moves nor removes it, and
+folder that has all files of a capture and no row may have lost its row: the next opening rebuilds the row from the
+record in the folder (adoption.py). Without a valid record the store neither moves nor removes it, and
 `Quarantine.orphans` lists it.
 """
 
@@ -17,8 +19,6 @@ import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -30,30 +30,32 @@ from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import capture_rows, schema
+from services.records import capture_record, capture_rows, schema
+from services.records.adoption import PAGE_ROWS, Adoption
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.quarantine import Quarantine
-from services.records.row_validation import REMEDY, without_damaged
+from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots
 from services.records.storage_errors import is_disk_full, storage_errors
 from services.records.store_space import StoreSpace
 from services.records.write_ahead_log import WriteAheadLog
 
-PAGE_ROWS = 500  # rows per query where all rows are read
-
 
 class CaptureStore:
     """Store of captures in one folder; opening it migrates the tables and moves incomplete captures to quarantine.
 
-    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening. `quarantine`, `space` and
-    `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a lock
-    file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at
-    opening: StoreError, StoreFull, StoreDamaged.
+    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening; `adopted` and `healed`
+    the captures whose rows were missing or unreadable then, and were rebuilt from their folders. `quarantine`, `space`
+    and `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a
+    lock file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log.
+    Errors at opening: StoreError, StoreFull, StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
+    adopted: tuple[str, ...]
+    healed: tuple[str, ...]
 
     def __init__(
         self,
@@ -78,6 +80,9 @@ class CaptureStore:
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 self._refuse_without_database()
                 schema.migrate(self.engine, snapshots.create)
+                adoption = Adoption(self._captures, self.engine)
+                self.adopted = adoption.rebuild_missing(self.quarantine.folders_without_row())
+                self.healed = adoption.heal_damaged()
                 self.newly_quarantined = self.quarantine.move_incomplete()
                 self.write_ahead_log.checkpoint_if_possible()
             cleanup.pop_all()
@@ -104,7 +109,8 @@ class CaptureStore:
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
         row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
-        length_bytes = sum(map(len, files.values()))
+        length_bytes = sum(map(len, files.values()))  # rows and record, some kilobytes, fit into the reserve
+        files = {**files, capture_record.RECORD: capture_record.record_of(row)}
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
@@ -112,11 +118,16 @@ class CaptureStore:
             with _removed_when_full(part, kept):
                 atomic_io.write_folder(part, files)
                 atomic_io.replace_durably(part, kept)
-                with Session(schema.for_writing(self.engine)) as session, session.begin():
+                with (
+                    Session(schema.for_writing(self.engine)) as session,
+                    session.begin(),
+                    _renamed_back_when_refused(kept, part),
+                ):
                     session.add(row)
+                    session.flush()
                     if write_rows is not None:
-                        session.flush()
                         write_rows(session, capture)
+                        session.flush()
         self.space.count_capture(length_bytes)
         return capture
 
@@ -131,7 +142,7 @@ class CaptureStore:
             raise SettingError(f"a list of {limit} captures is not a list", "Ask for one capture or more.")
         out: list[Capture] = []
         with self._reading() as session:
-            for page in _pages(session, limit, None if before is None else _row(session, before).kept):
+            for page in capture_rows.pages(session, limit, None if before is None else _row(session, before).kept):
                 out += page.captures
                 if len(out) >= limit:
                     break
@@ -143,7 +154,7 @@ class CaptureStore:
         Lists omit these captures, and `get` raises StoreDamaged.
         """
         with self._reading() as session:
-            return sum(page.damaged for page in _pages(session, PAGE_ROWS))
+            return sum(len(page.damaged) for page in capture_rows.pages(session, PAGE_ROWS))
 
     def get(self, id: str) -> Capture:
         """Return the capture with that id; its files are not checked.
@@ -205,29 +216,6 @@ class CaptureStore:
                 raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
 
 
-@dataclass(frozen=True)
-class _Page:
-    """One page of captures, newest first, and the number of its rows that cannot be read."""
-
-    captures: list[Capture]
-    damaged: int
-
-
-def _pages(session: Session, size: int, before: int | None = None) -> Iterator[_Page]:
-    """Yield all captures, last stored first, in pages of `size` rows; only row numbers below `before`, if given."""
-    while True:
-        query = capture_rows.CAPTURES.order_by(schema.CAPTURE_ROWID.desc()).limit(size)
-        rows = capture_rows.capture_rows(
-            session, query if before is None else query.where(before > schema.CAPTURE_ROWID)
-        )
-        if not rows:
-            return
-        files = capture_rows.files_of(session, rows)
-        found = without_damaged(rows, partial(capture_rows.capture_of, files=files))
-        yield _Page(found, len(rows) - len(found))
-        before = rows[-1].kept
-
-
 def _row(session: Session, id: str) -> capture_rows.CaptureColumns:
     """Return the row of a capture, with the columns of CAPTURES; RecordNotFound if unknown or no valid id.
 
@@ -247,8 +235,23 @@ def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
     for name in (id, *files):
         if not capture_rows.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
+    if capture_record.RECORD in files:
+        raise SettingError(f"{capture_record.RECORD} is written by the store", "Give the file another name.")
     if not files:
         raise SettingError(f"{id} has no files, so there is nothing to keep")
+
+
+@contextmanager
+def _renamed_back_when_refused(kept: Path, part: Path) -> Iterator[None]:
+    """Rename a folder back to its `.part` name if the block, which writes its rows, raises; a context manager.
+
+    Nothing was committed then, so the next opening must quarantine the folder and not adopt it.
+    """
+    try:
+        yield
+    except BaseException:
+        atomic_io.replace_durably(kept, part)
+        raise
 
 
 @contextmanager

@@ -37,10 +37,10 @@ class Quarantine:
         Complete folders in `torn/`, moved there by an earlier release, are included. Lists of captures omit orphans.
         """
         with storage_errors(), atomic_io.file_lock(self._lock):  # a capture that is being written gets its row first
-            folders = [*self._folders_without_row(), *self._folder.iterdir()]
+            folders = [*self.folders_without_row(), *self._folder.iterdir()]
             return sorted(folder.name for folder in folders if _is_complete(folder))
 
-    def _folders_without_row(self) -> list[Path]:
+    def folders_without_row(self) -> list[Path]:
         """Return every folder in `captures/` whose name has no row, also `.part` folders; sorted."""
         with Session(self._engine) as session:
             kept = set(session.scalars(select(CaptureRow.id)))
@@ -52,7 +52,7 @@ class Quarantine:
         Return the names there. Complete folders without a row stay.
         """
         incomplete = [
-            stray for stray in self._folders_without_row() if stray.name.startswith(".") or not _is_complete(stray)
+            stray for stray in self.folders_without_row() if stray.name.startswith(".") or not _is_complete(stray)
         ]
         moved = tuple(atomic_io.quarantine(stray, self._folder) for stray in incomplete)
         if moved:

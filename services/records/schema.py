@@ -29,7 +29,7 @@ from sqlalchemy import (
     literal_column,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
@@ -337,6 +337,11 @@ def _begin(connection: Connection) -> None:
     """Begin a transaction; with `for_writing` take the write lock at once: an upgrade of a read lock cannot wait."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+def captures_folder(session: Session) -> Path:
+    """Return the folder with the files of the captures, which is beside the database file."""
+    return Path(str(session.get_bind().engine.url.database)).with_name("captures")
 
 
 def for_writing(engine: Engine) -> Engine:
