@@ -124,7 +124,8 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
     if change_made.startswith(
         "row"
     ):  # after damage to an index alone, lists follow the index and counts follow the row
-        assert len(captures) + store.damaged() == 3, change_made
+        assert {one.id for one in captures} >= {"c0", "c1", "c2"}, f"{change_made}: not healed"
+        assert store.damaged() <= 1, change_made  # a row whose id changed stays, and its capture is adopted again
         assert len(visits) + people.damaged() == 3, change_made
     written = (
         [visit_as_json(visit) for visit in visits],
