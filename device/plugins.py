@@ -44,7 +44,7 @@ class Plugin:
             yield
         except DiffuscopeError:
             raise
-        except Exception as error:
+        except Exception as error:  # code of other people may raise anything; none of it is hidden
             cause = str(error).strip().splitlines()
             text = f"{type(error).__name__}: {cause[0]}" if cause else type(error).__name__
             raise self.error(f"cannot {doing}: {text}") from error

@@ -10,7 +10,7 @@ from pathlib import Path
 from sqlalchemy import Engine, delete
 from sqlalchemy.orm import Session
 
-from services.errors import StoreDamaged
+from device.errors import StoreError
 from services.records import capture_record, capture_rows, schema
 from services.records.capture_report import parse_report
 from services.records.schema import CaptureRow, CaptureSlotRow, FileRow, VisitRow
@@ -43,19 +43,23 @@ class Adoption:
         """
         try:
             return tuple(id for id in self._damaged_ids() if self._rebuild(self._captures / id))
-        except StoreDamaged as error:
+        except StoreError as error:
             log.error("damaged rows of captures were not searched: %s", error)
             return ()
 
     def _rebuild(self, folder: Path) -> bool:
-        """Write the rows of one folder in one transaction; return False if its record or a file is damaged."""
+        """Write the rows of one folder in one transaction; return False if that fails, which is logged only.
+
+        It fails if the record or a file is damaged, or if the database takes no rows, for example on a full disk. The
+        folder stays as it is, the store opens, and the next opening tries again.
+        """
         try:
             row = capture_record.read_row(folder)
-        except StoreDamaged as error:
+            with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
+                _replace(session, row)
+        except StoreError as error:
             log.warning("capture folder %s stays without a readable row: %s", folder.name, error)
             return False
-        with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
-            _replace(session, row)
         log.warning("rows of capture %s rebuilt from its record", folder.name)
         return True
 

@@ -110,6 +110,18 @@ def test_a_flipped_bit_in_a_folder_without_a_row_is_never_adopted(store: Capture
     assert adopted < FLIPS, "no flip was found, so the test shows nothing"
 
 
+def test_a_database_that_takes_no_rows_does_not_prevent_the_start(store: CaptureStore) -> None:
+    kept = saved(store, "a")
+    store.close()
+    refuse = "CREATE TRIGGER full BEFORE INSERT ON captures BEGIN SELECT RAISE(FAIL, 'no space'); END"
+    without_rows(store.folder, *LOST_ROWS, refuse)
+    with CaptureStore(store.folder, reserve_bytes=0) as again:
+        assert (again.adopted, again.quarantine.orphans()) == ((), ["a"])
+    without_rows(store.folder, "DROP TRIGGER full")
+    with CaptureStore(store.folder, reserve_bytes=0) as once_more:
+        assert (once_more.adopted, once_more.captures()) == (("a",), [kept])
+
+
 def test_a_record_of_another_capture_or_format_is_refused(store: CaptureStore) -> None:
     saved(store, "a")
     store.close()
