@@ -240,12 +240,36 @@ def _read_columns(n: int) -> list[tuple[str, Row]]:
     ]
 
 
+def _sign_records(connection: sqlite3.Connection, n: int) -> None:
+    reference = f"{n:016x} {hashlib.sha256(b'press').hexdigest()}"
+    connection.execute("UPDATE captures SET request=? WHERE captures.id = ?", (reference, f"c{n}"))
+    connection.execute("UPDATE visits SET request=? WHERE visits.id = ?", (reference, f"v{n}"))
+    connection.execute("UPDATE persons SET patient_id=? WHERE persons.number = ?", (f"{n:016x}", f"A{n}"))
+    row = connection.execute(f"SELECT {_CAPTURE} FROM captures WHERE captures.id = ?", (f"c{n}",)).fetchone()
+    names = ("id", "eye", "taken_at", "simulated", "calibration_id")
+    content = dict(zip(names, row, strict=False)) | {"report": json.loads(row[5]), "request": reference}
+    content["files"] = {"raw.tiff": {"sha256": hashlib.sha256(RAW).hexdigest(), "bytes": len(RAW)}}
+    signed = {"kind": "capture", "revision": 1, "record": content}
+    digest = hashlib.sha256(json.dumps(signed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    connection.execute("UPDATE captures SET revision=?, record_sha256=? WHERE captures.id = ?", (1, digest, f"c{n}"))
+
+
+def _read_records(n: int) -> list[tuple[str, Row]]:
+    return [
+        ("SELECT captures.id FROM captures WHERE captures.record_sha256 IS NULL", ()),
+        ("SELECT captures.request, captures.revision FROM captures WHERE captures.id = ?", (f"c{n}",)),
+        ("SELECT visits.request FROM visits WHERE visits.id = ?", (f"v{n}",)),
+        ("SELECT persons.number, persons.patient_id FROM persons WHERE persons.number IN (?)", (f"A{n}",)),
+    ]
+
+
 WRITES: dict[str, Callable[[sqlite3.Connection, int], None]] = {
     "r0001": _write_captures,
     "r0002": _write_light,
     "r0003": _write_people,
     "r0004": _write_outbox,
     "r0005": _correct_eye,
+    "r0006": _sign_records,
 }
 READS: dict[str, Callable[[int], list[tuple[str, Row]]]] = {
     "r0001": _read_captures,
@@ -253,4 +277,5 @@ READS: dict[str, Callable[[int], list[tuple[str, Row]]]] = {
     "r0003": _read_people,
     "r0004": _read_outbox,
     "r0005": _read_columns,
+    "r0006": _read_records,
 }

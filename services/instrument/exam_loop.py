@@ -172,9 +172,9 @@ class ExamLoop:
             self._events.verdict(shot.id, verdict)  # a failed reconstruction is published with the stored capture
         record = self._pipeline.record(shot, made, verdict, budget_s)
         self._events.stage(shot.press, shot.id, "keep")
-        quick, write_rows = self._events.output.quick_looks.get(shot.id), shot.press.target.write_rows
+        quick, target = self._events.output.quick_looks.get(shot.id), shot.press.target
         kept = run_in_thread(
-            lambda: self._parts.store.save(record.capture, record.files(quick), write_rows),
+            lambda: self._parts.store.save(record.capture, record.files(quick), target.write_rows, target.request),
             lambda: self._serve_between_rounds(shot),
         )
         self._events.kept(shot.id)

@@ -14,11 +14,13 @@ from services.errors import StoreDamaged
 from services.records import row_validation
 from services.records.capture import Capture
 from services.records.capture_report import parse_report
+from services.records.record_rows import FileEntry, capture_content
+from services.records.record_signing import refuse_changed
 from services.records.schema import CAPTURE_ROWID, CaptureRow, FileRow
 
 CAPTURES: Select[*tuple[Any, ...]] = select(
     CAPTURE_ROWID, CaptureRow.id, CaptureRow.eye, CaptureRow.taken_at, CaptureRow.simulated, CaptureRow.calibration_id,
-    CaptureRow.report,
+    CaptureRow.report, CaptureRow.request, CaptureRow.revision, CaptureRow.record_sha256,
 )  # fmt: skip
 CaptureColumns = Row[*tuple[Any, ...]]
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")  # capture id, and name of a file
@@ -54,14 +56,15 @@ def pages(session: Session, size: int, before: int | None = None) -> Iterator[Pa
         before = rows[-1].kept
 
 
-def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, object]]]) -> Capture:
-    """Return the capture of a row of CAPTURES; `files` maps each capture id to its (file name, SHA-256) pairs.
+def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[FileEntry]]) -> Capture:
+    """Return the capture of a row of CAPTURES; `files` maps each capture id to (name, SHA-256, length) of its files.
 
-    StoreDamaged if the row or a pair cannot be read, or if the capture has no files.
+    StoreDamaged if the row or a file's row cannot be read or differs from the digest, or if the capture has no files.
     """
     with row_validation.reading_record(row.id):
         if not NAME.fullmatch(row_validation.text(row.id)) or row.id not in files:
             raise ValueError("no files belong to it")
+        refuse_changed("capture", row, capture_content(row, files[row.id]))
         return Capture(
             id=row.id,
             eye=row_validation.one_of(row.eye, *EYES),
@@ -69,18 +72,18 @@ def capture_of(row: CaptureColumns, files: Mapping[str, Sequence[tuple[object, o
             simulated=bool(row_validation.one_of(row.simulated, 0, 1)),
             calibration_id=row_validation.text(row.calibration_id),
             report=parse_report(row.report),
-            files={row_validation.text(name): row_validation.text(digest) for name, digest in files[row.id]},
+            files={row_validation.text(name): row_validation.text(digest) for name, digest, _ in files[row.id]},
         )
 
 
-def files_of(session: Session, rows: Sequence[CaptureColumns]) -> dict[str, list[tuple[object, object]]]:
-    """Return the (file name, SHA-256) pairs of these captures by capture id, sorted by file name, without validation.
+def files_of(session: Session, rows: Sequence[CaptureColumns]) -> dict[str, list[FileEntry]]:
+    """Return (name, SHA-256, length) of the files of these captures by capture id, sorted by name, without validation.
 
     Captures with an invalid id or without files are absent.
     """
     ids = [row.id for row in rows if isinstance(row.id, str) and NAME.fullmatch(row.id)]
-    found: dict[str, list[tuple[object, object]]] = defaultdict(list)
-    query = select(FileRow.capture_id, FileRow.name, FileRow.sha256).where(FileRow.capture_id.in_(ids))
-    for capture, name, digest in session.execute(query.order_by(FileRow.name)):
-        found[capture].append((name, digest))
+    found: dict[str, list[FileEntry]] = defaultdict(list)
+    query = select(FileRow.capture_id, FileRow.name, FileRow.sha256, FileRow.bytes).where(FileRow.capture_id.in_(ids))
+    for capture, name, digest, length in session.execute(query.order_by(FileRow.name)):
+        found[capture].append((name, digest, length))
     return found

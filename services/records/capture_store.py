@@ -3,19 +3,24 @@
     shelf.sqlite                  database: one row per stored capture; also visits and the dose ledger
     shelf.sqlite-wal              write-ahead log: rows that are not in the main file yet (write_ahead_log.py)
     captures/<id>/<name>          files of each capture
-    captures/<id>/record.json     what the rows of the capture hold (capture_record.py)
+    captures/<id>/record.json     what the rows of the capture hold (record_document.py)
+    patients/<id>.json            what the rows of a patient hold
+    visits/<id>.json              what the rows of a visit hold
+    damaged/<n>/                  databases that could not be used and were rebuilt from these files (recovery.py)
+    conflicts/                    states of records that another state replaced after a rollback (recovery.py)
     captures/.<id>.part/          capture being written; no row yet
     torn/<id>/                    quarantine: captures found incomplete at an opening of the store; not listed, and
                                   kept until their space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
 
 Commit protocol: files, fsync, atomic rename of the folder, and then the row. A row therefore always has its files. A
-folder that has all files of a capture and no row may have lost its row: the next opening rebuilds the row from the
-record in the folder (adoption.py). Without a valid record the store neither moves nor removes it, and
+folder that has all files of a capture and no row may have lost its row: the next opening restores the row from the
+record in the folder (recovery.py). Without a valid record the store neither moves nor removes it, and
 `Quarantine.orphans` lists it.
 """
 
 import hashlib
+import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -30,11 +35,15 @@ from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import capture_record, capture_rows, schema
-from services.records.adoption import PAGE_ROWS, Adoption
+from services.records import blobs, capture_rows, schema
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.quarantine import Quarantine
+from services.records.record_document import RecordDocument
+from services.records.record_files import CAPTURE_RECORD, RecordFiles
+from services.records.record_rows import capture_content, file_entries
+from services.records.record_signing import PAGE_ROWS, recorded, write_signature
+from services.records.recovery import Recovery, RecoveryReport, damage_of, set_aside
 from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots
@@ -42,20 +51,21 @@ from services.records.storage_errors import is_disk_full, storage_errors
 from services.records.store_space import StoreSpace
 from services.records.write_ahead_log import WriteAheadLog
 
+log = logging.getLogger(__name__)
+
 
 class CaptureStore:
     """Store of captures in one folder; opening it migrates the tables and moves incomplete captures to quarantine.
 
-    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening; `adopted` and `healed`
-    the captures whose rows were missing or unreadable then, and were rebuilt from their folders. `quarantine`, `space`
-    and `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a
-    lock file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log.
-    Errors at opening: StoreError, StoreFull, StoreDamaged.
+    `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening, `recovery` what was
+    restored from the files of the records. `quarantine`, `space` and `write_ahead_log` are the parts of the store for
+    those matters. Several threads may read while one writes; a lock file serialises writers across threads and
+    processes. Opening and closing checkpoint the write-ahead log. Errors at opening: StoreError, StoreFull,
+    StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
-    adopted: tuple[str, ...]
-    healed: tuple[str, ...]
+    recovery: RecoveryReport
 
     def __init__(
         self,
@@ -72,17 +82,15 @@ class CaptureStore:
             atomic_io.make_folder(self._captures)
             atomic_io.make_folder(torn)
             snapshots = Snapshots(database, clock or SystemClock(), free_bytes)
-            self.engine = schema.open_engine(database)
+            self.engine = schema.open_engine(database)  # connects later
             cleanup.callback(self.engine.dispose)
             self.write_ahead_log = WriteAheadLog(database, self.engine)
             self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
             self.space = StoreSpace(folder, self.engine, self.quarantine, reserve_bytes, free_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
-                self._refuse_without_database()
+                damage = self._set_damaged_database_aside()
                 schema.migrate(self.engine, snapshots.create)
-                adoption = Adoption(self._captures, self.engine)
-                self.adopted = adoption.rebuild_missing(self.quarantine.folders_without_row())
-                self.healed = adoption.heal_damaged()
+                self.recovery = Recovery(folder, self.engine, damage).run()
                 self.newly_quarantined = self.quarantine.move_incomplete()
                 self.write_ahead_log.checkpoint_if_possible()
             cleanup.pop_all()
@@ -98,10 +106,18 @@ class CaptureStore:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
 
-    def save(self, capture: Capture, files: Mapping[str, bytes], write_rows: RowWriter | None = None) -> Capture:
+    def save(
+        self,
+        capture: Capture,
+        files: Mapping[str, bytes],
+        write_rows: RowWriter | None = None,
+        request: str | None = None,
+    ) -> Capture:
         """Store a capture and its files (name -> content); return it with their SHA-256 once it is durable.
 
-        `write_rows` adds rows in the same transaction. Quarantined captures are deleted if their space is needed.
+        `write_rows` adds rows in the same transaction. `request`: reference of the press, as
+        `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
+        if their space is needed.
         Errors: StoreFull (everything written is removed); StoreError (the id exists; or a write failed: the next
         opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name or
         report, or no files).
@@ -109,25 +125,23 @@ class CaptureStore:
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
         row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
+        row.request = request
+        record = RecordDocument("capture", 1, capture_content(row, file_entries(row)))
         length_bytes = sum(map(len, files.values()))  # rows and record, some kilobytes, fit into the reserve
-        files = {**files, capture_record.RECORD: capture_record.record_of(row)}
+        files = {**files, CAPTURE_RECORD: record.encoded()}
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
             self.space.make_room(length_bytes)
             with _removed_when_full(part, kept):
-                atomic_io.write_folder(part, files)
+                blobs.write_folder(part, files)
                 atomic_io.replace_durably(part, kept)
-                with (
-                    Session(schema.for_writing(self.engine)) as session,
-                    session.begin(),
-                    _renamed_back_when_refused(kept, part),
-                ):
+                with _renamed_back_when_refused(kept, part), recorded(self.engine) as session:
                     session.add(row)
                     session.flush()
+                    write_signature(session, record)
                     if write_rows is not None:
                         write_rows(session, capture)
-                        session.flush()
         self.space.count_capture(length_bytes)
         return capture
 
@@ -175,12 +189,12 @@ class CaptureStore:
         """
         with self._reading() as session:
             row = _row(session, id)
-            files = dict(capture_rows.files_of(session, [row]).get(row.id, ()))
+            files = {name: digest for name, digest, _ in capture_rows.files_of(session, [row]).get(row.id, ())}
         if name not in files:
             raise RecordNotFound(f"{id} has no file named {name!r}")
         # The path is built from the row alone: path traversal through `id` or `name` is impossible.
         try:
-            content: bytes = (self._captures / row.id / name).read_bytes()
+            content = blobs.read_blob(self._captures / row.id / name)
         except OSError as error:
             raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != files[name]:
@@ -200,15 +214,21 @@ class CaptureStore:
         with storage_errors(), Session(self.engine) as session:
             yield session
 
-    def _refuse_without_database(self) -> None:
-        """Raise StoreDamaged if captures exist, but the database is missing or empty.
+    def _set_damaged_database_aside(self) -> str | None:
+        """Move a database that cannot be used to `damaged/`, so that it is rebuilt; return why, None for a usable one.
 
-        A new database would have no rows for these captures.
+        A store whose visits never had files cannot be rebuilt: its damaged database is opened as it is, row by row, and
+        StoreDamaged is raised if it is missing or empty, because a new one would have no rows for the captures.
         """
         database = self.folder / "shelf.sqlite"
+        damage = damage_of(database)
+        if damage is not None and RecordFiles(self.folder).exist():
+            log.error("the database is moved to %s: %s", set_aside(database), damage)
+            return damage
         missing = not database.exists() or database.stat().st_size == 0
         if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
             raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
+        return None
 
     def _refuse_duplicate(self, *folders: Path) -> None:
         for folder in folders:
@@ -235,8 +255,8 @@ def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
     for name in (id, *files):
         if not capture_rows.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")
-    if capture_record.RECORD in files:
-        raise SettingError(f"{capture_record.RECORD} is written by the store", "Give the file another name.")
+    if CAPTURE_RECORD in files:
+        raise SettingError(f"{CAPTURE_RECORD} is written by the store", "Give the file another name.")
     if not files:
         raise SettingError(f"{id} has no files, so there is nothing to keep")
 

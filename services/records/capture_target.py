@@ -20,7 +20,8 @@ class CaptureTarget:
     """Target of a capture: visit id, slot id and field of view; without a visit the capture is a test picture.
 
     `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds
-    rows in the transaction that stores the capture. `permit` is called right before the light and raises ConsentMissing
+    rows in the transaction that stores the capture, whose record holds `request`, the reference of the press
+    (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing
     or ConsentDeclined if the visit does not allow light.
     """
 
@@ -30,6 +31,7 @@ class CaptureTarget:
     retakes: int = 2
     field: str | None = None
     write_rows: RowWriter | None = None
+    request: str | None = None
     permit: Permit = permit_test_picture
 
 

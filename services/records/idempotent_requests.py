@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from device.clock import Clock
 from device.errors import InputError
 from services.records import schema
+from services.records.record_signing import recorded
 from services.records.schema import IdempotencyKeyRow
 from services.records.storage_errors import storage_errors
 
@@ -27,7 +28,7 @@ class IdempotentRequests:
 
         For a repeated key return the stored answer; InputError if the key belongs to another request.
         """
-        with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
+        with storage_errors(), recorded(self._engine) as session:
             before = self.find(session, key, request)
             if before is None:
                 answer = act(session)
@@ -61,6 +62,10 @@ class IdempotentRequests:
         """Add the key of a completed request to the transaction."""
         now = schema.utc_text(self._clock.wall())
         session.add(IdempotencyKeyRow(key=key, request=_digest(request), answer=answer, done_at=now))
+
+    def reference(self, key: str, request: str) -> str:
+        """Return key and digest of a request, as the record that the request makes holds them."""
+        return f"{key} {_digest(request)}"
 
     def delete_expired(self, session: Session) -> None:
         """Delete the keys that are older than KEY_RETENTION."""

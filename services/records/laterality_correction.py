@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from device.errors import InputError
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
-from services.records import capture_record, row_validation, schema
+from services.records import row_validation, schema
 from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
 from services.records.capture_report import parse_report, report_as_json
 from services.records.dose_ledger_tables import add_given_dose
@@ -97,7 +97,7 @@ def relabel(session: Session, shot: CaptureSlotRow, to: Slot, at: datetime, by: 
     """Write the new eye and slot into the rows, and the move (old eye and slot, new eye, time, screen) into the report.
 
     `by`: public name of the screen that requested the move; None for the instrument's own button or a script.
-    The files of the capture stay unchanged, but for its record (capture_record.py). The dose of the capture is added
+    The files of the capture stay unchanged, but for its record (record_document.py). The dose of the capture is added
     once to the new eye and stays counted for the other eye too, because the correction may be wrong.
     """
     row = session.get_one(CaptureRow, shot.capture)
@@ -107,7 +107,6 @@ def relabel(session: Session, shot: CaptureSlotRow, to: Slot, at: datetime, by: 
     if to.eye not in counted:
         add_given_dose(session, to.eye, report.light.dose_j_per_cm2 or 0.0)
     row.eye, row.report, shot.slot = to.eye, schema.report_text(report_as_json(report)), to.id
-    capture_record.rewrite_record(session, row)
 
 
 def _eye(row: CaptureRow) -> Eye:
@@ -130,4 +129,3 @@ def confirm(session: Session, shot: CaptureSlotRow, at: datetime, by: str | None
     row = session.get_one(CaptureRow, shot.capture)
     report = _report(row).with_confirmation(EyeConfirmation(row.eye, at.isoformat(), by))
     row.report = schema.report_text(report_as_json(report))
-    capture_record.rewrite_record(session, row)

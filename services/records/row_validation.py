@@ -6,7 +6,7 @@ error of the driver. Values that pass can be written as JSON: text without lone 
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from typing import Any, TypeVar, cast
@@ -57,6 +57,15 @@ def text(value: object) -> str:
         raise ValueError(f"{type(value).__name__} where a text was kept")
     value.encode()  # UnicodeEncodeError is a ValueError
     return value
+
+
+def readable_keys(values: Iterable[object]) -> list[str]:
+    """Return those of the primary keys that can be asked for again: texts that were stored as UTF-8."""
+    return [value for value in values if isinstance(value, str) and _is_utf8(value)]
+
+
+def _is_utf8(value: str) -> bool:
+    return not any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
 def form_value(value: object) -> FormValue:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +30,7 @@ from sqlalchemy import (
     literal_column,
     text,
 )
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from device.errors import SettingError
@@ -48,6 +49,9 @@ PRAGMAS = (
 )
 
 
+SCHEMA_TEXT = "SELECT name, sql FROM sqlite_schema"
+
+
 class Base(DeclarativeBase):
     """Declarative base of all tables."""
 
@@ -58,12 +62,26 @@ def _report_entry(name: str, kind: str) -> Computed:
     return Computed(f"CASE WHEN json_valid(report) THEN {entry} END", persisted=False)
 
 
-class CaptureRow(Base):
+UNSIGNED = "record_sha256 IS NULL"
+
+
+class RecordColumns:
+    """Columns of the row of a record: its revision and digest (record_document.py).
+
+    A trigger makes `record_sha256` null when a value of the record is changed, also by an earlier release, until the
+    record is signed again (record_signing.py).
+    """
+
+    revision: Mapped[int] = mapped_column(server_default="0")
+    record_sha256: Mapped[str | None] = mapped_column(Text)
+
+
+class CaptureRow(RecordColumns, Base):
     """One stored capture; `report` is JSON, `simulated` 0 or 1.
 
     `taken_at` is UTC text with six decimals of the second, so that text order is time order. SQLite computes `visit`,
     `slot`, `verdict` and `laterality` (the last two JSON objects) from the report: they stand in one place, also after
-    a write by an earlier release.
+    a write by an earlier release. `request`: idempotency key of its press and SHA-256 of that request, or null.
     """
 
     __tablename__ = "captures"
@@ -79,6 +97,7 @@ class CaptureRow(Base):
     slot: Mapped[str | None] = mapped_column(Text, _report_entry("slot", "text"))
     verdict: Mapped[str | None] = mapped_column(Text, _report_entry("verdict", "object"))
     laterality: Mapped[str | None] = mapped_column(Text, _report_entry("laterality", "object"))
+    request: Mapped[str | None] = mapped_column(Text)
     files: Mapped[list["FileRow"]] = relationship(order_by="FileRow.name")
 
     __table_args__ = (
@@ -86,6 +105,7 @@ class CaptureRow(Base):
         CheckConstraint("simulated IN (0, 1)", name="simulated_is_yes_or_no"),
         CheckConstraint("json_valid(report)", name="report_is_json"),
         Index("captures_by_time", "taken_at", "id"),
+        Index("captures_to_sign", "id", sqlite_where=text(UNSIGNED)),
         {"sqlite_strict": True},
     )
 
@@ -147,15 +167,20 @@ class ObservedTimeRow(Base):
     __table_args__ = (CheckConstraint("id = 1", name="time_is_one"), {"sqlite_strict": True})
 
 
-class PatientRow(Base):
-    """One patient: patient number, and time of creation (UTC); no identifying field."""
+class PatientRow(RecordColumns, Base):
+    """One patient: patient number, time of creation (UTC), and an opaque random id; no identifying field.
+
+    A patient that an earlier release made has no `patient_id` until its record is signed.
+    """
 
     __tablename__ = "persons"
 
     number: Mapped[str] = mapped_column(Text, primary_key=True)
     made_at: Mapped[str] = mapped_column(Text)
+    patient_id: Mapped[str | None] = mapped_column(Text)
 
     __table_args__ = (
+        Index("persons_to_sign", "number", sqlite_where=text(UNSIGNED)),
         CheckConstraint("length(number) BETWEEN 1 AND 20", name="number_is_short"),
         {"sqlite_strict": True},
     )
@@ -180,10 +205,11 @@ class IdentifierRow(Base):
 UNSENT = "finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at)"
 
 
-class VisitRow(Base):
+class VisitRow(RecordColumns, Base):
     """One visit of the patient with number `person`; `day` is the local date of its start, timestamps are UTC.
 
-    `finished_at` and `outcome` (JSON) are null in an unfinished visit.
+    `finished_at` and `outcome` (JSON) are null in an unfinished visit. `request`: idempotency key of the request that
+    began it and SHA-256 of that request, or null.
     """
 
     __tablename__ = "visits"
@@ -195,12 +221,14 @@ class VisitRow(Base):
     finished_at: Mapped[str | None] = mapped_column(Text)
     outcome: Mapped[str | None] = mapped_column(Text)
     sent: Mapped[str | None] = mapped_column(Text)  # the `finished_at` of the last uploaded state
+    request: Mapped[str | None] = mapped_column(Text)
 
     __table_args__ = (
         CheckConstraint("(finished_at IS NULL) = (outcome IS NULL)", name="what_is_finished_has_an_outcome"),
         CheckConstraint("outcome IS NULL OR json_valid(outcome)", name="outcome_is_json"),
         Index("visits_by_time", "begun_at", "id"),
         Index("visits_by_day", "day"),
+        Index("visits_to_sign", "id", sqlite_where=text(UNSIGNED)),
         Index(
             "visits_to_send", "finished_at", sqlite_where=text(UNSENT)
         ),  # partial index: only visits in the upload queue
@@ -309,6 +337,18 @@ class IdempotencyKeyRow(Base):
     )
 
 
+RecordRow = PatientRow | VisitRow | CaptureRow
+RECORD_TABLES: dict[str, type[RecordRow]] = {
+    "patient": PatientRow, "visit": VisitRow, "capture": CaptureRow,
+}  # fmt: skip
+RECORD_KEYS = {"patient": PatientRow.number, "visit": VisitRow.id, "capture": CaptureRow.id}
+
+
+def record_key(row: RecordRow) -> str:
+    """Return the primary key of the row of a record: the number of a patient, the id of a visit or a capture."""
+    return row.number if isinstance(row, PatientRow) else row.id
+
+
 def open_engine(path: Path) -> Engine:
     """Return an engine for one SQLite file, usable from any thread; transactions of `for_writing` are serialised.
 
@@ -337,11 +377,6 @@ def _begin(connection: Connection) -> None:
     """Begin a transaction; with `for_writing` take the write lock at once: an upgrade of a read lock cannot wait."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
-
-
-def captures_folder(session: Session) -> Path:
-    """Return the folder with the files of the captures, which is beside the database file."""
-    return Path(str(session.get_bind().engine.url.database)).with_name("captures")
 
 
 def for_writing(engine: Engine) -> Engine:
@@ -386,6 +421,16 @@ def migrate(engine: Engine, before: Callable[[str], None]) -> None:
     with for_writing(engine).begin() as connection:
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+        tables = [tuple(row) for row in connection.exec_driver_sql(SCHEMA_TEXT)]
+        connection.exec_driver_sql(f"PRAGMA user_version = {schema_checksum(tables)}")
+
+
+def schema_checksum(tables: Sequence[tuple[str, str | None]]) -> int:
+    """Return the checksum (31 bits, not 0) of the rows of SCHEMA_TEXT, stored as `user_version` of the database.
+
+    A bit that changes in the SQL of a trigger or a constraint passes SQLite's integrity check.
+    """
+    return zlib.crc32(repr(sorted(tables, key=repr)).encode()) & 0x7FFFFFFF or 1
 
 
 def migration_config() -> Config:

@@ -15,6 +15,7 @@ from device.clock import Clock
 from device.errors import DiffuscopeError
 from services.errors import ReceiverUnreachable
 from services.records import row_validation, schema
+from services.records.record_signing import recorded
 from services.records.row_validation import reading_record, without_damaged
 from services.records.schema import CaptureSlotRow, FileRow, UploadRow, VisitRow
 from services.records.storage_errors import storage_errors
@@ -140,7 +141,7 @@ class UploadQueue:
         A visit that was finished again meanwhile stays in the queue.
         """
         now, finish = self.clock.wall(), schema.utc_text(one.finished_at)
-        with storage_errors(), Session(schema.for_writing(self.engine)) as session, session.begin():
+        with storage_errors(), recorded(self.engine) as session:
             row = _attempt_row(session, one)
             row.tries, row.error, row.said, row.failing_since = row.tries + 1, None, None, None
             row.sent_at, row.sha256, row.confirmed = schema.utc_text(now), receipt.sha256, receipt.confirmed

@@ -36,8 +36,9 @@ class VisitPictures:
         `key`: idempotency key, stored with the capture. Errors: InputError (the slot is of the other eye),
         RecordNotFound (unknown visit or slot), VisitFinished, ConsentMissing, ConsentDeclined.
         """
+        request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         if id is None or slot is None:
-            return CaptureTarget(write_rows=self._row_writer(key))
+            return CaptureTarget(write_rows=self._row_writer(key), request=request)
         visit, protocol_slot = self._get(id), self._protocol.slot(slot)
         if protocol_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
@@ -47,7 +48,7 @@ class VisitPictures:
         permit()
         tries = len(visit.slots[slot].captures)
         return CaptureTarget(
-            id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), permit
+            id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit
         )
 
     def permission(self, id: str | None) -> Permit:

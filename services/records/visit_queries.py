@@ -17,6 +17,8 @@ from services.errors import RecordNotFound, StoreDamaged
 from services.records import row_validation
 from services.records.capture_report import read_verdict
 from services.records.protocol import Protocol
+from services.records.record_rows import visit_contents
+from services.records.record_signing import refuse_changed
 from services.records.row_validation import REMEDY, reading_record, without_damaged
 from services.records.schema import (
     CAPTURE_ROWID,
@@ -84,11 +86,13 @@ def counts(session: Session, day: str | None) -> dict[str, int]:
 def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) -> list[Visit]:
     """Return the visits of these rows, in the same order, without those that cannot be read."""
     known = without_damaged(rows, _checked_row)
+    contents = visit_contents(session, known)
     ids, fields = [row.id for row in known], _fields(session, known)
     taken, decided = _taken(session, ids), _decided(session, ids)
 
     def visit(row: VisitRow) -> Visit:
         with reading_record(row.id):
+            refuse_changed("visit", row, contents[row.id])
             slots = {
                 slot.id: SlotState(
                     tuple(_taken_capture(*one) for one in taken[row.id, slot.id]), _choice(decided, row, slot.id)

@@ -39,6 +39,7 @@ class VisitRepository:
         """
 
         number = None if number is None else numbering.normalise(number)
+        request = f"begin {number}"
 
         def act(session: Session) -> str:
             now = self.clock.wall()
@@ -47,10 +48,11 @@ class VisitRepository:
             number_of_patient = patient_rows.patient_number(session, prefix, number, begun_at)
             id = f"{now:%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
             day = now.astimezone().date().isoformat()
-            session.add(VisitRow(id=id, person=number_of_patient, day=day, begun_at=begun_at))
+            reference = self.requests.reference(key, request)
+            session.add(VisitRow(id=id, person=number_of_patient, day=day, begun_at=begun_at, request=reference))
             return id
 
-        return self.get(self.requests.run_in_transaction(key, f"begin {number}", act))
+        return self.get(self.requests.run_in_transaction(key, request, act))
 
     def get(self, id: str) -> Visit:
         """Return one visit; RecordNotFound if unknown, StoreDamaged if its rows cannot be read."""

@@ -24,8 +24,8 @@ from device import atomic_io
 from device.values import Report
 from services.records import capture_store as product
 from services.records.capture import Capture, CaptureReport
-from services.records.capture_record import RECORD
 from services.records.capture_store import CaptureStore
+from services.records.record_files import CAPTURE_RECORD as RECORD
 
 WATCHED = (str(Path(product.__file__).parent), atomic_io.__file__)  # files whose lines are traced
 FILES = {"raw.tiff": bytes(range(256)) * 40, "picture.png": b"png" * 300, "report.json": b"{}"}
@@ -123,7 +123,9 @@ def test_each_step_is_durable_before_the_next_begins(tmp_path: Path) -> None:
     files = [f"fsync {name}" for name in (*FILES, RECORD)]
     assert sorted(seen[:4]) == sorted(files)
     assert seen[4:7] == ["fsync .new.part", "rename", "fsync captures"]
-    assert seen[7:] == ["BEGIN IMMEDIATE", "INSERT INTO captures", "INSERT INTO files"]
+    assert seen[7:10] == ["BEGIN IMMEDIATE", "INSERT INTO captures", "INSERT INTO files"]
+    assert seen[10].startswith("UPDATE captures SET revision")
+    assert all(one.startswith("SELECT") for one in seen[11:]), "the search for unsigned records"
 
 
 # Victim process

@@ -11,11 +11,11 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import StoreFull
 from services.records.capture import Capture, CaptureReport
-from services.records.capture_record import RECORD
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
+from services.records.record_files import CAPTURE_RECORD as RECORD
 from services.records.visit_repository import VisitRepository
 from tests.journey.test_cli_server import Server
 
@@ -78,7 +78,7 @@ def test_a_flipped_bit_in_the_log_costs_no_picture_and_lowers_no_dose(
             listed = {one.id for one in store.captures()}
             assert listed == set(kept), flipped
             assert not store.quarantine.sizes_bytes(), flipped
-            adopted += len(store.adopted)
+            adopted += len(store.recovery.adopted)
             VisitRepository(store.engine, load_protocol(), VirtualClock()).visits(10)
         assert complete_captures(folder) == set(kept), flipped
         now = spent_of(folder)

@@ -221,8 +221,9 @@ def test_an_invalid_protocol_is_refused_with_the_key_of_the_mistake(tmp_path: Pa
 @pytest.mark.parametrize(
     "statement",
     [
-        "INSERT INTO visits VALUES ('v', 'nobody', '2026-01-01', 'x', NULL, NULL, NULL)",
-        "INSERT INTO persons VALUES ('', 'x')", "INSERT INTO persons VALUES ('123456789012345678901', 'x')",
+        "INSERT INTO visits (id, person, day, begun_at) VALUES ('v', 'no one', '2026-01-01', 'x')",
+        "INSERT INTO persons (number, made_at) VALUES ('', 'x')",
+        "INSERT INTO persons (number, made_at) VALUES ('123456789012345678901', 'x')",
         "UPDATE visits SET finished_at = 'x'", "UPDATE visits SET outcome = '{}'", "DELETE FROM persons",
         "INSERT INTO fields SELECT id, 'age', 'fifty', 'x' FROM visits",
         "INSERT INTO slots SELECT id, 'R-centre', 'no capture', NULL FROM visits",

@@ -1,7 +1,8 @@
-"""Adoption: rows of captures that were lost or damaged are rebuilt from the records in the capture folders."""
+"""Recovery: rows that were lost or damaged are restored from the files of their records at the next opening."""
 
 import json
 import random
+import re
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -11,11 +12,13 @@ import pytest
 
 from device.clock import VirtualClock
 from device.errors import SettingError
+from services.errors import StoreDamaged
 from services.records.capture import Capture, CaptureReport, PictureVerdict
-from services.records.capture_record import RECORD
 from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
+from services.records.record_files import CAPTURE_RECORD as RECORD
+from services.records.recovery import RecoveryReport
 from services.records.visit_repository import VisitRepository
 
 FILES = {name: name.encode() * 50 for name in REQUIRED_FILES}
@@ -41,6 +44,14 @@ def without_rows(folder: Path, *statements: str) -> None:
     database.close()
 
 
+def flip(path: Path, content: bytes, changed: bytes, nth: int = 0) -> None:
+    """Replace the occurrence number `nth` of a text in a file by another of the same length."""
+    before = path.read_bytes()
+    places = [found.start() for found in re.finditer(re.escape(content), before)]
+    place = places[nth]
+    path.write_bytes(before[:place] + changed + before[place + len(content) :])
+
+
 LOST_ROWS = ("DELETE FROM shots", "DELETE FROM files", "DELETE FROM captures")
 
 
@@ -49,12 +60,12 @@ def test_captures_without_rows_are_adopted_with_all_that_was_stored(store: Captu
     store.close()
     without_rows(store.folder, *LOST_ROWS)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert (again.adopted, again.newly_quarantined) == (("a", "b"), ())
+        assert (again.recovery.adopted, again.newly_quarantined) == (["a", "b"], ())
         assert sorted(again.captures(), key=lambda one: one.id) == sorted(kept, key=lambda one: one.id)
         assert {name: again.read("a", name) for name in FILES} == FILES
         assert again.quarantine.orphans() == []
     with CaptureStore(store.folder, reserve_bytes=0) as once_more:
-        assert once_more.adopted == ()
+        assert once_more.recovery == RecoveryReport()
 
 
 def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> None:
@@ -78,19 +89,25 @@ def test_an_adopted_capture_is_in_the_slot_of_its_visit(store: CaptureStore) -> 
 def test_an_unreadable_row_is_healed_and_its_neighbours_are_unchanged(store: CaptureStore) -> None:
     kept = [saved(store, id) for id in ("a", "b", "c")]
     store.close()
-    without_rows(
-        store.folder,
-        "PRAGMA ignore_check_constraints = ON",
-        "UPDATE captures SET report = replace(report, ':', ';') WHERE id = 'b'",
-    )
+    flip(store.folder / "shelf.sqlite", b'"level": 0.25', b'"level": 0.75', nth=1)
     with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert (again.healed, again.damaged()) == (("b",), 0)
+        assert (len(again.recovery.healed), again.recovery.rebuilt_because, again.damaged()) == (1, None, 0)
         assert again.captures() == kept[::-1]
 
 
+def test_an_entry_that_is_no_json_rebuilds_the_database(store: CaptureStore) -> None:
+    kept = [saved(store, id) for id in ("a", "b", "c")]
+    store.close()
+    flip(store.folder / "shelf.sqlite", b'"level": 0.25', b'"level"; 0.25', nth=1)
+    with CaptureStore(store.folder, reserve_bytes=0) as again:
+        assert again.recovery.rebuilt_because == "CHECK constraint failed in captures"
+        assert sorted(again.captures(), key=lambda one: one.id) == kept
+    assert (store.folder / "damaged" / "1" / "shelf.sqlite").exists()
+
+
 @pytest.mark.parametrize("name", [RECORD, "raw.tiff"])
-def test_a_flipped_bit_in_a_folder_without_a_row_is_never_adopted(store: CaptureStore, name: str) -> None:
-    """Either the record still describes the capture as it was stored, or the folder stays as it is, without a row."""
+def test_a_flipped_bit_in_a_folder_without_a_row_is_never_shown(store: CaptureStore, name: str) -> None:
+    """A changed record is not adopted, unless it reads the same; a changed file is refused when it is read."""
     kept = saved(store, "a")
     store.close()
     random_source = random.Random(20)
@@ -104,22 +121,24 @@ def test_a_flipped_bit_in_a_folder_without_a_row_is_never_adopted(store: Capture
         place.write_bytes(content)
         with CaptureStore(folder, reserve_bytes=0) as again:
             assert again.captures() in ([], [kept]), turn
-            adopted += len(again.adopted)
-            assert len(again.adopted) + len(again.quarantine.orphans()) == 1, turn
-    assert adopted == 0 or name == RECORD, "a changed file was adopted"
-    assert adopted < FLIPS, "no flip was found, so the test shows nothing"
+            adopted += len(again.recovery.adopted)
+            assert len(again.recovery.adopted) + len(again.quarantine.orphans()) == 1, turn
+            if name != RECORD:
+                with pytest.raises(StoreDamaged, match="SHA-256"):
+                    again.read("a", name)
+    assert adopted < FLIPS if name == RECORD else adopted == FLIPS
 
 
 def test_a_database_that_takes_no_rows_does_not_prevent_the_start(store: CaptureStore) -> None:
     kept = saved(store, "a")
     store.close()
     refuse = "CREATE TRIGGER full BEFORE INSERT ON captures BEGIN SELECT RAISE(FAIL, 'no space'); END"
-    without_rows(store.folder, *LOST_ROWS, refuse)
+    without_rows(store.folder, *LOST_ROWS, refuse, "PRAGMA user_version = 0")
     with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert (again.adopted, again.quarantine.orphans()) == ((), ["a"])
+        assert (again.recovery.adopted, again.quarantine.orphans()) == ([], ["a"])
     without_rows(store.folder, "DROP TRIGGER full")
     with CaptureStore(store.folder, reserve_bytes=0) as once_more:
-        assert (once_more.adopted, once_more.captures()) == (("a",), [kept])
+        assert (once_more.recovery.adopted, once_more.captures()) == (["a"], [kept])
 
 
 def test_a_record_of_another_capture_or_format_is_refused(store: CaptureStore) -> None:
@@ -129,9 +148,9 @@ def test_a_record_of_another_capture_or_format_is_refused(store: CaptureStore) -
     captures = store.folder / "captures"
     shutil.copytree(captures / "a", captures / "b")
     record = json.loads((captures / "a" / RECORD).read_bytes())
-    (captures / "a" / RECORD).write_text(json.dumps(record | {"format": 2}))
+    (captures / "a" / RECORD).write_text(json.dumps(record | {"format": 3}))
     with CaptureStore(store.folder, reserve_bytes=0) as again:
-        assert (again.adopted, again.quarantine.orphans()) == ((), ["a", "b"])
+        assert (again.recovery.adopted, again.quarantine.orphans()) == ([], ["a", "b"])
 
 
 def test_a_file_cannot_take_the_place_of_the_record(store: CaptureStore) -> None:

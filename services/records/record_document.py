@@ -1,0 +1,91 @@
+"""Self-describing record of a patient, a visit or a capture: one JSON file that holds what its database rows hold.
+
+    {"format": 2, "kind": "visit", "revision": 3, "record": {"id": ..., ...}, "sha256": "..."}
+
+`sha256` is the digest of the canonical JSON (sorted keys, no spaces) of `kind`, `revision` and `record`. The rows hold
+the same revision and digest, so that a changed bit in either is detected, and the newer of the two is known. Format 1
+described captures only, without a revision; it is still read.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from services.records import row_validation
+from services.records.json_values import JsonObject, JsonValue
+
+FORMAT = 2
+Kind = Literal["patient", "visit", "capture"]
+
+
+@dataclass(frozen=True)
+class RecordDocument:
+    """One revision of a record; `content` has the entries of `record`, with the id of the record as `id`."""
+
+    kind: Kind
+    revision: int
+    content: JsonObject
+
+    @property
+    def id(self) -> str:
+        """Id of the patient, the visit or the capture."""
+        return row_validation.text(self.content["id"])
+
+    @property
+    def key(self) -> str:
+        """Primary key of the row: the number of the patient, or the id of the visit or the capture."""
+        return row_validation.text(self.content["number" if self.kind == "patient" else "id"])
+
+    def sha256(self) -> str:
+        """Return the SHA-256 (hexadecimal) of the canonical JSON of kind, revision and content."""
+        return _digest(self._signed())
+
+    def encoded(self) -> bytes:
+        """Return the content of the file."""
+        entries = {"format": FORMAT, **self._signed(), "sha256": self.sha256()}
+        return json.dumps(entries, indent=1).encode()
+
+    def _signed(self) -> JsonObject:
+        return {"kind": self.kind, "revision": self.revision, "record": dict(self.content)}
+
+
+def parse_document(content: bytes) -> RecordDocument:
+    """Return the document in a file; ValueError, TypeError or KeyError if it is no document or differs from its digest.
+
+    A capture in format 1 has revision 0.
+    """
+    entries = as_object(row_validation.parsed_json(content.decode()))
+    if entries["format"] == 1:
+        capture = as_object(entries["capture"])
+        _refuse_changed(_digest(capture), entries["sha256"])
+        return RecordDocument("capture", 0, {**capture, "request": None})
+    kind: Kind = row_validation.one_of(entries["kind"], *get_args(Kind))
+    row_validation.one_of(entries["format"], FORMAT)
+    document = RecordDocument(kind, whole_number(entries["revision"]), as_object(entries["record"]))
+    _refuse_changed(document.sha256(), entries["sha256"])
+    return document
+
+
+def as_object(value: JsonValue) -> JsonObject:
+    """Return the value unchanged if it is a JSON object; ValueError otherwise."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{type(value).__name__} where an object was kept")
+    return value
+
+
+def whole_number(value: object) -> int:
+    """Return the value unchanged if it is a whole number of at least 0; ValueError otherwise."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{value!r:.60} where a whole number was kept")
+    return value
+
+
+def _refuse_changed(digest: str, expected: object) -> None:
+    if digest != expected:
+        raise ValueError("the SHA-256 of the record differs")
+
+
+def _digest(entries: JsonObject) -> str:
+    canonical = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()

@@ -1,0 +1,76 @@
+"""Files of the records in a store: `patients/<id>.json`, `visits/<id>.json` and `captures/<id>/record.json`."""
+
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from device import atomic_io
+from services.errors import StoreDamaged
+from services.records import blobs, row_validation
+from services.records.record_document import Kind, RecordDocument, parse_document
+
+CAPTURE_RECORD = "record.json"
+_FOLDERS: dict[Kind, str] = {"patient": "patients", "visit": "visits"}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+class RecordFiles:
+    """Files of the records of the store in `folder`; the caller serialises writers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def exist(self) -> bool:
+        """Return whether every visit of this store has had a file, so that its rows can be rebuilt from the files."""
+        return all((self._folder / name).is_dir() for name in _FOLDERS.values())
+
+    def make_folders(self) -> None:
+        """Create the folders of the files durably; OSError if the disk refuses."""
+        for name in _FOLDERS.values():
+            atomic_io.make_folder(self._folder / name)
+
+    def path(self, kind: Kind, id: str) -> Path:
+        """Return the path of the file of a record; ValueError if the id cannot name a file."""
+        if not _NAME.fullmatch(id):
+            raise ValueError(f"{id!r:.60} cannot name a file")
+        if kind == "capture":
+            return self._folder / "captures" / id / CAPTURE_RECORD
+        return self._folder / _FOLDERS[kind] / f"{id}.json"
+
+    def read(self, kind: Kind, id: str) -> RecordDocument | None:
+        """Return the document in the file of a record; None without a file, StoreDamaged if it cannot be read."""
+        with row_validation.reading_record(id):
+            path = self.path(kind, id)
+            try:
+                content = blobs.read_blob(path)
+            except (FileNotFoundError, NotADirectoryError):
+                return None
+            except OSError as error:
+                raise StoreDamaged(f"the record of {id} cannot be read: {error}") from error
+            document = parse_document(content)
+            if (document.kind, document.id) != (kind, id):
+                raise ValueError(f"a record of the {document.kind} {document.id!r:.60}")
+            return document
+
+    def ids(self, kind: Kind) -> Iterator[str]:
+        """Yield the ids of the records of patients or visits that have a file, sorted."""
+        folder = self._folder / _FOLDERS[kind]
+        if folder.is_dir():
+            yield from sorted(path.stem for path in folder.glob("[!.]*.json"))
+
+    def write(self, documents: Iterable[RecordDocument]) -> None:
+        """Write or replace the files of these records, each atomically and durably, in the given order.
+
+        A capture without a folder gets no file. OSError if the disk refuses.
+        """
+        for document in documents:
+            path = self.path(document.kind, document.id)
+            if path.parent.is_dir():
+                blobs.write_blob(path, document.encoded())
+
+    def remove(self, kind: Kind, id: str) -> None:
+        """Remove the file of a patient or visit whose rows were not committed; without a file do nothing."""
+        path = self.path(kind, id)
+        if kind != "capture" and path.exists():
+            path.unlink()
+            atomic_io.fsync_folder(path.parent)

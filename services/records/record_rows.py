@@ -1,0 +1,296 @@
+"""Contents of records from database rows, and rows from contents: patients, visits, captures.
+
+A record holds raw values of its rows, so that content read from restored rows is the same again. The captures of a
+visit are not in its record: each capture's own record names visit and slot.
+"""
+
+import base64
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from datetime import date
+from typing import Any
+
+from sqlalchemy import Row, delete, select
+from sqlalchemy.dialects.sqlite import insert
+from sqlalchemy.orm import Session
+
+from device.values import EYES
+from services.records import row_validation
+from services.records.capture_report import read_report
+from services.records.json_values import JsonObject, JsonValue
+from services.records.record_document import Kind, as_object, whole_number
+from services.records.schema import (
+    AnswerRow,
+    CaptureRow,
+    CaptureSlotRow,
+    FileRow,
+    IdempotencyKeyRow,
+    IdentifierRow,
+    PatientRow,
+    SlotDecisionRow,
+    UploadRow,
+    VisitRow,
+)
+
+CAPTURE_VALUES = ("eye", "taken_at", "simulated", "calibration_id", "report", "request")
+IDENTITY_VERSION = 1  # version of the encoding of the identifying fields
+Content = dict[str, JsonValue]
+FileEntry = tuple[Any, Any, Any]  # name, SHA-256 and length of a file, as the row has them
+
+
+def file_entries(row: CaptureRow) -> list[FileEntry]:
+    """Return name, SHA-256 and length of each file of a capture."""
+    return [(file.name, file.sha256, file.bytes) for file in row.files]
+
+
+def capture_content(row: CaptureRow | Row[*tuple[Any, ...]], files: Iterable[FileEntry]) -> Content:
+    """Return the content of the record of a capture from its row and (name, SHA-256, length) of its files.
+
+    ValueError or TypeError if a value is no JSON.
+    """
+    return {
+        "id": row.id, "eye": row.eye, "taken_at": row.taken_at, "simulated": row.simulated,
+        "calibration_id": row.calibration_id, "request": row.request, "report": _parsed(row.report),
+        "files": {name: {"sha256": digest, "bytes": length} for name, digest, length in files},
+    }  # fmt: skip
+
+
+def patient_contents(session: Session, rows: Sequence[PatientRow]) -> dict[str, Content | ValueError]:
+    """Return the content of each patient by number, or the error of reading its rows.
+
+    The identifying fields are one opaque text, which a later release may encrypt; `version` names its encoding.
+    """
+    numbers = row_validation.readable_keys(row.number for row in rows)
+    query = select(IdentifierRow).where(IdentifierRow.person.in_(numbers))
+    fields = _grouped((row.person, row.name, row.value) for row in session.scalars(query) if row is not None)
+
+    def content(row: PatientRow) -> Content:
+        values = {name: _parsed(value) for name, value in fields[row.number]}
+        blob = base64.b64encode(json.dumps(values, sort_keys=True).encode()).decode()
+        identity: Content = {"version": IDENTITY_VERSION, "blob": blob}
+        return {"id": row.patient_id, "number": row.number, "made_at": row.made_at, "identity": identity}
+
+    return {row.number: _or_error(lambda row=row: content(row)) for row in rows}
+
+
+def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Content | ValueError]:
+    """Return the content of each visit by id, or the error of reading its rows."""
+    ids = row_validation.readable_keys(row.id for row in rows)
+    answered = session.scalars(select(AnswerRow).where(AnswerRow.visit.in_(ids)))
+    answers = _grouped((row.visit, row.name, (row.value, row.set_at)) for row in answered if row is not None)
+    decided = session.scalars(select(SlotDecisionRow).where(SlotDecisionRow.visit.in_(ids)))
+    slots = _grouped((row.visit, row.slot, (row.capture, row.reason)) for row in decided if row is not None)
+    sent = session.scalars(select(UploadRow).where(UploadRow.visit.in_(ids), UploadRow.sent_at.is_not(None)))
+    uploads = _grouped((row.visit, row.finished_at, row) for row in sent if row is not None)
+    numbers = row_validation.readable_keys(row.person for row in rows)
+    query = select(PatientRow.number, PatientRow.patient_id).where(PatientRow.number.in_(numbers))
+    patients: dict[str, str | None] = {one.number: one.patient_id for one in session.execute(query)}
+
+    def content(row: VisitRow) -> Content:
+        return {
+            "id": row.id, "patient_id": patients.get(row.person), "number": row.person, "day": row.day,
+            "begun_at": row.begun_at, "finished_at": row.finished_at,
+            "outcome": None if row.outcome is None else _parsed(row.outcome),
+            "sent": row.sent, "request": row.request,
+            "answers": {name: {"value": _parsed(value), "set_at": at} for name, (value, at) in answers[row.id]},
+            "decisions": {slot: {"capture": capture, "reason": why} for slot, (capture, why) in slots[row.id]},
+            "uploads": {at: _upload_content(upload) for at, upload in uploads[row.id]},
+        }  # fmt: skip
+
+    return {row.id: _or_error(lambda row=row: content(row)) for row in rows}
+
+
+def restore_patient(session: Session, content: JsonObject) -> None:
+    """Write the rows of a patient as described; ValueError, TypeError or KeyError for a content of another form."""
+    row, identifiers = _patient_rows(content)
+    session.execute(delete(IdentifierRow).where(IdentifierRow.person == row.number))
+    session.merge(row)
+    session.flush()
+    session.add_all(identifiers)
+    session.flush()
+
+
+def restore_visit(session: Session, content: JsonObject) -> None:
+    """Write the rows of a visit as described, but its decisions on slots; errors as in `restore_patient`.
+
+    A patient without rows gets a row with that number and no identifying field.
+    """
+    row, answers, uploads, _ = _visit_rows(content)
+    if session.get(PatientRow, row.person) is None:
+        patient_id = _text_or_none(content["patient_id"])
+        session.add(PatientRow(number=row.person, made_at=row.begun_at, patient_id=patient_id))
+        session.flush()
+    session.execute(delete(AnswerRow).where(AnswerRow.visit == row.id))
+    session.execute(delete(UploadRow).where(UploadRow.visit == row.id, UploadRow.sent_at.is_not(None)))
+    _restore_request(session, row.request, row.id, row.begun_at)
+    session.merge(row)
+    session.flush()
+    session.add_all(answers)
+    for upload in uploads:
+        session.merge(upload)
+    session.flush()
+
+
+def restore_decisions(session: Session, content: JsonObject) -> list[str]:
+    """Write the decisions on the slots of a visit; return the ids of chosen captures that have no row.
+
+    A decision on such a capture is omitted: its files and its record are gone.
+    """
+    row, _, _, decisions = _visit_rows(content)
+    session.execute(delete(SlotDecisionRow).where(SlotDecisionRow.visit == row.id))
+    chosen = {one.capture for one in decisions if one.capture is not None}
+    present = set(session.scalars(select(CaptureRow.id).where(CaptureRow.id.in_(chosen))))
+    session.add_all(one for one in decisions if one.capture is None or one.capture in present)
+    session.flush()
+    return sorted(chosen - present)
+
+
+def refuse_invalid(kind: Kind, content: JsonObject) -> None:
+    """Raise ValueError, TypeError or KeyError if the content is none from which the rows can be restored."""
+    {"patient": _patient_rows, "visit": _visit_rows, "capture": capture_row}[kind](content)
+
+
+def capture_row(content: JsonObject) -> CaptureRow:
+    """Return the row of a capture as described, with its file rows; errors as in `restore_patient`."""
+    files = as_object(content["files"])
+    if not files:
+        raise ValueError("a capture without files")
+    report = as_object(content["report"])
+    read_report(report)
+    return CaptureRow(
+        id=row_validation.text(content["id"]),
+        eye=row_validation.one_of(content["eye"], *EYES),
+        taken_at=_moment(content["taken_at"]),
+        simulated=row_validation.one_of(content["simulated"], 0, 1),
+        calibration_id=row_validation.text(content["calibration_id"]),
+        request=_text_or_none(content["request"]),
+        report=json.dumps(report, allow_nan=False),
+        files=[_file_row(name, as_object(file)) for name, file in files.items()],
+    )
+
+
+def restore_capture(session: Session, row: CaptureRow) -> None:
+    """Write the rows of a capture, its files and the idempotency key of its press, instead of those present."""
+    session.execute(delete(FileRow).where(FileRow.capture_id == row.id))
+    values = {name: getattr(row, name) for name in CAPTURE_VALUES}
+    session.execute(insert(CaptureRow).values(id=row.id, **values).on_conflict_do_update(["id"], set_=values))
+    files = [dict(zip(("name", "sha256", "bytes"), file, strict=True)) for file in file_entries(row)]
+    session.execute(insert(FileRow), [{"capture_id": row.id, **file} for file in files])
+    _restore_request(session, row.request, row.id, row.taken_at)
+
+
+def restore_slots(session: Session) -> list[str]:
+    """Write visit and slot of each capture as its report has them, for known visits; return the ids of those changed.
+
+    The report is what the record of the capture holds, so that a lost or changed row of `shots` is found.
+    """
+    query = (
+        select(CaptureRow.id, CaptureRow.visit, CaptureRow.slot, CaptureSlotRow)
+        .join(VisitRow, VisitRow.id == CaptureRow.visit)
+        .outerjoin(CaptureSlotRow, CaptureSlotRow.capture == CaptureRow.id)
+        .where(CaptureRow.slot.is_not(None))
+    )
+    changed = []
+    for id, visit, slot, present in session.execute(query).all():
+        if present is None or (present.visit, present.slot) != (visit, slot):
+            session.merge(CaptureSlotRow(capture=id, visit=visit, slot=slot))
+            changed.append(id)
+    session.flush()
+    return changed
+
+
+def _restore_request(session: Session, request: str | None, answer: str, at: str) -> None:
+    """Write the idempotency key of the request that made a record, so that a repeat has no further effect."""
+    if request is not None:
+        key, digest = request.split(" ")
+        session.merge(IdempotencyKeyRow(key=key, request=digest, answer=answer, done_at=at))
+
+
+def _patient_rows(content: JsonObject) -> tuple[PatientRow, list[IdentifierRow]]:
+    """Return the rows that the content of a patient describes."""
+    number, identity = row_validation.text(content["number"]), as_object(content["identity"])
+    row_validation.one_of(identity["version"], IDENTITY_VERSION)
+    blob = base64.b64decode(row_validation.text(identity["blob"]), validate=True)
+    values = as_object(row_validation.parsed_json(blob.decode()))
+    row = PatientRow(number=number, made_at=_moment(content["made_at"]), patient_id=row_validation.text(content["id"]))
+    return row, [IdentifierRow(person=number, name=name, value=json.dumps(value)) for name, value in values.items()]
+
+
+def _visit_rows(content: JsonObject) -> tuple[VisitRow, list[AnswerRow], list[UploadRow], list[SlotDecisionRow]]:
+    """Return the rows that the content of a visit describes."""
+    id, outcome = row_validation.text(content["id"]), content["outcome"]
+    finished_at, sent, request = (_text_or_none(content[name]) for name in ("finished_at", "sent", "request"))
+    row = VisitRow(
+        id=id, person=row_validation.text(content["number"]), day=_day(content["day"]),
+        begun_at=_moment(content["begun_at"]), finished_at=None if finished_at is None else _moment(finished_at),
+        outcome=None if outcome is None else json.dumps(as_object(outcome)), sent=sent, request=request,
+    )  # fmt: skip
+    answers = [(row_validation.text(name), as_object(one)) for name, one in as_object(content["answers"]).items()]
+    uploads = [_upload_row(id, at, as_object(one)) for at, one in as_object(content["uploads"]).items()]
+    return (
+        row,
+        [
+            AnswerRow(visit=id, name=name, value=json.dumps(one["value"]), set_at=row_validation.text(one["set_at"]))
+            for name, one in answers
+        ],
+        uploads,
+        [_decision_row(id, slot, as_object(one)) for slot, one in as_object(content["decisions"]).items()],
+    )
+
+
+def _decision_row(visit: str, slot: str, decision: JsonObject) -> SlotDecisionRow:
+    capture, reason = (_text_or_none(decision[name]) for name in ("capture", "reason"))
+    return SlotDecisionRow(visit=visit, slot=row_validation.text(slot), capture=capture, reason=reason)
+
+
+def _upload_content(row: UploadRow) -> Content:
+    return {"tries": row.tries, "sent_at": row.sent_at, "sha256": row.sha256, "confirmed": row.confirmed}
+
+
+def _upload_row(visit: str, finished_at: str, upload: JsonObject) -> UploadRow:
+    sent_at, sha256, confirmed = (row_validation.text(upload[name]) for name in ("sent_at", "sha256", "confirmed"))
+    tries = whole_number(upload["tries"])
+    return UploadRow(
+        visit=visit, finished_at=finished_at, tries=tries, sent_at=sent_at, sha256=sha256, confirmed=confirmed
+    )
+
+
+def _file_row(name: str, file: JsonObject) -> FileRow:
+    digest, length = row_validation.text(file["sha256"]), whole_number(file["bytes"])
+    return FileRow(name=row_validation.text(name), sha256=digest, bytes=length)
+
+
+def _parsed(value: object) -> JsonValue:
+    return row_validation.parsed_json(value)
+
+
+def _text_or_none(value: object) -> str | None:
+    return None if value is None else row_validation.text(value)
+
+
+def _day(value: object) -> str:
+    date.fromisoformat(row_validation.text(value))
+    return row_validation.text(value)
+
+
+def _moment(value: object) -> str:
+    """Return the text of a timestamp unchanged; ValueError if it is none."""
+    row_validation.timestamp(value)
+    return row_validation.text(value)
+
+
+def _grouped(rows: Any) -> dict[str, list[tuple[str, Any]]]:
+    """Return (name, value) pairs by record from (record, name, value) triples."""
+    out: dict[str, list[tuple[str, Any]]] = defaultdict(list)
+    for record, name, value in rows:
+        out[record].append((name, value))
+    return out
+
+
+def _or_error(read: Any) -> Content | ValueError:
+    try:
+        content: Content = read()
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        return ValueError(str(error))
+    return content
