@@ -110,6 +110,15 @@ def shown(folder: Path) -> tuple[Shown, int]:
         return Shown(captures, visits, files, doses), reported
 
 
+def expected(store: Path) -> Shown:
+    """Return what an undamaged store shows; a copy of it is opened, because an opening empties the write-ahead log."""
+    copy = shutil.copytree(store, store.with_name("expected"))
+    before, reported = shown(copy)
+    assert not reported
+    shutil.rmtree(copy)
+    return before
+
+
 def judge(folder: Path, before: Shown) -> tuple[Outcome, list[str]]:
     """Return the outcome of opening a damaged store, and its violations.
 
@@ -176,17 +185,26 @@ def swap(folder: Path, paths: list[Path], source: random.Random) -> str:
     return f"{one.relative_to(folder)} and {other.relative_to(folder)} swapped"
 
 
-def rows_only(folder: Path, _: list[Path], source: random.Random) -> str:
-    """Remove all rows of one table, as an older copy of the database would lack them."""
+def lose_table(folder: Path, _: list[Path], source: random.Random) -> str:
+    """Drop one table, or remove all its rows while no trigger sees it, as damage does."""
     with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as tables:
         names = [name for (name,) in tables.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
         name = source.choice(sorted(set(names) - {"alembic_version"}))
+        if source.random() < 0.5:
+            tables.execute(f"DROP TABLE {name}")
+            return f"table {name} dropped"
+        triggers = tables.execute("SELECT name, sql FROM sqlite_schema WHERE type = 'trigger'").fetchall()
+        for trigger, _sql in triggers:
+            tables.execute(f"DROP TRIGGER {trigger}")
         tables.execute(f"DELETE FROM {name}")
+        for _trigger, sql in triggers:
+            tables.execute(sql)
     return f"rows of {name} removed"
 
 
 DAMAGES: dict[str, Damage] = {
-    "bit": flip_bit, "truncated": truncate, "zeros": zero_block, "removed": remove, "swapped": swap, "table": rows_only,
+    "bit": flip_bit, "truncated": truncate, "zeros": zero_block, "removed": remove, "swapped": swap,
+    "table": lose_table,
 }  # fmt: skip
 
 

@@ -1,10 +1,10 @@
-"""Damaged store, a small sample: no change of one file loses or changes anything silently (tests/hard has the table)."""
+"""Damaged store, a small sample of tests/hard: no change of one file loses or changes anything silently."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.store_damage import filled_store, plan, run_trial, shown
+from tests.store_damage import expected, filled_store, plan, run_trial
 
 SAMPLE = 40
 
@@ -17,7 +17,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Path]:
 
 
 def test_no_damage_of_one_file_is_silent(stores: dict[bool, Path], tmp_path: Path) -> None:
-    before = {with_log: shown(store)[0] for with_log, store in stores.items()}
+    before = {with_log: expected(store) for with_log, store in stores.items()}
     every = plan(20 * SAMPLE)
     trials = [run_trial(stores, before, trial, tmp_path) for trial in every[:: len(every) // SAMPLE]]
     assert len(trials) >= SAMPLE
