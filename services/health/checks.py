@@ -6,13 +6,14 @@ snapshot in the process of the instrument, which alone owns the head; the checks
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 
 from device.config.operating_limits import is_battery_low, is_too_hot
 from device.errors import DiffuscopeError, StoreError
 from services.health import thresholds
 from services.health.thresholds import MAX_COMPUTER_C, MAX_LATENESS_S, MAX_SHOWN_VISITS, MIN_VISITS_LEFT
+from services.records.recovery import RecoveryReport
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class StatusSnapshot:
     time of the last capture; `presses`: (duration, lateness) in s of the last captures, where lateness is the duration
     minus the time budget; `torn_bytes`: size of each quarantined capture; `orphans`: number of complete capture folders
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
-    upload queue and of those that need help from a user (None: upload is not set up).
+    upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
+    restored.
     """
 
     state: str
@@ -64,6 +66,7 @@ class StatusSnapshot:
     orphans: int = 0
     damaged: int = 0
     unsent: tuple[int, int] | None = None
+    recovery: RecoveryReport = field(default_factory=RecoveryReport)
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -110,6 +113,20 @@ def captures(facts: StatusSnapshot) -> Check:
     return Check("captures", not problems, "; ".join(problems) or "safe", limit, " ".join(remedies), of_release=True)
 
 
+def database(facts: StatusSnapshot) -> Check:
+    """Check that the last start needed no rebuilding of the database and found no two states of a record."""
+    problems = []
+    if facts.recovery.rebuilt_because is not None:
+        problems.append(f"rebuilt from the files of the store at the last start: {facts.recovery.rebuilt_because}")
+    if facts.recovery.conflicts:
+        problems.append(f"{_count(len(facts.recovery.conflicts), 'record has', 'records have')} a second state")
+    if facts.recovery.missing:
+        problems.append(f"{_count(len(facts.recovery.missing), 'chosen picture is', 'chosen pictures are')} gone")
+    remedy = DATABASE_REMEDY if problems else ""
+    return Check("database", not problems, "; ".join(problems) or "whole", "whole at the last start", remedy)
+
+
+DATABASE_REMEDY = "What is listed is the newest state; what it replaced is kept. If this comes back, replace the card."
 ORPHANS_REMEDY = (
     "Pictures without an entry are not listed. They stay on the disk: remove nothing, copy the folder of the captures "
     "to another disk, and call the technician."
@@ -213,7 +230,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
-    camera, lamp, calibration, captures, space, battery, heat, clock, speed, sending,
+    camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending,
 )  # fmt: skip
 
 

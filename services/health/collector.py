@@ -46,6 +46,7 @@ def collect_status(
         torn_bytes=list(store.quarantine.sizes_bytes().values()),
         orphans=orphans,
         damaged=damaged,
+        recovery=store.recovery,
     )
 
 

@@ -12,7 +12,8 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
     old_rig.request("POST", "/api/captures", json={"eye": "OD"})
     well = old_rig.request("GET", "/api/health").json()
     assert {check["name"] for check in well["checks"]} == {
-        "camera", "lamp", "calibration", "captures", "space", "battery", "heat", "clock", "speed", "sending",
+        "camera", "lamp", "calibration", "captures", "database", "space",
+        "battery", "heat", "clock", "speed", "sending",
     }  # fmt: skip
     old_rig.world.faults.add("camera.missing")
     old_rig.exam.preview(0, wait_s=0.0)

@@ -9,6 +9,7 @@ import pytest
 from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
 from services.health.checks import CHECKS, StatusSnapshot, run_checks
 from services.health.probe import table
+from services.records.recovery import RecoveryReport
 
 SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
@@ -23,6 +24,9 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("lamp", {"lamp_is_dark": False}),
     ("calibration", {"calibration": HeadMismatch("another head")}),
     ("captures", {"store": StoreFull("0 bytes are free")}),
+    ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
+    ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
+    ("database", {"recovery": RecoveryReport(missing=["c"])}),
     ("space", {"people_left": 9}),
     ("battery", {"battery": 0.04}),
     ("battery", {"battery": BusFault("the fuel gauge does not answer")}),

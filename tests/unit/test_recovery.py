@@ -6,12 +6,13 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import SettingError
+from device.errors import SettingError, StoreError
 from services.errors import StoreDamaged
 from services.records.capture import Capture, CaptureReport, PictureVerdict
 from services.records.capture_store import CaptureStore
@@ -19,7 +20,10 @@ from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_files import CAPTURE_RECORD as RECORD
 from services.records.recovery import RecoveryReport
+from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
+from tests.earlier import Release, store_of_version
+from tests.store_damage import Shown, expected, filled_store, shown
 
 FILES = {name: name.encode() * 50 for name in REQUIRED_FILES}
 KEYS = (f"{number:016x}" for number in range(1 << 16))
@@ -156,3 +160,128 @@ def test_a_record_of_another_capture_or_format_is_refused(store: CaptureStore) -
 def test_a_file_cannot_take_the_place_of_the_record(store: CaptureStore) -> None:
     with pytest.raises(SettingError, match="written by the store"):
         store.save(Capture("a", "OD", VirtualClock().wall(), True, "00ff", CaptureReport(), {}), {RECORD: b"{}"})
+
+
+# Visits and patients
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Shown]:
+    """Return a store with visits, captures and doses, and what it shows."""
+    store = filled_store(tmp_path_factory.mktemp("filled"), with_log=False)
+    return store, expected(store)
+
+
+def test_the_files_of_a_store_alone_rebuild_all_that_it_shows(filled: tuple[Path, Shown], tmp_path: Path) -> None:
+    folder, before = shutil.copytree(filled[0], tmp_path / "copy"), filled[1]
+    (folder / "shelf.sqlite").unlink()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert store.recovery.rebuilt_because == "it is missing or empty"
+        assert (len(store.recovery.adopted), len(store.recovery.visits)) == (len(before.captures), len(before.visits))
+    assert shown(folder) == (before, 0)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert store.recovery == RecoveryReport()
+
+
+def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
+    folder, clock = tmp_path / "store", VirtualClock()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        visit = people.begin(next(KEYS)).id
+        people.answer(next(KEYS), visit, "age", 40)
+        people.answer(next(KEYS), visit, "name", "Asha")
+    older = (folder / "shelf.sqlite").read_bytes()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        people.answer(next(KEYS), visit, "age", 41)
+        people.answer(next(KEYS), visit, "name", "Usha")
+        people.finish(next(KEYS), visit)
+        latest = people.get(visit), people.get(people.begin(next(KEYS)).id)
+    (folder / "shelf.sqlite").write_bytes(older)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        assert tuple(people.get(one.id) for one in latest) == latest
+        assert sorted(store.recovery.visits) == sorted(one.id for one in latest)
+
+
+def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path) -> None:
+    folder, clock = tmp_path / "store", VirtualClock()
+    begin, press = next(KEYS), next(KEYS)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        visit = people.begin(begin).id
+        people.answer(next(KEYS), visit, "consent", "agreed")
+        target = people.pictures.capture_target("OD", press, visit, "R-centre")
+        report = CaptureReport(visit=visit, slot="R-centre", verdict=PictureVerdict("good"))
+        taken = Capture("a", "OD", clock.wall(), True, "00ff", report, {})
+        store.save(taken, FILES, target.write_rows, target.request)
+    (folder / "shelf.sqlite").unlink()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        assert people.begin(begin).id == visit
+        assert people.pictures.capture_for_key(press, "OD", visit, "R-centre") == "a"
+
+
+def test_a_change_that_was_killed_between_file_and_commit_is_applied_as_a_whole(tmp_path: Path) -> None:
+    folder, clock = tmp_path / "store", VirtualClock()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        visit = people.begin(next(KEYS)).id
+        people.answer(next(KEYS), visit, "age", 40)
+    older = (folder / "shelf.sqlite").read_bytes()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        changed = VisitRepository(store.engine, load_protocol(), clock).finish(next(KEYS), visit)
+    (folder / "shelf.sqlite").write_bytes(older)
+    for _ in range(2):
+        with CaptureStore(folder, reserve_bytes=0) as store:
+            assert VisitRepository(store.engine, load_protocol(), clock).get(visit) == changed
+
+
+def test_a_change_that_the_database_refuses_leaves_the_files_as_they_were(tmp_path: Path) -> None:
+    folder, clock = tmp_path / "store", VirtualClock()
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        visit = people.begin(next(KEYS)).id
+        before = files_of(folder)
+        without_rows(folder, "CREATE TRIGGER full BEFORE INSERT ON keys BEGIN SELECT RAISE(FAIL, 'no space'); END")
+        for act in (lambda: people.answer(next(KEYS), visit, "age", 40), lambda: people.begin(next(KEYS))):
+            with pytest.raises(StoreError):
+                act()
+        assert files_of(folder) == before
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for name in ("visits", "patients") for path in (folder / name).iterdir()}
+
+
+@pytest.mark.parametrize("later", ["earlier release", "this release"])
+def test_after_a_rollback_on_older_tables_the_later_change_is_used_and_the_other_stored(
+    tmp_path: Path, later: str
+) -> None:
+    earlier = Release(store_of_version(tmp_path, "r0005"), "r0005")
+    earlier.write(1)
+    clock = VirtualClock(start=datetime(2026, 3, 1, 13, tzinfo=UTC))
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        people.reopen(next(KEYS), "v1")
+        people.answer(next(KEYS), "v1", "age", 60)
+        saved(store, "new")
+    snapshots = Snapshots(tmp_path / "shelf.sqlite", clock)
+    snapshots.restore(snapshots.names()[0])
+    earlier.write(2)
+    if later == "earlier release":
+        without_rows(
+            tmp_path, "UPDATE fields SET value = '70', set_at = '2026-03-01T18:00:00+00:00' WHERE visit = 'v1'"
+        )
+    new_folder = {path.name: path.read_bytes() for path in (tmp_path / "captures" / "new").iterdir()}
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        assert {one.id for one in store.captures()} == {"c1", "c2", "new"}
+        assert {name: store.read("new", name) for name in FILES} == {name: new_folder[name] for name in FILES}
+        assert {one.id for one in people.visits(10)} == {"v1", "v2"}
+        used, other = (70, 60) if later == "earlier release" else (60, 51)
+        assert people.get("v1").fields["age"] == used
+        stored = [json.loads(path.read_bytes())["record"] for path in (tmp_path / "conflicts").glob("visit-v1-*")]
+        assert [one["answers"]["age"]["value"] for one in stored] == [other]
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        assert store.recovery == RecoveryReport()

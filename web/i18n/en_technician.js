@@ -242,6 +242,7 @@ export const TECHNICIAN = {
   "health.lamp": "Lamp",
   "health.calibration": "Calibration",
   "health.captures": "Pictures",
+  "health.database": "Database",
   "health.space": "Space",
   "health.battery": "Battery",
   "health.heat": "Heat",
