@@ -24,9 +24,6 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("lamp", {"lamp_is_dark": False}),
     ("calibration", {"calibration": HeadMismatch("another head")}),
     ("captures", {"store": StoreFull("0 bytes are free")}),
-    ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
-    ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
-    ("database", {"recovery": RecoveryReport(missing=["c"])}),
     ("space", {"people_left": 9}),
     ("battery", {"battery": 0.04}),
     ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
@@ -38,6 +35,9 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("speed", {"presses": [(1.0, -4.0)] * 50 + [(9.0, 4.0)] * 50}),
     ("sending", {"unsent": (4, 1)}),
     ("speed", {"presses": [(2.5, 1.5)] * 100}),
+    ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
+    ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
+    ("database", {"recovery": RecoveryReport(missing=["c"])}),
 ]
 
 
