@@ -8,7 +8,7 @@ file. After a kill in between the file is one revision ahead, and recovery.py ta
 import logging
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,11 +71,11 @@ def documents_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[Reco
     """
     rows = rows_of(session, kind, keys)
     contents = contents_of(session, kind, rows)
-    return [
-        RecordDocument(kind, row.revision, content)
-        for row in rows
-        if not isinstance(content := contents[schema.record_key(row)], ValueError)
-    ]
+    documents = []
+    for row in rows:
+        with suppress(ValueError, TypeError, KeyError):  # a damaged record
+            documents.append(refuse_changed(kind, row, contents[schema.record_key(row)]))
+    return documents
 
 
 def rows_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[RecordRow]:
@@ -87,27 +87,12 @@ def rows_of(session: Session, kind: Kind, keys: Sequence[str]) -> list[RecordRow
 
 
 def contents_of(session: Session, kind: Kind, rows: Sequence[RecordRow]) -> dict[str, Content | ValueError]:
-    """Return the content of each record by patient number, visit id or capture id, or the error of reading its rows.
-
-    A content from which the rows could not be restored is an error too.
-    """
+    """Return the content of each record by patient number, visit id or capture id, or the error of reading its rows."""
     if kind == "patient":
-        contents = patient_contents(session, [row for row in rows if isinstance(row, PatientRow)])
-    elif kind == "visit":
-        contents = visit_contents(session, [row for row in rows if isinstance(row, VisitRow)])
-    else:
-        contents = {row.id: _capture_content(row) for row in rows if isinstance(row, CaptureRow)}
-    return {key: _valid(kind, content) for key, content in contents.items()}
-
-
-def _valid(kind: Kind, content: Content | ValueError) -> Content | ValueError:
-    if isinstance(content, ValueError):
-        return content
-    try:
-        refuse_invalid(kind, content)
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        return ValueError(str(error))
-    return content
+        return patient_contents(session, [row for row in rows if isinstance(row, PatientRow)])
+    if kind == "visit":
+        return visit_contents(session, [row for row in rows if isinstance(row, VisitRow)])
+    return {row.id: _capture_content(row) for row in rows if isinstance(row, CaptureRow)}
 
 
 def _capture_content(row: CaptureRow) -> Content | ValueError:
@@ -118,11 +103,17 @@ def _capture_content(row: CaptureRow) -> Content | ValueError:
 
 
 def refuse_changed(kind: Kind, row: RecordRow | Row[*tuple[Any, ...]], content: Content | ValueError) -> RecordDocument:
-    """Return the record in rows with that content; ValueError if it is unreadable or its signed digest differs."""
+    """Return the record in rows with that content.
+
+    ValueError, TypeError or KeyError if it cannot be read, if its signed digest differs, or if it is unsigned and no
+    content from which the rows could be restored.
+    """
     if isinstance(content, ValueError):
         raise content
     document = RecordDocument(kind, row.revision, content)
-    if row.record_sha256 is not None and document.sha256() != row.record_sha256:
+    if row.record_sha256 is None:
+        refuse_invalid(kind, content)
+    elif document.sha256() != row.record_sha256:
         raise ValueError("the SHA-256 of the record differs")
     return document
 

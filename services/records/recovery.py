@@ -282,7 +282,7 @@ def _document_in_rows(kind: Kind, row: RecordRow, content: Content | ValueError)
     """Return the record in rows; None if they cannot be read or differ from their digest."""
     try:
         return refuse_changed(kind, row, content)
-    except ValueError:
+    except (ValueError, TypeError, KeyError):
         return None
 
 
