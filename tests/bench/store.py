@@ -1,6 +1,6 @@
 """`make bench-store`: kills, stops and damage of a running instrument's store, and the time from start to a press.
 
-The real program runs with the small simulated head. After each end the store is opened anew by the next start, and
+The real program runs with the small simulated head. After each end the store is opened again by the next start, and
 every acknowledged capture must be listed. `--kills` sets the number of ends, SIGKILL and SIGTERM by turns.
 """
 
