@@ -42,7 +42,7 @@ from services.records.record_signing import (
     write_signature,
 )
 from services.records.schema import CaptureRow, PatientRow, RecordRow
-from services.records.storage_errors import storage_errors
+from services.records.storage_errors import sqlite_name, storage_errors
 
 log = logging.getLogger(__name__)
 
@@ -73,11 +73,12 @@ def damage_of(database: Path) -> str | None:
         return "it is missing or empty"
     try:
         with closing(sqlite3.connect(database)) as connection:
+            connection.text_factory = schema.decoded
             found = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
             tables = connection.execute(schema.SCHEMA_TEXT).fetchall()
             checksum = connection.execute("PRAGMA user_version").fetchone()[0]
     except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError) and error.sqlite_errorname != "SQLITE_ERROR":
+        if isinstance(error, sqlite3.OperationalError) and sqlite_name(error) != "SQLITE_ERROR":
             raise  # busy, or refused by the disk: nothing is known about the content
         return str(error)
     if found == "ok" and checksum not in (0, schema.schema_checksum(tables)):  # 0: of an earlier release

@@ -361,14 +361,14 @@ def open_engine(path: Path) -> Engine:
 
 
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
-    """Set up one new connection: no transaction handling by the driver, text decoding by `_decoded`, PRAGMAS."""
+    """Set up one new connection: no transaction handling by the driver, text decoding by `decoded`, PRAGMAS."""
     connection.isolation_level = None
-    connection.text_factory = _decoded
+    connection.text_factory = decoded
     for pragma in PRAGMAS:
         connection.execute(pragma).close()
 
 
-def _decoded(content: bytes) -> str:
+def decoded(content: bytes) -> str:
     """Decode stored text; bytes that are not UTF-8 become lone surrogates, which row_validation refuses row by row."""
     return content.decode(errors="surrogateescape")
 

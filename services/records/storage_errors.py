@@ -13,11 +13,12 @@ from services.errors import StoreDamaged
 
 def is_disk_full(error: OSError | DBAPIError) -> bool:
     """Return whether the error means that the disk, the quota or the database is full."""
-    return atomic_io.is_full(error) if isinstance(error, OSError) else _sqlite_name(error) == "SQLITE_FULL"
+    return atomic_io.is_full(error) if isinstance(error, OSError) else sqlite_name(error.orig) == "SQLITE_FULL"
 
 
-def _sqlite_name(error: DBAPIError) -> str:
-    return getattr(error.orig, "sqlite_errorname", "")
+def sqlite_name(error: BaseException | None) -> str:
+    """Return SQLite's name of an error such as "SQLITE_FULL"; "" for an error of the driver, which has none."""
+    return getattr(error, "sqlite_errorname", "")
 
 
 @contextmanager
@@ -32,9 +33,9 @@ def storage_errors() -> Iterator[None]:
         kind = StoreFull if atomic_io.is_full(error) else StoreError
         raise kind(f"the disk refused: {error}") from error
     except DBAPIError as error:
-        raise _KINDS.get(_sqlite_name(error), StoreError)(f"the database refused: {error.orig}") from error
+        raise _KINDS.get(sqlite_name(error.orig), StoreError)(f"the database refused: {error.orig}") from error
     except sqlite3.Error as error:
-        raise _KINDS.get(error.sqlite_errorname, StoreError)(f"the database refused: {error}") from error
+        raise _KINDS.get(sqlite_name(error), StoreError)(f"the database refused: {error}") from error
 
 
 _KINDS: dict[str, type[StoreError]] = {
