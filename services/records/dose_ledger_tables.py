@@ -1,5 +1,6 @@
 """Dose ledger in the database: the dose of each eye persists across restarts, power cuts and clock changes."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +13,13 @@ from device.errors import LightLimit, StoreError
 from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState, Reserved
 from device.values import EYES, Eye
 from services.records import schema
-from services.records.dose_copy import DoseCopy
-from services.records.schema import DoseRow, ObservedTimeRow
+from services.records.dose_ledger_log import DoseLedgerLog, raise_to
+from services.records.schema import CaptureRow, DoseRow, ObservedTimeRow
 from services.records.storage_errors import storage_errors
 
+log = logging.getLogger(__name__)
+
+LOST_J_PER_CM2 = 100.0  # counted for each eye if the ledger is gone: above the limit of every day
 _AS_IT_IS = {"synchronize_session": False}
 REMEDY = "The light stays off while what it gives cannot be written down. Free some space, or call the technician."
 
@@ -35,19 +39,22 @@ def add_given_dose(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
 class DoseLedgerStore:
     """Dose ledger in the database of the capture store; each change is durable when its call returns.
 
-    A dose counts for at least `window_s` (s) of observed time. Opening raises every dose that is lower than in the
-    second copy (dose_copy.py), and adds the time since the last observation if it was in the same boot. Writers are
-    serialised, across processes too. StoreError if the ledger cannot be read or written.
+    A dose counts for at least `window_s` (s) of observed time. Each reading raises every dose that is lower than in the
+    second copy (dose_ledger_log.py); opening adds the time since the last observation if it was in the same boot. If
+    both are gone while the store has captures, both eyes count as full. Writers are serialised, across processes too.
+    StoreError if the ledger cannot be read or written.
     """
 
     def __init__(self, engine: Engine, clock: Clock, window_s: float, boot: str | None = None) -> None:
         self._engine, self._clock, self._window_s = engine, clock, window_s
         # With a random id the time between two openings does not count as observed, so doses expire later.
         self._boot = boot or boot_id()
-        self._copy = DoseCopy(Path(str(engine.url.database)).with_name("light.copy"))
+        self._log = DoseLedgerLog(Path(str(engine.url.database)).parent)
+        is_lost = self._is_lost()
         with self._writing() as state:
-            self._copy.raise_to_copy(state)
-            state.advance(self._boot, self._clock.now_s(), self._window_s)
+            if is_lost:
+                log.error("the dose ledger of a used device is gone: both eyes count as full")
+                state.add(EYES, int(state.observed_s // SLOT_S), LOST_J_PER_CM2)
 
     def spent_j_per_cm2(self, eye: Eye) -> float:
         """Return the dose (J/cm2) of an eye that still counts, including reservations that were never settled."""
@@ -79,7 +86,8 @@ class DoseLedgerStore:
     def _writing(self) -> Iterator[DoseLedgerState]:
         """Yield the current state of the ledger in an exclusive transaction; a context manager.
 
-        Write the state to the database and then to the second copy at the end; after an exception in the block neither.
+        Write the state to the second copy and to the database at the end; after an exception in the block neither. If
+        only the commit fails, the copy has the change, and the higher dose counts.
         """
         try:
             with storage_errors(), Session(schema.for_writing(self._engine)) as session, session.begin():
@@ -93,10 +101,17 @@ class DoseLedgerStore:
                 for (eye, slot), dose_j_per_cm2 in state.doses.items():
                     session.merge(DoseRow(eye=eye, slot=slot, dose_j_per_cm2=dose_j_per_cm2))
                 session.merge(ObservedTimeRow(id=1, boot=state.boot, now_s=state.now_s, observed_s=state.observed_s))
-            with storage_errors():
-                self._copy.write(state)
+                session.flush()
+                self._log.append(state)
         except StoreError as error:
             raise type(error)(f"the book of light cannot be written: {error.message}", REMEDY) from error
+
+    def _is_lost(self) -> bool:
+        """Return whether the store has captures, but neither table nor copy of the ledger has ever been written."""
+        with storage_errors(), Session(self._engine) as session:
+            if session.get(ObservedTimeRow, 1) is not None or self._log.newest() is not None:
+                return False
+            return session.scalar(select(CaptureRow.id).limit(1)) is not None
 
     def _state(self, session: Session) -> DoseLedgerState:
         state = DoseLedgerState()
@@ -106,5 +121,7 @@ class DoseLedgerStore:
         seen = session.get(ObservedTimeRow, 1)
         if seen is not None:
             state.observed_s, state.boot, state.now_s = seen.observed_s, seen.boot, seen.now_s
+        if (copy := self._log.newest()) is not None:
+            raise_to(state, copy)
         state.advance(self._boot, self._clock.now_s(), self._window_s)
         return state

@@ -100,21 +100,3 @@ def test_deleted_rows_lower_no_dose(store: CaptureStore) -> None:
     assert (again.spent_j_per_cm2("OD"), again.spent_j_per_cm2("OS")) == (0.25, 2.0)
     clock.sleep(DAY_S)
     assert again.spent_j_per_cm2("OD") == 0.0, "the dose ages as before"
-
-
-@pytest.mark.parametrize("block", [0, 1])
-def test_one_of_the_two_blocks_of_the_copy_may_be_damaged(store: CaptureStore, block: int) -> None:
-    clock = VirtualClock()
-    first = open_ledger(store, clock)
-    for _ in range(2):
-        first.reserve(("OD",), 1.0, 10.0)
-    first.settle(first.reserve(("OD",), 0.0, 10.0), 0.0)
-    path = store.folder / "light.copy"
-    content = bytearray(path.read_bytes())
-    content[block * len(content) // 2 + 20] ^= 1
-    path.write_bytes(content)
-    with closing(sqlite3.connect(store.folder / "shelf.sqlite", isolation_level=None)) as tables:
-        tables.execute("DELETE FROM light_doses")
-    assert open_ledger(store, clock).spent_j_per_cm2("OD") == 2.0
-    path.write_bytes(b"")
-    assert open_ledger(store, clock).spent_j_per_cm2("OD") == 2.0, "the database holds the dose again"

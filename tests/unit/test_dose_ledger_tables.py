@@ -66,7 +66,7 @@ def test_a_dose_with_an_unreadable_eye_counts_for_both_eyes(store: CaptureStore,
     with sqlite3.connect(store.folder / "shelf.sqlite") as tables:
         tables.execute("PRAGMA ignore_check_constraints = ON")  # as a flipped bit on the disk
         tables.execute("UPDATE light_doses SET eye = 'O?'")
-    (store.folder / "light.copy").unlink()
+    (store.folder / "dose-ledger.log").unlink()
     assert [open_ledger(store, clock).spent_j_per_cm2(eye) for eye in ("OD", "OS")] == [STOP / 2, STOP / 2]
 
 

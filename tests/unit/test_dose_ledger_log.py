@@ -1,0 +1,186 @@
+"""Second copy of the dose ledger: no damage of table or file lowers a dose that was counted."""
+
+import json
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from device.clock import VirtualClock
+from device.errors import LightLimit, StoreError
+from device.light_safety.dose_ledger import DoseLedgerState
+from services.records.capture import Capture, CaptureReport
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_log import EARLIER_BLOCK_BYTES, EARLIER_COPY, LOG, MAX_BYTES, DoseLedgerLog
+from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.snapshots import Snapshots
+
+DAY_S, STOP = 86_400.0, 10.0
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[CaptureStore]:
+    with CaptureStore(tmp_path / "store", reserve_bytes=0) as opened:
+        yield opened
+
+
+def ledger_of(store: CaptureStore, clock: VirtualClock) -> DoseLedgerStore:
+    return DoseLedgerStore(store.engine, clock, DAY_S, boot="boot")
+
+
+def run(folder: Path, *statements: str) -> None:
+    with closing(sqlite3.connect(folder / "shelf.sqlite", isolation_level=None)) as tables:
+        for statement in statements:
+            tables.execute(statement)
+
+
+def lose_rows(folder: Path) -> None:
+    run(folder, "DELETE FROM light_doses", "DELETE FROM light_time")
+
+
+def lose_file(folder: Path) -> None:
+    (folder / LOG).unlink(missing_ok=True)
+
+
+def tear_last_line(folder: Path) -> None:
+    content = (folder / LOG).read_bytes() if (folder / LOG).exists() else b""
+    (folder / LOG).write_bytes(content[: -len(content) // 7])
+
+
+def zero_file(folder: Path) -> None:
+    (folder / LOG).write_bytes(bytes(1000))
+
+
+def nothing(_: Path) -> None:
+    pass
+
+
+ACTIONS = st.lists(
+    st.one_of(
+        st.tuples(st.just("light"), st.sampled_from(("OD", "OS")), st.floats(0, 0.01), st.floats(0, 1)),
+        st.tuples(st.sampled_from((lose_rows, lose_file, tear_last_line, zero_file)), st.booleans()),
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(ACTIONS)
+def test_no_damage_of_one_copy_lowers_a_dose(actions: list[tuple[object, ...]]) -> None:
+    """Damage of one copy at a time; after each, the ledger is used or opened again, which restores the other copy."""
+    with TemporaryDirectory() as place, CaptureStore(Path(place) / "store", reserve_bytes=0) as store:
+        clock, given_doses = VirtualClock(), {"OD": 0.0, "OS": 0.0}
+        ledger = ledger_of(store, clock)
+        for action in actions:
+            if action[0] == "light":
+                _, eye, dose, share = action
+                ledger.settle(ledger.reserve((eye,), dose, STOP), dose * share)  # type: ignore[arg-type, operator]
+                given_doses[eye] += dose * share  # type: ignore[index, operator]
+            else:
+                damage, reopen = action
+                damage(store.folder)  # type: ignore[operator]
+                if reopen:
+                    ledger = ledger_of(store, clock)
+                ledger.settle(ledger.reserve(("OD",), 0.0, STOP), 0.0)
+            for eye, dose in given_doses.items():
+                assert ledger.spent_j_per_cm2(eye) >= dose - 1e-12  # type: ignore[arg-type]
+
+
+def test_rows_that_are_deleted_while_the_instrument_runs_lower_no_dose(store: CaptureStore) -> None:
+    ledger = ledger_of(store, VirtualClock())
+    ledger.settle(ledger.reserve(("OD",), 1.0, STOP), 0.75)
+    lose_rows(store.folder)
+    assert ledger.spent_j_per_cm2("OD") == 0.75
+    with pytest.raises(LightLimit):
+        ledger.reserve(("OD",), 0.5, 1.0)
+
+
+def test_a_settled_dose_replaces_its_reservation_in_both_copies(store: CaptureStore) -> None:
+    ledger = ledger_of(store, VirtualClock())
+    ledger.settle(ledger.reserve(("OS",), 1.0, STOP), 0.25)
+    for damage in (lose_rows, lose_file):
+        damage(store.folder)
+        assert ledger_of(store, VirtualClock()).spent_j_per_cm2("OS") == 0.25
+
+
+def test_a_change_that_the_database_refuses_counts_the_higher_dose(store: CaptureStore) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    reserved = ledger.reserve(("OD",), 1.0, STOP)
+    clock.sleep(1)
+    run(store.folder, "CREATE TRIGGER full BEFORE UPDATE ON light_time BEGIN SELECT RAISE(FAIL, 'no space'); END")
+    with pytest.raises(StoreError):
+        ledger.settle(reserved, 0.25)
+    run(store.folder, "DROP TRIGGER full")
+    assert ledger_of(store, VirtualClock()).spent_j_per_cm2("OD") == 1.0
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_both_eyes_of_a_used_device_count_as_full_if_table_and_file_are_gone(store: CaptureStore, used: bool) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    ledger.settle(ledger.reserve(("OD",), 0.5, STOP), 0.5)
+    if used:
+        store.save(Capture("a", "OD", clock.wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
+    lose_rows(store.folder)
+    lose_file(store.folder)
+    again = ledger_of(store, clock)
+    for eye in ("OD", "OS"):
+        if used:
+            with pytest.raises(LightLimit):
+                again.reserve((eye,), 0.001, STOP)  # type: ignore[arg-type]
+        else:
+            again.reserve((eye,), 0.001, STOP)  # type: ignore[arg-type]
+    clock.sleep(DAY_S + 2000)
+    again.reserve(("OS",), 0.001, STOP)
+
+
+def test_a_restored_snapshot_lowers_no_dose(store: CaptureStore) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    snapshots = Snapshots(store.folder / "shelf.sqlite", clock)
+    snapshots.create("r0001")
+    ledger.settle(ledger.reserve(("OD",), 9.5, STOP), 9.5)
+    store.close()
+    snapshots.restore(snapshots.names()[0])
+    with CaptureStore(store.folder, reserve_bytes=0) as restored, pytest.raises(LightLimit):
+        ledger_of(restored, clock).reserve(("OD",), 1.0, STOP)
+
+
+def test_the_copy_of_an_earlier_release_is_read(tmp_path: Path) -> None:
+    def block(number: int, dose: float) -> bytes:
+        entry = {"number": number, "boot": "b", "now_s": 5.0, "observed_s": 7.0, "doses": [["OD", 0, dose]]}
+        content = json.dumps(entry).encode()
+        head = struct.pack("<II", len(content), zlib.crc32(content))
+        return (head + content).ljust(EARLIER_BLOCK_BYTES, b"\0")
+
+    (tmp_path / EARLIER_COPY).write_bytes(block(2, 0.5) + block(3, 0.75))
+    assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.75}, 7.0, "b", 5.0)
+    (tmp_path / EARLIER_COPY).write_bytes(block(2, 0.5) + b"x" * EARLIER_BLOCK_BYTES)
+    assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.5}, 7.0, "b", 5.0)
+
+
+def test_the_file_does_not_grow_without_limit(tmp_path: Path) -> None:
+    log = DoseLedgerLog(tmp_path)
+    state = DoseLedgerState({("OD", slot): 0.1 for slot in range(150)}, 7.0, "b", 5.0)
+    for number in range(200):
+        state.now_s = float(number)
+        log.append(state)
+        assert (tmp_path / LOG).stat().st_size <= MAX_BYTES
+    assert log.newest() == state
+
+
+@pytest.mark.parametrize("damage", [nothing, tear_last_line])
+def test_a_line_after_a_torn_line_is_read(tmp_path: Path, damage: Callable[[Path], None]) -> None:
+    log, state = DoseLedgerLog(tmp_path), DoseLedgerState({("OD", 1): 0.5}, 7.0, "b", 5.0)
+    log.append(DoseLedgerState())
+    damage(tmp_path)
+    log.append(state)
+    assert log.newest() == state
