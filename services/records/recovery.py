@@ -77,6 +77,8 @@ def damage_of(database: Path) -> str | None:
             found = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
             tables = connection.execute(schema.SCHEMA_TEXT).fetchall()
             checksum = connection.execute("PRAGMA user_version").fetchone()[0]
+    except UnicodeDecodeError:  # of SQLite's message about a damaged definition
+        return "the definitions of its tables are no UTF-8"
     except sqlite3.DatabaseError as error:
         if isinstance(error, sqlite3.OperationalError) and sqlite_name(error) != "SQLITE_ERROR":
             raise  # busy, or refused by the disk: nothing is known about the content
