@@ -26,6 +26,7 @@ from services.lab.reconstruct_each import reconstruct_each, refuse_several
 from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions
 from services.records.command import app as snapshots
+from services.records.store_command import app as store
 from services.update.command import app as update_app
 
 app = typer.Typer(
@@ -36,6 +37,7 @@ app.add_typer(calibration_archive.app, name="calibrations")
 
 app.add_typer(update_app, name="update")
 app.add_typer(snapshots, name="snapshots")
+app.add_typer(store, name="store")
 
 INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography"})
 SIM_HEAD = resources.HEADS / "sim.toml"

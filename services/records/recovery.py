@@ -42,6 +42,7 @@ from services.records.record_signing import (
     write_signature,
 )
 from services.records.schema import CaptureRow, PatientRow, RecordRow
+from services.records.snapshots import refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
 
 log = logging.getLogger(__name__)
@@ -315,9 +316,11 @@ def _timestamps(value: object) -> list[datetime]:
 def rebuild_database(folder: Path) -> Path:
     """Move the database of a store that is not in use aside; the next opening rebuilds it. Return where it is now.
 
-    Errors: StoreDamaged (the files of the records of this store were never all written), OSError.
+    Errors: StoreDamaged (the files of the records of this store were never all written), StoreError (the instrument is
+    running), OSError.
     """
     if not RecordFiles(folder).exist():
         raise StoreDamaged(f"{folder} has no files of its visits", "Start this release once with the present database.")
+    refuse_in_use(folder / "shelf.sqlite")
     with atomic_io.file_lock(folder / ".lock"):
         return set_aside(folder / "shelf.sqlite")

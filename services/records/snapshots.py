@@ -67,7 +67,7 @@ class Snapshots:
         if name not in self.names():
             raise RecordNotFound(f"there is no snapshot {name!r}", "`diffuscope snapshots list` names them.")
         _refuse_damaged(self.folder / name)
-        _refuse_in_use(self.database)
+        refuse_in_use(self.database)
         new = self.database.with_name(".shelf.part")
         shutil.copyfile(self.folder / name, new)
         atomic_io.fsync_file(new)
@@ -138,7 +138,7 @@ def _refuse_damaged(path: Path) -> None:
         raise StoreDamaged(f"{path.name} is damaged: {result}", "Choose another snapshot.")
 
 
-def _refuse_in_use(database: Path) -> None:
+def refuse_in_use(database: Path) -> None:
     """Raise StoreError if another process has the database open: then its journal mode cannot be changed to DELETE.
 
     A missing or unreadable database is no error, because it may be replaced.

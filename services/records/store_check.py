@@ -1,0 +1,154 @@
+"""Check of a whole store: every row against its digest and its file, and every file of a capture against its SHA-256.
+
+Nothing is changed, so the check may run beside the instrument. What is healable is restored by the next start
+(recovery.py), or by `diffuscope store rebuild`.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from services.errors import RecordNotFound, StoreDamaged
+from services.records import blobs, record_signing, row_validation, schema
+from services.records.dose_ledger_log import DoseLedgerLog
+from services.records.record_document import Kind, RecordDocument
+from services.records.record_files import RecordFiles
+from services.records.recovery import damage_of
+from services.records.storage_errors import storage_errors
+
+KINDS: dict[Kind, str] = {"patient": "patients", "visit": "visits", "capture": "captures"}
+Progress = Callable[[str], None]
+
+
+@dataclass
+class Checked:
+    """Result for one kind of content: the number of whole ones, and the names of the healable and the damaged ones."""
+
+    name: str
+    whole: int = 0
+    healable: list[str] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether everything of this kind is whole."""
+        return not self.healable and not self.damaged
+
+
+def check_store(folder: Path, progress: Progress) -> list[Checked]:
+    """Check the store in `folder` and return a result for each kind of content; `progress` gets one line per kind.
+
+    RecordNotFound if the folder holds no store; StoreError if the disk refuses.
+    """
+    if not (folder / "captures").is_dir():
+        raise RecordNotFound(f"{folder} holds no captures", "Give the folder of the captures with --data.")
+    with storage_errors():
+        progress("reading the database")
+        database = _checked_database(folder)
+        results = [database, _checked_ledger(folder)]
+        documents = dict[tuple[Kind, str], RecordDocument]()
+        for kind, name in KINDS.items():
+            progress(f"reading the {name}")
+            results.append(_checked_records(folder, kind, name, database.is_whole, documents))
+        progress("reading the files of the captures")
+        results.append(_checked_files(folder, documents))
+    return results
+
+
+def _checked_database(folder: Path) -> Checked:
+    result, damage = Checked("database"), damage_of(folder / "shelf.sqlite")
+    if damage is None:
+        result.whole = 1
+    elif RecordFiles(folder).exist():
+        result.healable.append(damage)
+    else:
+        result.damaged.append(damage)
+    return result
+
+
+def _checked_ledger(folder: Path) -> Checked:
+    result = Checked("copy of the dose ledger")
+    if DoseLedgerLog(folder).newest() is None:
+        result.healable.append("no valid entry")
+    else:
+        result.whole = 1
+    return result
+
+
+def _checked_records(
+    folder: Path, kind: Kind, name: str, with_rows: bool, documents: dict[tuple[Kind, str], RecordDocument]
+) -> Checked:
+    """Compare rows and files of all records of a kind; add the newest whole state of each to `documents`."""
+    result, files, known = Checked(name), RecordFiles(folder), set[str]()
+    for id, in_rows in _records_in_rows(folder, kind) if with_rows else ():
+        known.add(id)
+        in_file = _in_file(files, kind, id)
+        whole = [one for one in (in_rows, in_file) if one is not None]
+        if not whole:
+            result.damaged.append(id)
+            continue
+        documents[kind, id] = max(whole, key=lambda one: one.revision)
+        if len(whole) == 2 and whole[0].sha256() == whole[1].sha256():
+            result.whole += 1
+        else:
+            result.healable.append(id)
+    for id in _ids_of_files(folder, kind):
+        if id not in known:
+            in_file = _in_file(files, kind, id)
+            (result.damaged if in_file is None else result.healable).append(id)
+            if in_file is not None:
+                documents[kind, id] = in_file
+    return result
+
+
+def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocument | None]]:
+    """Yield the id of each record that has rows, and its document; None if the rows are damaged."""
+    engine = schema.open_engine(folder / "shelf.sqlite")
+    try:
+        with Session(engine) as session:
+            keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
+            for start in range(0, len(keys), record_signing.PAGE_ROWS):
+                page = keys[start : start + record_signing.PAGE_ROWS]
+                whole = {one.key: one for one in record_signing.documents_of(session, kind, page)}
+                for row in record_signing.rows_of(session, kind, page):
+                    document = whole.get(schema.record_key(row))
+                    yield row.patient_id or row.number if isinstance(row, schema.PatientRow) else row.id, document
+                session.expire_all()
+    finally:
+        engine.dispose()
+
+
+def _in_file(files: RecordFiles, kind: Kind, id: str) -> RecordDocument | None:
+    try:
+        return files.read(kind, id)
+    except StoreDamaged:
+        return None
+
+
+def _ids_of_files(folder: Path, kind: Kind) -> list[str]:
+    if kind != "capture":
+        return list(RecordFiles(folder).ids(kind))
+    return sorted(one.name for one in (folder / "captures").iterdir() if one.is_dir() and not one.name.startswith("."))
+
+
+def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument]) -> Checked:
+    """Compare each file of each whole capture record with its SHA-256."""
+    result = Checked("files of captures")
+    for (kind, id), document in documents.items():
+        files = document.content.get("files")
+        for name, described in files.items() if kind == "capture" and isinstance(files, dict) else ():
+            try:
+                content = blobs.read_blob(folder / "captures" / id / Path(name).name)
+            except OSError:
+                result.damaged.append(f"{id}/{name}")
+                continue
+            expected = described.get("sha256") if isinstance(described, dict) else None
+            if hashlib.sha256(content).hexdigest() == expected:
+                result.whole += 1
+            else:
+                result.damaged.append(f"{id}/{name}")
+    return result
