@@ -150,7 +150,7 @@ def _decode(path: Path, data: bytes, name: str | None) -> Pixels:
     except _DECODER_ERRORS as error:
         raise FrameError(
             f"{path} is not a whole {path.suffix[1:]} image: {_one_line(error)}",
-            "Copy or export the file again; its content does not fit its ending.",
+            "Copy or export the file again; it is incomplete, or of another format than its ending.",
         ) from error
     raise FrameError(
         f"{path}: the ending '{path.suffix}' is not one of {', '.join(READABLE)}",
@@ -160,7 +160,7 @@ def _decode(path: Path, data: bytes, name: str | None) -> Pixels:
 
 def _one_line(error: BaseException) -> str:
     if isinstance(error, UnidentifiedImageError):
-        return "it begins like no image"
+        return "its first bytes are those of no image format"
     return " ".join(str(error).split()) or "too large"
 
 

@@ -180,7 +180,10 @@ def load_psfs(options: ReconstructOptions, loaded: LoadedRaw, per_channel: bool 
     colour = any(len(psfs) == 3 for psfs in cleaned)
     if colour and not (per_channel and loaded.channels == 3):
         names = ", ".join(name for (_, name), psfs in zip(counts, cleaned, strict=True) if len(psfs) == 3)
-        notes += (f"{names}: the three channels of the PSF were averaged, because the raw has one channel.",)
+        notes += (
+            f"{names}: the three channels of the PSF were averaged, because the raw is solved as one channel. "
+            "Give a PSF of one channel if only that one fits.",
+        )
         averaged = tuple(_averaged(psfs) for psfs in cleaned)
         return LoadedPsfs((averaged,), notes)
     if not colour:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.journey.wrong_inputs import WRONG_INPUTS, WrongInput, call, write_right_inputs
+from tests.journey.wrong_inputs import TABLE, WRONG_INPUTS, WrongInput, call, row, write_right_inputs
 
 
 @pytest.fixture(scope="module")
@@ -20,10 +20,12 @@ def test_there_are_34_wrong_inputs() -> None:
 
 @pytest.mark.parametrize("wrong", WRONG_INPUTS, ids=lambda wrong: wrong.name)
 def test_wrong_input_gets_one_sentence_and_one_remedy(folder: Path, wrong: WrongInput) -> None:
-    answer = call(wrong.words(folder))
+    words = wrong.words(folder)
+    answer = call(words)
     lines = answer.err.strip().splitlines()
     assert wrong.answer in answer.err
     assert "Traceback" not in answer.err
+    assert row(wrong, folder, words, answer) in TABLE.read_text(encoding="utf-8").splitlines()
     if wrong.noted:
         assert answer.code == 0
         assert len(lines) == 1, answer.err

@@ -1,10 +1,9 @@
-"""Wrong inputs of `diffuscope reconstruct`, each a real file or option; run as a program, this prints the table.
+"""Wrong inputs of `diffuscope reconstruct`, each a real file or option; as a program, this writes `wrong_inputs.md`.
 
 python -m tests.journey.wrong_inputs
 """
 
 import io
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -21,6 +20,14 @@ from services.cli import main
 
 SHAPE = (96, 128)
 Write = Callable[[Path], list[str]]
+TABLE = Path(__file__).with_name("wrong_inputs.md")
+HEADER = """# Wrong inputs of `diffuscope reconstruct` and their messages
+
+`raw.npy` and `psf.npy` are a correct pair; each row has one mistake. Exit status 2: refused, no picture; 0: the picture
+is made, with a note. What follows // is the remedy. Written by `python -m tests.journey.wrong_inputs`; a test compares.
+
+| input | command | exit | message |
+|---|---|---|---|"""
 
 
 @dataclass(frozen=True)
@@ -198,17 +205,21 @@ def call(words: list[str]) -> Answer:
     return Answer(code, out.getvalue(), err.getvalue())
 
 
+def row(wrong: WrongInput, folder: Path, words: list[str], answer: Answer) -> str:
+    """Return the row of a wrong input as Markdown: name, command, exit status, message. The remedy follows //."""
+    typed = " ".join(["diffuscope", *words])
+    message = " // ".join(answer.err.strip().splitlines()).replace("|", "/")
+    return f"| {wrong.name} | `{typed}` | {answer.code} | {message} |".replace(f"{folder}/", "")
+
+
 def table(folder: Path) -> str:
-    """Return the table of all wrong inputs as Markdown: input, exit status, message."""
+    """Return the table of all wrong inputs as Markdown, from a run of each."""
     write_right_inputs(folder)
-    lines = ["| input | exit | message |", "|---|---|---|"]
-    for wrong in WRONG_INPUTS:
-        answer = call(wrong.words(folder))
-        message = " // ".join(answer.err.strip().splitlines()).replace(f"{folder}/", "").replace("|", "/")
-        lines.append(f"| {wrong.name} | {answer.code} | {message} |")
-    return "\n".join(lines)  # the remedy stands behind //
+    asked = [(wrong, wrong.words(folder)) for wrong in WRONG_INPUTS]
+    rows = [row(wrong, folder, words, call(words)) for wrong, words in asked]
+    return "\n".join([HEADER, *rows]) + "\n"
 
 
 if __name__ == "__main__":
     with TemporaryDirectory() as temporary:
-        sys.stdout.write(table(Path(temporary)) + "\n")
+        TABLE.write_text(table(Path(temporary)), encoding="utf-8")
