@@ -54,7 +54,7 @@ export const ENGLISH = {
   "find.start": "New person with number {number}",
   "find.erase": "Erase",
   "find.scan": "A code reader types the number here by itself.",
-  "find.none": "Nobody yet today.",
+  "find.none": "No patient yet today.",
   "find.nomatch": "No match for {number}.",
   "find.open": "To finish",
 
@@ -223,7 +223,7 @@ export const ENGLISH = {
   "show.all": "All",
   "show.open": "To finish",
   "show.referred": "Referred",
-  "history.none": "Nobody on this day.",
+  "history.none": "No patient on this day.",
   "film.title": "Pictures of {number}",
   "film.none": "No pictures.",
   "film.pick": { one: "Choose one more to compare", other: "Choose two to compare" },

@@ -8,10 +8,10 @@ export const SENDING = {
 
   "send.title": "Send",
   "send.off": "Nothing is sent from this device. Copy or save visits.",
-  "send.none": "Nobody waits to be sent.",
+  "send.none": "Nothing waits to be sent.",
   "send.waiting": { one: "{n} person waits to be sent.", other: "{n} people wait to be sent." },
   "send.today": "{n} sent today.",
-  "send.soon": "It is sent while nobody is examined.",
+  "send.soon": "It is sent when no patient is being examined.",
   "send.next": { one: "Next try in {n} minute.", other: "Next try in {n} minutes." },
   "send.size": "{n} MB",
   "send.tries": { one: "{n} try", other: "{n} tries" },
