@@ -136,7 +136,7 @@ def verify_export(whole: bytes, name: str, trusted: tuple[Signer, ...]) -> tuple
     signer = next((one for one in trusted if one.fingerprint == mark), None)
     if signer is None:
         raise CalibrationUntrusted(
-            f"{name} is signed by nobody who is trusted here: it says '{claimed_name}', key {mark[:16]}",
+            f"{name} is signed with a key that is not trusted here: it names '{claimed_name}', key {mark[:16]}",
             "If you know that this is the service centre's key, give its public key with --trust. Else do not use it.",
         )
     try:

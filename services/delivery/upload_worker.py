@@ -153,7 +153,7 @@ class UploadWorker:
             if self._clock.now_s() > until_s:
                 break
             self._worker.closing.wait(PAUSE_POLL_S)
-        raise Busy("somebody is examined, or the instrument is being switched off")
+        raise Busy("a patient is being examined, or the instrument is being switched off")
 
 
 def archive_builder(store: CaptureStore, people: VisitRepository) -> Callable[[str], VisitArchive]:

@@ -82,7 +82,7 @@ def camera(facts: StatusSnapshot) -> Check:
 def lamp(facts: StatusSnapshot) -> Check:
     """Check that the lamp was dark at least once within twice the longest permitted light (`max_on_s`)."""
     value = "dark" if facts.lamp_is_dark else "does not go out"
-    return Check("lamp", facts.lamp_is_dark, value, "dark when nobody looks", LAMP_REMEDY, of_release=True)
+    return Check("lamp", facts.lamp_is_dark, value, "dark when not in use", LAMP_REMEDY, of_release=True)
 
 
 LAMP_REMEDY = "Keep every eye away from the device. Turn it off, and call the technician."
@@ -215,7 +215,7 @@ def _percentile(ordered_s: Sequence[float], share: float) -> float:
 
 def sending(facts: StatusSnapshot) -> Check:
     """Check that no visit in the upload queue is stuck; ok but not known if upload is not set up."""
-    limit = "nobody needs help to be sent"
+    limit = "no visit needs help to be sent"
     if facts.unsent is None:
         return Check("sending", True, "not set up", limit, "", known=False)
     waiting, stuck = facts.unsent

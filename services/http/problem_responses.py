@@ -132,6 +132,6 @@ def register_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)  # Starlette answers outside every middleware, then logs it
     async def _(request: Request, _: Exception) -> Response:
-        answer = problem_response(DiffuscopeError("something happened that nobody foresaw"))
+        answer = problem_response(DiffuscopeError("an unexpected error occurred"))
         answer.headers.update(security_headers(request.url.path))
         return answer

@@ -56,7 +56,7 @@ class CrossOriginProtection:
         if scope["method"] not in SAFE_METHODS and origin is not None and _authority(origin) != (host or "").lower():
             return CrossOriginRequest(f"a page of {origin[:80]!r} asked for a change")
         if scope["path"] in LIGHT_EMITTING_PATHS and not _is_same_origin(headers):
-            return CrossOriginRequest("nobody knows which page asked for light", "Open the camera's own page to aim.")
+            return CrossOriginRequest("the page that requested light is unknown", "Open the camera's own page to aim.")
         return None
 
 

@@ -109,7 +109,7 @@ class CalibrationMonitor:
     def _yield_to_press(self) -> None:
         self._watchdog.beat()  # on a busy computer a check may outlast the watchdog interval
         if self._is_pressed():
-            raise Busy("somebody presses")
+            raise Busy("a press waits")
 
     @property
     def findings(self) -> tuple[Finding, ...]:

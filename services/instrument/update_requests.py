@@ -169,7 +169,7 @@ class UpdateRequests:
         if self._clock.now_s() - self._requested_s < PICKUP_TIMEOUT_S:
             return True
         request.unlink(missing_ok=True)
-        self._timeout_error = StoredError.of(UpdateFailed(f"nobody took the wish in {PICKUP_TIMEOUT_S:g} s"))
+        self._timeout_error = StoredError.of(UpdateFailed(f"the updater took no request in {PICKUP_TIMEOUT_S:g} s"))
         return False
 
     def _refuse_elsewhere(self) -> tuple[Path, Path]:

@@ -183,7 +183,7 @@ def import_psf(
     black_dn: Annotated[float | None, typer.Option(min=0, max=65535, help="Count without light.")] = None,
     white_dn: Annotated[float | None, typer.Option(min=1, max=65535, help="Count at which the sensor ends.")] = None,
 ) -> None:
-    """Keep a PSF that others measured, with what nobody knows of it marked as unknown; it is not put in force."""
+    """Archive a PSF of another laboratory, its unknown values marked as unknown; it is not put in force."""
     from importlib.metadata import version
 
     from device.calibration.archive import Provenance

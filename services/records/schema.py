@@ -443,7 +443,7 @@ def migration_config() -> Config:
 def utc_text(moment: datetime) -> str:
     """Return a timestamp as UTC text (ISO 8601, microseconds) that sorts by time; SettingError without a time zone."""
     if moment.tzinfo is None:
-        raise SettingError(f"the moment {moment} has no time zone, so nobody can say when it was")
+        raise SettingError(f"the time {moment} has no time zone, so it cannot be converted to UTC")
     return moment.astimezone(UTC).isoformat(timespec="microseconds")
 
 

@@ -61,13 +61,13 @@ def settle(settings: Settings = SETTINGS_PATH) -> None:
 
 @app.command()
 def answer(settings: Settings = SETTINGS_PATH) -> None:
-    """Do what was tapped on the technician's page; systemd calls this when the page has left a wish."""
+    """Carry out a request of the technician's page; systemd calls this when the page has written one."""
     _updater(settings).answer()
 
 
 @app.command()
 def tidy(settings: Settings = SETTINGS_PATH) -> None:
-    """Write down that an update was interrupted, if nobody is at it any more."""
+    """Record that an update was interrupted, if no updater works on it any more."""
     _updater(settings).tidy()
 
 

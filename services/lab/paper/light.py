@@ -28,7 +28,7 @@ HUMAN_EYE: HeadChanges = {"sim.eye.shown_by": "human eye", "sim.eye.focal_length
 PIXEL_UM = 5.0  # smaller pixels are merged up to this width; the ratio of peak to mean hardly changes
 FILE = "human-eye.png"
 NOTE = (
-    "The light is a budget, right within a factor of two (nobody measured the LEDs), with the quantum efficiency "
+    "The light is a budget, right within a factor of two (the LEDs were not measured), with the quantum efficiency "
     "of the paper's sensor. The other pictures on this page have 7000 to 20 000 electrons in their brightest pixel: "
     "they show what the optics can do, not what a human eye gives in one exposure. In its light the fine vessels are "
     "broken, and the prior for few edges leaves even patches between them."

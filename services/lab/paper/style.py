@@ -9,7 +9,7 @@ its pictures behave as the paper says they do: each assertion below is checked o
 <b class=open>not reproduced</b> here (S1). The others stand in figures that we do not have; so orderings are asserted,
 and our own values stand beside them. What is not reproduced is not counted as held.</li>
 <li>Not claimed: anything about a real diffuser, a real eye, or a diagnosis. The surface is a Gaussian random one;
-nobody has measured it. Retinas are drawn from a seed.</li>
+it has not been measured. Retinas are drawn from a seed.</li>
 <li>The paper chose its weight mu by eye from a small range. Here an oracle takes from such a range the weight whose
 picture correlates best with the truth. A person may choose another one: where that matters (S2) the weight with the
 best detail stands beside it.</li>
