@@ -57,6 +57,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",  # every script is run
     "within_subsection_order": "gallery_order.order",
     "abort_on_example_error": True,
+    "capture_repr": (),  # what a script prints, not the value of its last line
     "download_all_examples": True,
     "min_reported_time": 1,
     "remove_config_comments": True,
@@ -82,10 +83,13 @@ def name_source_file(
 def shorten_types(
     _: Sphinx, what: str, name: str, thing: object, options: object, signature: str | None, returns: str | None
 ) -> tuple[str | None, str | None]:
-    """Return a signature with the names of the project for types of arrays."""
+    """Return a signature with the names of the project for types of arrays, and `...` for the default of a factory."""
     array = r"(?:~numpy\.)?ndarray\[tuple\[(?:~typing\.)?Any, \.\.\.\], (?:~numpy\.)?dtype\[(?:~\w+\.)?{}\]\]"
     image, source = array.format("float32"), r"str \| (?:~pathlib\.)?Path \| " + array.format("Any")
-    texts = [text and re.sub(image, "Image", re.sub(source, "ImageSource", text)) for text in (signature, returns)]
+    names = ((source, "ImageSource"), (image, "Image"), ("<factory>", "..."))  # `<` ends the parsing of a signature
+    texts = [signature, returns]
+    for pattern, short in names:
+        texts = [text and re.sub(pattern, short, text) for text in texts]
     return texts[0], texts[1]
 
 

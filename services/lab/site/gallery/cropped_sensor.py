@@ -2,13 +2,14 @@
 Cropped sensor
 ==============
 
-The caustic of a point near the field's edge runs past a small sensor. A periodic model assumes that this light comes
-back on the opposite side; the default method models the crop instead.
+The caustic of a point near the field's edge runs past a small sensor. A periodic model
+assumes that this light comes back on the opposite side; the default method models the
+crop instead.
 """
 
 # %%
-# One eye, one optical design, two sensors of the same pixels: the small one has half as many rows and columns. The PSF
-# is as large as the frame, so the one of the small sensor is cropped too.
+# A sensor of 300 x 400 pixels, where the caustic of the design covers more rows. The PSF
+# is as large as the frame, so it is cropped too.
 
 from pathlib import Path
 from tempfile import mkdtemp
@@ -19,7 +20,7 @@ import numpy as np
 
 SCENE = """
 name = "Small sensor"
-camera = { backend = "sim", sensor = "quantalux", rows = 300, cols = 400, pitch_um = 10.08 }
+camera = {backend = "sim", sensor = "quantalux", rows = 300, cols = 400, pitch_um = 10.08}
 light = { backend = "sim" }
 optics = { field_deg = 33.4 }
 sim = { seed = 5, peak_e = 15000 }
@@ -29,8 +30,8 @@ path.write_text(SCENE)
 scene = diffuscope.simulate(path)
 
 # %%
-# ``tikhonov`` is the paper's closed form, which is periodic. Its picture is compared with the default's, given the same
-# head file.
+# ``tikhonov`` is the paper's closed form, which is periodic. Its picture is compared with
+# the default's, given the same head file.
 
 periodic = diffuscope.reconstruct(scene.raw, scene.psf, head=path, method="tikhonov")
 aware = diffuscope.reconstruct(scene.raw, scene.psf, head=path)

@@ -2,12 +2,13 @@
 Saturated, dead and warm pixels
 ===============================
 
-A reflex saturates pixels, some columns are dead, other pixels are warm. Each wrong count spreads over the whole
-picture, unless the pixels are found and left out.
+A reflex saturates pixels, some columns are dead, other pixels are warm. Each wrong count
+spreads over the whole picture, unless the pixels are found and left out.
 """
 
 # %%
-# A clean frame, and the same frame with all three defects. The head file states at which count a pixel is saturated.
+# A clean frame, and the same frame with all three defects. The head file states at which
+# count a pixel is saturated.
 
 from pathlib import Path
 from tempfile import mkdtemp
@@ -18,7 +19,7 @@ import numpy as np
 
 SCENE = """
 name = "Reflex"
-camera = { backend = "sim", sensor = "quantalux", rows = 540, cols = 960, pitch_um = 10.08 }
+camera = {backend = "sim", sensor = "quantalux", rows = 540, cols = 960, pitch_um = 10.08}
 light = { backend = "sim" }
 optics = { field_deg = 33.4 }
 sim = { seed = 3, peak_e = 15000 }
@@ -40,7 +41,9 @@ spoilt = np.clip(spoilt, 0, white_dn).astype(np.uint16)
 print(f"{np.mean(spoilt == white_dn):.2%} of the pixels are saturated")
 
 # %%
-# The default leaves out what it finds, and reports it. ``tikhonov``, the paper's closed form, uses every pixel.
+# The default leaves out what it finds, and reports it as a share of the pixels that it
+# reads: 540 x 640 around the field. ``tikhonov``, the paper's closed form, uses every
+# pixel.
 
 made = diffuscope.reconstruct(spoilt, scene.psf, head=head)
 closed = diffuscope.reconstruct(spoilt, scene.psf, head=head, method="tikhonov")
@@ -61,4 +64,5 @@ figure, axes = plt.subplots(2, 2, figsize=(8, 8.4), layout="constrained")
 for axis, (title, image) in zip(axes.flat, shown.items(), strict=True):
     likeness = np.corrcoef(image[middle].ravel(), scene.truth[middle].ravel())[0, 1]
     axis.imshow(image[105:-105, 315:-315], cmap="gray")
-    axis.set(title=title if image is spoilt else f"{title}, {likeness:.3f}", xticks=[], yticks=[])
+    title += "" if image is spoilt else f", {likeness:.3f}"
+    axis.set(title=title, xticks=[], yticks=[])

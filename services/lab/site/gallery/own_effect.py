@@ -4,13 +4,14 @@ An effect of your own
 
 Dust on the sensor: dark discs at places that the scene's seed fixes.
 
-An installed package adds the effect by an entry point in its ``pyproject.toml``, here for a module ``own_effect``::
+An installed package adds the effect by an entry point in its ``pyproject.toml``, here for
+a module ``own_effect``::
 
     [project.entry-points."diffuscope.effects"]
     dust = "own_effect:EFFECT"
 
-A scene uses it with a table of its name. ``diffuscope simulate SCENE.toml --explain`` then decides on it by its eta, as
-on every other effect, and ``plan.json`` lists it::
+A scene uses it with a table of its name. ``diffuscope simulate SCENE.toml --explain``
+then decides on it by its eta, as on every other effect, and ``plan.json`` lists it::
 
     [sim.effects.dust]
     spots = 12
@@ -41,7 +42,8 @@ class Dust:
 
     def size(self, scene: Scene) -> Size:
         """Return the rms of the missing light over the noise of a pixel."""
-        dust, camera = scene.sim.effect_settings(self.name, DustSettings), scene.spec.camera
+        dust = scene.sim.effect_settings(self.name, DustSettings)
+        camera = scene.spec.camera
         covered = dust.spots * pi / 4 * dust.diameter_px**2 / (camera.rows * camera.cols)
         eta = dust.depth * sqrt(min(covered, 1)) * scene.lit_e / scene.noise_e
         return Size(eta, f"{dust.spots} discs cover {covered:.2%}")
@@ -49,18 +51,21 @@ class Dust:
     def apply(self, setup: OpticalSetup) -> None:
         """Multiply the response of the pixels by the shadows of the discs."""
         dust = setup.scene.sim.effect_settings(self.name, DustSettings)
-        rng, (rows, cols) = np.random.default_rng((setup.scene.seed, 71)), np.indices(setup.shape)
+        rng = np.random.default_rng((setup.scene.seed, 71))
+        rows, cols = np.indices(setup.shape)
         shadow = np.ones(setup.shape, np.float32)
         for row, col in rng.uniform((0, 0), setup.shape, (dust.spots, 2)):
-            shadow[np.hypot(rows - row, cols - col) < dust.diameter_px / 2] = 1 - dust.depth
+            is_covered = np.hypot(rows - row, cols - col) < dust.diameter_px / 2
+            shadow[is_covered] = 1 - dust.depth
         setup.multiply_response(shadow)
 
 
 EFFECT = Dust()
 
 # %%
-# The entry point takes two small files beside the module, which installing a package writes. A scene then has the
-# effect as soon as it names it.
+# The entry point takes two small files beside the module, which installing a package
+# writes. A scene then has the effect as soon as it names it. The solver does not model
+# the dust: the picture is wrong, and its report says so.
 
 if __name__ == "__main__":
     import sys
@@ -72,16 +77,28 @@ if __name__ == "__main__":
 
     folder = Path(mkdtemp())
     (info := folder / "own_effect-0.1.dist-info").mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-effect\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text("[diffuscope.effects]\ndust = own_effect:EFFECT\n")
+    metadata = "Metadata-Version: 2.1\nName: own-effect\nVersion: 0.1\n"
+    entry_point = "[diffuscope.effects]\ndust = own_effect:EFFECT\n"
+    (info / "METADATA").write_text(metadata)
+    (info / "entry_points.txt").write_text(entry_point)
     sys.path[:0] = [str(folder), str(Path.cwd())]  # this folder has own_effect.py
 
     SCENE = """
     name = "Dusty scene"
-    camera = { backend = "sim", sensor = "quantalux", rows = 540, cols = 960, pitch_um = 10.08 }
-    light = { backend = "sim" }
-    optics = { field_deg = 33.4 }
-    sim = { seed = 3, peak_e = 15000, effects.dust = { spots = 40, depth = 0.6 } }
+    [camera]
+    backend = "sim"
+    sensor = "quantalux"
+    rows = 540
+    cols = 960
+    pitch_um = 10.08
+    [light]
+    backend = "sim"
+    [optics]
+    field_deg = 33.4
+    [sim]
+    seed = 3
+    peak_e = 15000
+    effects.dust = { spots = 40, depth = 0.6 }
     """
     (folder / "dusty.toml").write_text(SCENE)
     scene = diffuscope.simulate(folder / "dusty.toml")
@@ -93,7 +110,11 @@ if __name__ == "__main__":
     (folder / "clean.toml").write_text(SCENE.replace("spots = 40", "spots = 0"))
     clean = diffuscope.simulate(folder / "clean.toml")
     without = diffuscope.reconstruct(clean.raw, clean.psf, head=folder / "clean.toml")
-    shown = {"raw frame": scene.raw, "picture": made.picture, "without dust": without.picture}
+    shown = {
+        "raw frame": scene.raw,
+        "picture": made.picture,
+        "without dust": without.picture,
+    }
     figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained")
     for axis, (title, image) in zip(axes, shown.items(), strict=True):
         axis.imshow(image[130:-130, 340:-340], cmap="gray")
