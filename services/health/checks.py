@@ -13,7 +13,7 @@ from device.config.operating_limits import is_battery_low, is_too_hot
 from device.errors import DiffuscopeError, StoreError
 from services.health import thresholds
 from services.health.thresholds import MAX_COMPUTER_C, MAX_LATENESS_S, MAX_SHOWN_VISITS, MIN_VISITS_LEFT
-from services.records.recovery import RecoveryReport
+from services.records.recovery_report import RecoveryReport
 
 
 @dataclass(frozen=True)

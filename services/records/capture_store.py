@@ -43,7 +43,8 @@ from services.records.record_document import RecordDocument
 from services.records.record_files import CAPTURE_RECORD, RecordFiles
 from services.records.record_rows import capture_content, file_entries
 from services.records.record_signing import PAGE_ROWS, recorded, write_signature
-from services.records.recovery import Recovery, RecoveryReport, damage_of, set_aside
+from services.records.recovery import Recovery, damage_of, set_aside
+from services.records.recovery_report import RecoveryReport
 from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots

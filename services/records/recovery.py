@@ -18,7 +18,6 @@ A database that is missing or fails SQLite's integrity check is moved to `damage
 import logging
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
@@ -41,6 +40,7 @@ from services.records.record_signing import (
     sign_changed,
     write_signature,
 )
+from services.records.recovery_report import RecoveryReport
 from services.records.schema import CaptureRow, PatientRow, RecordRow
 from services.records.snapshots import refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
@@ -48,24 +48,6 @@ from services.records.storage_errors import sqlite_name, storage_errors
 log = logging.getLogger(__name__)
 
 LOG_SUFFIXES = ("-wal", "-shm", "-journal")
-
-
-@dataclass
-class RecoveryReport:
-    """What an opening restored: ids of captures and visits, and numbers of patients.
-
-    `adopted`: captures without rows; `healed`: captures with damaged or older rows; `visits` and `patients`: restored
-    ones; `conflicts`: ids of records of which another state is stored in `conflicts/`; `missing`: chosen captures whose
-    folder is gone. `rebuilt_because`: why the whole database was rebuilt, else None.
-    """
-
-    adopted: list[str] = field(default_factory=list)
-    healed: list[str] = field(default_factory=list)
-    visits: list[str] = field(default_factory=list)
-    patients: list[str] = field(default_factory=list)
-    conflicts: list[str] = field(default_factory=list)
-    missing: list[str] = field(default_factory=list)
-    rebuilt_because: str | None = None
 
 
 def damage_of(database: Path) -> str | None:

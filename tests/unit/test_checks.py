@@ -9,7 +9,7 @@ import pytest
 from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
 from services.health.checks import CHECKS, StatusSnapshot, run_checks
 from services.health.probe import table
-from services.records.recovery import RecoveryReport
+from services.records.recovery_report import RecoveryReport
 
 SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)

@@ -19,7 +19,7 @@ from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
 from services.records.record_files import CAPTURE_RECORD as RECORD
-from services.records.recovery import RecoveryReport
+from services.records.recovery_report import RecoveryReport
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 from tests.earlier import Release, store_of_version
