@@ -13,11 +13,13 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import Any
 
 from device import atomic_io
 from device.light_safety.dose_ledger import DoseLedgerState
-from device.values import EYES
+from device.values import EYES, Eye
+from services.records.json_values import JsonObject, JsonValue
+from services.records.record_document import as_number, as_object, whole_number
+from services.records.row_validation import one_of, text
 
 LOG, EARLIER_COPY = "dose-ledger.log", "light.copy"
 MAX_BYTES = 262_144
@@ -82,7 +84,7 @@ def _state_in(line: bytes) -> DoseLedgerState | None:
     crc, _, content = line.partition(b" ")
     if not content or crc != b"%08x" % zlib.crc32(content):
         return None
-    return _ledger(json.loads(content))
+    return _ledger(as_object(json.loads(content)))
 
 
 def _block(block: bytes) -> tuple[int, DoseLedgerState] | None:
@@ -93,10 +95,19 @@ def _block(block: bytes) -> tuple[int, DoseLedgerState] | None:
     content = block[_EARLIER_HEAD.size : _EARLIER_HEAD.size + length]
     if not content or len(content) != length or zlib.crc32(content) != crc:
         return None
-    entry = json.loads(content)
-    return entry["number"], _ledger(entry)
+    entry = as_object(json.loads(content))
+    return whole_number(entry["number"]), _ledger(entry)
 
 
-def _ledger(entry: dict[str, Any]) -> DoseLedgerState:
-    doses = {(eye, slot): dose for eye, slot, dose in entry["doses"] if eye in EYES}
-    return DoseLedgerState(doses, entry["observed_s"], entry["boot"], entry["now_s"])
+def _ledger(entry: JsonObject) -> DoseLedgerState:
+    observed_s, now_s = (as_number(entry[name]) for name in ("observed_s", "now_s"))
+    doses = entry["doses"] if isinstance(entry["doses"], list) else []
+    return DoseLedgerState(dict(map(_dose, doses)), observed_s, text(entry["boot"]), now_s)
+
+
+def _dose(entry: JsonValue) -> tuple[tuple[Eye, int], float]:
+    """Return eye and slot, and the dose (J/cm2), of an entry of `doses`."""
+    if not isinstance(entry, list):
+        raise ValueError(f"{type(entry).__name__} where a dose was kept")
+    eye, slot, dose_j_per_cm2 = entry
+    return (one_of(eye, *EYES), whole_number(slot)), as_number(dose_j_per_cm2)

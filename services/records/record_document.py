@@ -81,6 +81,13 @@ def whole_number(value: object) -> int:
     return value
 
 
+def as_number(value: object) -> float:
+    """Return the value as a float if it is a number; ValueError otherwise."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        raise ValueError(f"{value!r:.60} where a number was kept")
+    return float(value)
+
+
 def _refuse_changed(digest: str, expected: object) -> None:
     if digest != expected:
         raise ValueError("the SHA-256 of the record differs")
