@@ -12,6 +12,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── ControlLeaseHeld              another screen holds the control lease
 │   ├── CrossOriginRequest            cross-origin request (CSRF check)
 │   ├── UntrustedHost                 Host header is not a name of the instrument
+│   ├── IdempotencyKeyConflict        idempotency key of another request
 │   ├── VisitFinished                 the visit is finished
 │   ├── ConsentMissing                no consent recorded for the visit
 │   └── ConsentDeclined               consent declined or withdrawn
@@ -110,6 +111,13 @@ class UntrustedHost(RequestRefused):
 
     code = "link.host"
     default_remedy = "Open the page by the camera's address, as it is written on the device."
+
+
+class IdempotencyKeyConflict(RequestRefused):
+    """The idempotency key of the request was used for another request."""
+
+    code = "refused.key"
+    default_remedy = "Reload the page and try again."
 
 
 class VisitFinished(RequestRefused):

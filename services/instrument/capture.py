@@ -85,7 +85,7 @@ class IdempotencyKeys:
         self._presses: OrderedDict[str, Press] = OrderedDict()
 
     def find(self, key: str | None, eye: Eye, target: CaptureTarget) -> Future[Capture] | None:
-        """Return the future of the press with this key, or None; InputError for another eye, visit or slot."""
+        """Return the future of the press with this key, or None; IdempotencyKeyConflict for another target."""
         press = None if key is None else self._presses.get(key)
         if press is None:
             return None

@@ -84,7 +84,7 @@ class ExamService:
     def press(self, eye: Eye, key: str | None = None, target: CaptureTarget = TEST_PICTURE) -> Future[Capture]:
         """Request one capture; return a future of the stored capture.
 
-        `key` is an idempotency key: a repeated key returns the same future. Raises InputError if the key belongs to
+        `key` is an idempotency key: a repeated key returns the same future. Raises IdempotencyKeyConflict if the key belongs to
         another eye, visit or slot, Busy while another press waits or is exposed, with two captures in progress or after
         close, CalibrationExpired or CalibrationStale if the calibration is not valid.
         """

@@ -82,7 +82,7 @@ class ExamRequests:
     def press(self, press: Press, refusal: DiffuscopeError | None) -> Future[Capture]:
         """Accept a press and return its future; for a known idempotency key, return the future of the earlier press.
 
-        Raises InputError if the key belongs to another eye, visit or slot, Busy if the exam takes no press now, else
+        Raises IdempotencyKeyConflict if the key belongs to another eye, visit or slot, Busy if the exam takes no press now, else
         `refusal` if it is given: the error of a calibration that is not valid. Consent and slot are checked before this
         call by the endpoint, consent again and head and light when the press is exposed.
         """

@@ -8,7 +8,7 @@ from sqlalchemy import Engine, delete
 from sqlalchemy.orm import Session
 
 from device.clock import Clock
-from device.errors import InputError
+from services.errors import IdempotencyKeyConflict
 from services.records import schema
 from services.records.record_signing import recorded
 from services.records.schema import IdempotencyKeyRow
@@ -26,7 +26,7 @@ class IdempotentRequests:
     def run_in_transaction(self, key: str, request: str, act: Callable[[Session], str]) -> str:
         """Run a change and store its idempotency key and answer in one transaction; return the answer.
 
-        For a repeated key return the stored answer; InputError if the key belongs to another request.
+        For a repeated key return the stored answer; IdempotencyKeyConflict if the key belongs to another request.
         """
         with storage_errors(), recorded(self._engine) as session:
             before = self.find(session, key, request)
@@ -39,8 +39,8 @@ class IdempotentRequests:
     def run_once(self, key: str, request: str, act: Callable[[], str]) -> str:
         """Run an action such as an export, and store its answer; for a repeated key return the stored answer instead.
 
-        `request`: text of the request; InputError if the key belongs to another request. The action runs before the
-        transaction, because other writers must not wait for it; so two simultaneous calls may both run it.
+        `request`: text of the request; IdempotencyKeyConflict if the key belongs to another request. The action runs
+        before the transaction, because other writers must not wait for it; so two simultaneous calls may both run it.
         """
         with storage_errors(), Session(self._engine) as session:
             before = self.find(session, key, request)
@@ -50,7 +50,7 @@ class IdempotentRequests:
         return self.run_in_transaction(key, request, lambda _: answer)
 
     def find(self, session: Session, key: str, request: str) -> str | None:
-        """Return the stored answer of a request; None for a new key, InputError for a key of another request."""
+        """Return the stored answer of a request; None for a new key, IdempotencyKeyConflict for a key in use."""
         before = session.get(IdempotencyKeyRow, key)
         if before is None:
             return None
@@ -73,9 +73,9 @@ class IdempotentRequests:
         session.execute(delete(IdempotencyKeyRow).where(IdempotencyKeyRow.done_at < oldest))
 
 
-def key_conflict() -> InputError:
+def key_conflict() -> IdempotencyKeyConflict:
     """Return the error for an idempotency key that was used for another request."""
-    return InputError("key: it belongs to another request", "Reload the page and try again.")
+    return IdempotencyKeyConflict("key: it belongs to another request")
 
 
 def _digest(request: str) -> str:

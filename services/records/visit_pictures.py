@@ -73,8 +73,8 @@ class VisitPictures:
     def capture_for_key(self, key: str, eye: Eye, visit: str | None, slot: str | None) -> str | None:
         """Return the id of the capture that a press with this idempotency key made; None for a new key.
 
-        InputError if the key belongs to a press for another eye, visit or slot, or to a request of another kind. The
-        record of the capture holds eye, visit and slot, so keys that an earlier release stored are checked too.
+        IdempotencyKeyConflict if the key belongs to a press for another eye, visit or slot, or to a request of another
+        kind. The record of the capture holds eye, visit and slot, so keys of an earlier release are checked too.
         """
         with storage_errors(), Session(self._engine) as session:
             capture = self._requests.find(session, key, PRESS_REQUEST)

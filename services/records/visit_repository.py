@@ -22,8 +22,8 @@ class VisitRepository:
     """Patients and visits in the database of the capture store; thread-safe, writers are serialised.
 
     Each changing method takes an idempotency key first: a repeated request with the same key changes nothing and
-    returns the present state of the same visit; the same key with another request is an InputError. `pictures`: the
-    pictures of the visits; `requests`: the keys of completed requests.
+    returns the present state of the same visit; another request with the same key is an IdempotencyKeyConflict.
+    `pictures`: the pictures of the visits; `requests`: the keys of completed requests.
     """
 
     def __init__(self, engine: Engine, protocol: Protocol, clock: Clock) -> None:

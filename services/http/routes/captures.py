@@ -36,9 +36,9 @@ def press_router(
         is a test picture. `key` is an idempotency key: a repeated request returns the first capture, also after a
         restart of the server. Answers 201 with the capture once it is stored. Refused before it is accepted: 403 for a
         cross-origin request (CSRF), 404 for an unknown visit or slot, 409 while the camera is busy, without consent, in
-        a finished visit or while another screen holds the control lease, 422 for an invalid body, 423 without a valid
-        calibration. Failed after it: 409 if the consent was withdrawn, 423 if light, heat or power forbid the exposure,
-        503 if a part of the head does not answer, 507 if the disk is full.
+        a finished visit, for a key of another request or while another screen holds the control lease, 422 for an
+        invalid body, 423 without a valid calibration. Failed after it: 409 if the consent was withdrawn, 423 if light,
+        heat or power forbid the exposure, 503 if a part of the head does not answer, 507 if the disk is full.
         """
         key, pictures = press.key, repository.pictures
         known_id = pictures.capture_for_key(key, press.eye, press.visit, press.slot) if key else None
