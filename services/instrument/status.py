@@ -5,10 +5,11 @@ the kernel serialises with those of the exam loop. It neither switches the lamp 
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 
 from device.calibration.monitoring.finding import Finding
 from device.calibration.monitoring.head_check import raise_on_failure
-from device.errors import CalibrationError, DiffuscopeError
+from device.errors import CalibrationError, DiffuscopeError, StoreError
 from device.ports import Chips
 from services.health.instrument_status import InstrumentStatus
 from services.instrument.head_arbiter import HeadArbiter
@@ -55,12 +56,15 @@ def wait_until_dark(arbiter: HeadArbiter) -> bool:
 def interrupted_captures(arbiter: HeadArbiter, visits: VisitRepository) -> list[InterruptedCapture]:
     """Return the interrupted captures that have not been repeated; none during a calibration.
 
-    Discards those whose slot has a newer capture or whose visit is finished.
+    Discards those whose slot has a newer capture or whose visit is finished. Test pictures are returned in one run of
+    the instrument only.
     """
     exam = arbiter.current_exam
     if exam is None:
         return []
     exam.capture_journal.discard(lambda one: _is_over(one, visits))
+    with suppress(StoreError):  # then the next start reports the test pictures again
+        exam.capture_journal.mark_reported()
     return list(exam.capture_journal.interrupted)
 
 

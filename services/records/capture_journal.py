@@ -32,7 +32,7 @@ class CaptureJournal:
 
     Entries that exist at the opening belong to interrupted captures and are in `interrupted`; an entry whose capture is
     in the store is deleted instead. Captures that the store quarantined at its opening are in `interrupted` also
-    without an entry, then with id and eye only.
+    without an entry, then with id and eye only. An entry without a visit is reported in one run only: `mark_reported`.
     """
 
     def __init__(self, store: CaptureStore) -> None:
@@ -75,6 +75,16 @@ class CaptureJournal:
         for one in discarded:
             self.end(one.id)
         self.interrupted = tuple(one for one in self.interrupted if one not in discarded)
+
+    def mark_reported(self) -> None:
+        """Delete the entries of interrupted test pictures, which were reported; they stay in `interrupted` in this run.
+
+        A picture of a visit keeps its entry until it is repeated or the visit is finished. StoreError if the disk
+        refuses.
+        """
+        for one in self.interrupted:
+            if one.visit is None:
+                self.end(one.id)
 
 
 def _is_kept(store: CaptureStore, id: str) -> bool:

@@ -1,5 +1,8 @@
 """Idempotency keys of capture requests: bound to eye, visit and slot, before and after a restart."""
 
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from device.clock import VirtualClock
@@ -34,10 +37,10 @@ def test_an_idempotency_key_of_another_eye_visit_or_slot_is_refused_without_ligh
     ]  # fmt: skip
     for other in others:
         answer = post_capture(rig, **other)
-        assert (answer.status_code, answer.json()["code"]) == (422, "input"), other
+        assert (answer.status_code, answer.json()["code"]) == (409, "refused.key"), other
         assert "key: it belongs to another request" in answer.json()["message"]
     taken = post_capture(rig, key="1" * 16, eye="OD")  # the key of the request that started a visit
-    assert (taken.status_code, taken.json()["message"]) == (422, "key: it belongs to another request")
+    assert (taken.status_code, taken.json()["message"]) == (409, "key: it belongs to another request")
     assert post_capture(rig, **request_body).json()["id"] == kept.json()["id"]
     assert [one.id for one in rig.store.captures()] == [kept.json()["id"]]
 
@@ -48,7 +51,7 @@ def test_an_idempotency_key_is_bound_while_its_capture_is_in_progress(rig: Any) 
     assert rig.exam.press("OD", KEY) is first
     answer = post_capture(rig, eye="OS")
     rig.clock.gate.set()
-    assert (answer.status_code, answer.json()["message"]) == (422, "key: it belongs to another request")
+    assert (answer.status_code, answer.json()["message"]) == (409, "key: it belongs to another request")
     assert first.result(30).eye == "OD"
 
 
@@ -83,3 +86,18 @@ def test_an_interrupted_capture_ends_when_its_key_is_completed(tmp_path: Any) ->
         again.end("20260301T120002-OD-ef", KEY)
         assert again.interrupted == (other,)
         assert CaptureJournal(store).interrupted == (other,)
+
+
+def test_the_status_reports_an_interrupted_test_picture_in_one_run_only(
+    build: Callable[..., Rig], tmp_path: Path
+) -> None:
+    lost = InterruptedCapture("20260301T120000-OD-ab", "OD")
+    with CaptureStore(tmp_path / "store", reserve_bytes=0) as store:
+        CaptureJournal(store).begin(lost, KEY)
+    reported = []
+    for _ in range(3):
+        with ExitStack() as undo:
+            rig = build(tmp_path, undo)
+            ids = [[one["id"] for one in rig.request("GET", "/api/status").json()["swept"]] for _ in range(2)]
+            reported.append(ids)
+    assert reported == [[[lost.id], [lost.id]], [[], []], [[], []]]

@@ -32,3 +32,19 @@ def test_a_stored_capture_is_not_interrupted_and_a_damaged_entry_still_gives_its
     assert not (folder / f"{kept.id}.json").exists()
     found.discard(lambda one: one.eye == "OS")
     assert [one.eye for one in CaptureJournal(store).interrupted] == ["OD"]
+
+
+def test_a_test_picture_is_reported_in_one_run_and_a_picture_of_a_visit_until_it_is_repeated(
+    store: CaptureStore,
+) -> None:
+    test_picture = InterruptedCapture("20260301T120000-OD-ab", "OD")
+    of_visit = InterruptedCapture("20260301T120001-OS-cd", "OS", "v", "L-nerve", 0)
+    before = CaptureJournal(store)
+    before.begin(test_picture)
+    before.begin(of_visit)
+    assert CaptureJournal(store).interrupted == (test_picture, of_visit)
+    reported = CaptureJournal(store)
+    assert reported.interrupted == (test_picture, of_visit), "an opening alone reports nothing"
+    reported.mark_reported()
+    assert reported.interrupted == (test_picture, of_visit)
+    assert CaptureJournal(store).interrupted == (of_visit,)
