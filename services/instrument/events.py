@@ -6,6 +6,8 @@ from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 from threading import Lock
 
+from services.instrument.wakeups import Wakeups
+
 BUFFER_LENGTH = 100  # length of the ring buffer: events that a reconnected page can still receive
 BEAT_S = 1.0
 
@@ -22,12 +24,12 @@ class Event:
 class EventBus:
     """Event bus with any number of asynchronous subscribers; `publish` is thread-safe.
 
-    The mutex `_lock` guards `_events`, `_number` and `_subscribers`.
+    The mutex `_lock` guards `_events` and `_number`.
     """
 
     def __init__(self) -> None:
         self._events: deque[Event] = deque(maxlen=BUFFER_LENGTH)
-        self._subscribers: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
+        self._wakeups = Wakeups()
         self._lock = Lock()
         self._number = 0
         self._closed = False
@@ -37,18 +39,12 @@ class EventBus:
         with self._lock:
             self._number += 1
             self._events.append(Event(self._number, kind, data))
-        self._wake()
+        self._wakeups.wake()
 
     def close(self) -> None:
         """End the iteration of every subscriber, so that the server can stop."""
         self._closed = True
-        self._wake()
-
-    def _wake(self) -> None:
-        with self._lock:
-            for loop, wakeup in self._subscribers:
-                if not loop.is_closed():
-                    loop.call_soon_threadsafe(wakeup.set)
+        self._wakeups.wake()
 
     @property
     def last_number(self) -> int:
@@ -69,11 +65,7 @@ class EventBus:
         """
         last = self.last_number
         seen = last if after is None else after if after <= last else 0
-        wakeup = asyncio.Event()
-        subscriber = (asyncio.get_running_loop(), wakeup)
-        with self._lock:
-            self._subscribers.add(subscriber)
-        try:
+        with self._wakeups.subscribed() as wakeup:
             yield Event(0, "beat", {"number": seen})
             while not self._closed:
                 wakeup.clear()
@@ -86,6 +78,3 @@ class EventBus:
                     await asyncio.wait_for(wakeup.wait(), BEAT_S)
                 except TimeoutError:
                     yield Event(0, "beat", {"number": seen})
-        finally:
-            with self._lock:
-                self._subscribers.discard(subscriber)

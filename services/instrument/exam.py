@@ -84,20 +84,20 @@ class ExamService:
     def press(self, eye: Eye, key: str | None = None, target: CaptureTarget = TEST_PICTURE) -> Future[Capture]:
         """Request one capture; return a future of the stored capture.
 
-        `key` is an idempotency key: a repeated key returns the same future. Raises IdempotencyKeyConflict if the key belongs to
-        another eye, visit or slot, Busy while another press waits or is exposed, with two captures in progress or after
-        close, CalibrationExpired or CalibrationStale if the calibration is not valid.
+        `key` is an idempotency key: a repeated key returns the same future. Raises IdempotencyKeyConflict if the key
+        belongs to another eye, visit or slot, Busy while another press waits or is exposed, with two captures in
+        progress or after close, CalibrationExpired or CalibrationStale if the calibration is not valid.
         """
         future: Future[Capture] = Future()
         future.set_running_or_notify_cancel()  # a client that disconnects cannot cancel the capture
         return self._requests.press(Press(future, eye, target, key), self.calibration_monitor.refusal())
 
-    def preview(self, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
+    async def preview(self, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
         """Return the next live picture with a number above `after`; None after `wait_s` seconds or at close.
 
         Its dose counts for the eyes of `wanted`; by default for both.
         """
-        return self._requests.preview(after, wait_s, wanted)
+        return await self._requests.preview(after, wait_s, wanted)
 
     def quick(self, id: str) -> bytes | None:
         """Return the JPEG quick look of the capture in progress `id`; None if there is none."""

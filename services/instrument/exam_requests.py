@@ -1,7 +1,9 @@
 """Request side of the exam: its state, the waiting press and the request for live pictures, behind one lock."""
 
+import asyncio
 from collections.abc import Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from threading import Condition
 from types import MappingProxyType
@@ -12,6 +14,7 @@ from services.errors import Busy
 from services.instrument.capture import NO_VISIT, IdempotencyKeys, LiveRequest, Press, Preview
 from services.instrument.exam_state import ExamEvent, ExamState, WireState, transition
 from services.instrument.frame_feedback import NO_AIM
+from services.instrument.wakeups import Wakeups
 from services.records.capture import Capture
 
 NO_PREVIEW = Preview(0, b"", 0.0, NO_AIM)
@@ -60,14 +63,15 @@ class ExamSnapshot:
 class ExamRequests:
     """Requests of any thread to the exam, and its state. Thread-safe.
 
-    The mutex `_lock` guards every field. It is never held over input or output, a solver round or a callback; a waiting
-    `preview` or `wait` releases it. The thread `head` alone calls `wait`, `advance`, `take_press`, `live_request`,
-    `withdraw`, `show` and `end`.
+    The mutex `_lock` guards every field. It is never held over input or output, a solver round or a callback; `wait`
+    releases it, and `preview` waits without it. The thread `head` alone calls `wait`, `advance`, `take_press`,
+    `live_request`, `withdraw`, `show` and `end`.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._lock = Condition()
+        self._preview_wakeups = Wakeups()
         self._snapshot = ExamSnapshot()
         self._pending: Press | None = None
         self._live_request = NO_VISIT
@@ -82,9 +86,9 @@ class ExamRequests:
     def press(self, press: Press, refusal: DiffuscopeError | None) -> Future[Capture]:
         """Accept a press and return its future; for a known idempotency key, return the future of the earlier press.
 
-        Raises IdempotencyKeyConflict if the key belongs to another eye, visit or slot, Busy if the exam takes no press now, else
-        `refusal` if it is given: the error of a calibration that is not valid. Consent and slot are checked before this
-        call by the endpoint, consent again and head and light when the press is exposed.
+        Raises IdempotencyKeyConflict if the key belongs to another eye, visit or slot, Busy if the exam takes no press
+        now, else `refusal` if it is given: the error of a calibration that is not valid. Consent and slot are checked
+        before this call by the endpoint, consent again and head and light when the press is exposed.
         """
         with self._lock:
             if (known := self._idempotency_keys.find(press.key, press.eye, press.target)) is not None:
@@ -101,18 +105,24 @@ class ExamRequests:
                 self._idempotency_keys.remember(press.key, press)
         return press.future
 
-    def preview(self, after: int, wait_s: float, wanted: LiveRequest) -> Preview | None:
+    async def preview(self, after: int, wait_s: float, wanted: LiveRequest) -> Preview | None:
         """Request live pictures; return the next one with a number above `after`, None after `wait_s` or at close."""
         with self._lock:
             self._live_request = wanted
             self._change(replace(self._snapshot, live_until_s=self._clock.now_s() + WANTED_S))
-            self._lock.wait_for(lambda: self._latest.number > after or self._snapshot.is_closing, wait_s)
-            return self._latest if self._latest.number > after else None
+        with self._preview_wakeups.subscribed() as wakeup, suppress(TimeoutError):
+            async with asyncio.timeout(wait_s):
+                while (now := self.snapshot).output.preview.number <= after and not now.is_closing:
+                    await wakeup.wait()
+                    wakeup.clear()
+        latest = self.snapshot.output.preview
+        return latest if latest.number > after else None
 
     def close(self) -> None:
         """Request the end of the exam: exposed captures are stored first, a press without light fails."""
         with self._lock:
             self._change(replace(self._snapshot, is_closing=True))
+        self._preview_wakeups.wake()
 
     # Called from the thread `head` only
 
@@ -151,6 +161,7 @@ class ExamRequests:
         """Replace what other threads see, and wake the requests that wait for a live picture."""
         with self._lock:
             self._change(replace(self._snapshot, output=output))
+        self._preview_wakeups.wake()
 
     def end(self) -> Press | None:
         """End the exam; return the press that waits, if any, for the caller to fail."""
@@ -160,10 +171,6 @@ class ExamRequests:
         return press
 
     # The caller holds the lock
-
-    @property
-    def _latest(self) -> Preview:
-        return self._snapshot.output.preview
 
     def _advance(self, event: ExamEvent) -> None:
         state = transition(self._snapshot.state, event)

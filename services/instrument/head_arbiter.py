@@ -1,5 +1,6 @@
 """Arbiter of the head: either the exam or a calibration run owns it, never both at once."""
 
+import asyncio
 import logging
 import re
 from collections.abc import Callable
@@ -280,16 +281,16 @@ class HeadArbiter:
             return True
         return exam.state == "aim" and self.context.clock.now_s() - self._last_preview_s >= AIMING_S
 
-    def preview(self, after: int, wanted: LiveRequest = NO_VISIT) -> Preview | None:
+    async def preview(self, after: int, wanted: LiveRequest = NO_VISIT) -> Preview | None:
         """Return the next live picture of the exam with a number above `after`; None without one within 2 s.
 
         While the exam does not own the head: None after NO_PREVIEW_S.
         """
         exam, self._last_preview_s = self.owner.exam, self.context.clock.now_s()
         if exam is None:
-            self.context.clock.sleep(NO_PREVIEW_S)
+            await asyncio.to_thread(self.context.clock.sleep, NO_PREVIEW_S)
             return None
-        return exam.preview(after, wanted=wanted)
+        return await exam.preview(after, wanted=wanted)
 
     def calibrate(self, request: RunRequest) -> None:
         """Start a calibration run after the exam has finished its captures and released the head.

@@ -21,7 +21,7 @@ from services.errors import ConsentDeclined
 from services.instrument.events import EventBus
 from services.records.capture_target import CaptureTarget
 from tests.golden import compare
-from tests.journey.asking import with_all_chips
+from tests.journey.asking import live_picture, with_all_chips
 from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, rig_builder, until
 from tests.journey.test_exam import FailingCamera
 
@@ -156,7 +156,7 @@ class Stage:
         """Close from another thread, as the server does after SIGTERM; return after the exam has begun to close."""
         self.closing = Thread(target=self.rig.arbiter.close, name="closing", daemon=True)
         self.closing.start()
-        assert self.rig.exam.preview(10**9, wait_s=PATIENCE_S) is None  # returns at once during closing
+        assert live_picture(self.rig.exam, 10**9, wait_s=PATIENCE_S) is None  # returns at once during closing
 
     def settle(self) -> None:
         """Wait until all presses are answered and the exam is idle or has ended."""
@@ -201,13 +201,13 @@ def press(stage: Stage) -> None:
 def press_while_aiming(stage: Stage) -> None:
     """Live pictures in red, then a press after one second of them."""
     stage.soon(lambda: stage.press("OS"), 1.0)
-    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
+    assert live_picture(stage.rig.exam, 0, wait_s=PATIENCE_S) is not None
 
 
 def aiming_ends(stage: Stage) -> None:
     """Live pictures go on for as long as they are wanted, and end by themselves."""
     stage.aims_until_s = 3.09  # within the pause after the last one
-    assert stage.rig.exam.preview(0, wait_s=PATIENCE_S) is not None
+    assert live_picture(stage.rig.exam, 0, wait_s=PATIENCE_S) is not None
 
 
 def press_during_refinement(stage: Stage) -> None:
@@ -291,7 +291,7 @@ def sigterm_during_exposure(stage: Stage) -> None:
 def sigterm_while_aiming(stage: Stage) -> None:
     """SIGTERM in the midst of a live picture."""
     stage.soon(stage.close, 0.02)
-    stage.rig.exam.preview(0, wait_s=PATIENCE_S)
+    live_picture(stage.rig.exam, 0, wait_s=PATIENCE_S)
 
 
 def head_lost(stage: Stage) -> None:

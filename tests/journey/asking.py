@@ -1,5 +1,6 @@
 """Requests to a simulated instrument with all optional hardware, and the observed responses and alerts."""
 
+import asyncio
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -14,13 +15,20 @@ from device.head import Head
 from device.ports import Chips
 from device.sim.camera import SimCamera
 from device.sim.chips import SimBattery, SimThermometer
+from services.instrument.capture import Preview
 from services.instrument.events import EventBus
+from services.instrument.exam import ExamService
 from tests.journey.conftest import Rig
 from tests.receiver import Receiver
 
 BUS = BusSpec(backend="sim", thermometer=0x48, battery=0x36)
 MAKE_WEEKS = 10  # age of the calibration
 MOST_BYTES = 10**12
+
+
+def live_picture(exam: ExamService, after: int, wait_s: float = 2.0) -> Preview | None:
+    """Return the next live picture as the server's event loop does; for a thread without such a loop."""
+    return asyncio.run(exam.preview(after, wait_s))
 
 
 @dataclass

@@ -15,6 +15,7 @@ from PIL import Image
 
 from device.errors import DiffuscopeError
 from services.http.problem_responses import HTTP_STATUS, problem_response
+from tests.journey.asking import live_picture
 
 CHOSEN = {  # expected HTTP status of each error class
     "SpecError": 422, "FrameError": 422, "PsfError": 422, "SettingError": 422,
@@ -278,7 +279,7 @@ def test_status_and_health_follow_a_camera_fault(old_rig: Any, wait_until: Calla
     assert not [check for check in health["checks"] if not check["ok"]]
     assert health["ok"] is True
     old_rig.world.faults.add("camera.missing")
-    old_rig.exam.preview(0, wait_s=0.0)
+    live_picture(old_rig.exam, 0, wait_s=0.0)
     wait_until(lambda: old_rig.exam.problem is not None)
     assert old_rig.request("GET", "/api/status").json()["problem"]["code"] == "camera.missing"
     assert old_rig.request("GET", "/api/health").json()["ok"] is False

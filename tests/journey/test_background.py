@@ -9,6 +9,7 @@ import pytest
 
 from device.errors import StoreFull
 from services.instrument.background import run_in_thread
+from tests.journey.asking import live_picture
 
 
 class SlowDisk:
@@ -43,7 +44,7 @@ def test_progress_and_live_pictures_continue_during_a_slow_write(make_rig: Any) 
         for _ in range(2):
             before = rig.exam.snapshot.output.preview.number
             rig.clock.sleep(1.0)
-            seen.append(rig.exam.preview(before, wait_s=20))
+            seen.append(live_picture(rig.exam, before, wait_s=20))
 
     disk.delay = two_live_pictures
     kept = rig.exam.press("OD").result(60)

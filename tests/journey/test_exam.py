@@ -23,6 +23,7 @@ from services.imaging.picture_files import read_raw_tiff, to_png
 from services.instrument.capture_pipeline import CapturePipeline, crop_to_field, plan_pipeline
 from services.instrument.events import EventBus
 from services.records.capture_report import report_as_json
+from tests.journey.asking import live_picture
 
 FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
@@ -183,7 +184,7 @@ def test_progress_and_live_pictures_continue_during_a_refinement(make_rig: Any) 
     def request_preview() -> int:
         rig.clock.sleep(1.0)
         seen: int = rig.exam.snapshot.output.preview.number
-        assert rig.exam.preview(seen, wait_s=0.0) is None
+        assert live_picture(rig.exam, seen, wait_s=0.0) is None
         return seen
 
     event_bus.press = request_preview
@@ -200,7 +201,7 @@ def test_progress_and_live_pictures_continue_during_a_refinement(make_rig: Any) 
 def test_the_lamp_is_off_during_a_refinement_without_requests_for_live_pictures(make_rig: Any) -> None:
     event_bus = PressAtQuickLook()
     rig = make_rig(event_bus=event_bus)
-    live = rig.exam.preview(0)
+    live = live_picture(rig.exam, 0)
     event_bus.press = lambda: rig.clock.sleep(1.0)  # less than WANTED_S after the last request
     rig.exam.press("OD").result(30)
     assert live is not None
@@ -363,7 +364,7 @@ def test_an_unexpected_exception_ends_the_exam_with_the_lamp_off(make_rig: Any, 
         with pytest.raises(DiffuscopeError, match="unexpectedly"):
             rig.exam.press("OD").result(30)
     else:
-        assert rig.exam.preview(0, wait_s=0.2) is None
+        assert live_picture(rig.exam, 0, wait_s=0.2) is None
     assert rig.died.wait(10)
     assert rig.world.illumination is None
     assert rig.exam.problem is not None
@@ -405,7 +406,7 @@ def test_a_press_cannot_be_cancelled_by_a_disconnected_client(rig: Any) -> None:
 def test_live_pictures_are_numbered_upwards_small_and_lit_in_red(rig: Any) -> None:
     numbers, number = [], 0
     for _ in range(4):
-        live = rig.exam.preview(number)
+        live = live_picture(rig.exam, number)
         assert live is not None
         number = live.number
         numbers.append(number)
@@ -418,7 +419,7 @@ def test_live_pictures_are_numbered_upwards_small_and_lit_in_red(rig: Any) -> No
 
 def test_the_lamp_stays_off_without_requests_for_live_pictures(rig: Any, wait_until: Callable[..., None]) -> None:
     assert rig.world.frames == 0
-    assert rig.exam.preview(0) is not None
+    assert live_picture(rig.exam, 0) is not None
     wait_until(lambda: rig.clock.elapsed_s >= 3.0)
     wait_until(lambda: rig.world.illumination is None)
     time.sleep(0.1)
@@ -426,7 +427,7 @@ def test_the_lamp_stays_off_without_requests_for_live_pictures(rig: Any, wait_un
     assert frames > 5
     time.sleep(0.3)
     assert rig.world.frames == frames
-    assert rig.exam.preview(0, wait_s=0.0) is not None  # a new request starts it again
+    assert live_picture(rig.exam, 0, wait_s=0.0) is not None  # a new request starts it again
     wait_until(lambda: rig.world.frames > frames)
 
 
@@ -434,7 +435,7 @@ def test_the_duty_cycle_of_the_aiming_light_is_at_most_one_half(make_rig: Any) -
     rig = make_rig(max_on_s=1.0)
     number = 0
     while rig.clock.elapsed_s < 6:  # with a higher duty cycle the guard would refuse
-        live = rig.exam.preview(number)
+        live = live_picture(rig.exam, number)
         assert live is not None
         number = live.number
         assert rig.exam.problem is None
@@ -443,25 +444,25 @@ def test_the_duty_cycle_of_the_aiming_light_is_at_most_one_half(make_rig: Any) -
 
 
 def test_a_press_has_priority_over_the_live_pictures_which_resume(rig: Any) -> None:
-    before = rig.exam.preview(0)
+    before = live_picture(rig.exam, 0)
     assert before is not None
     kept = rig.exam.press("OD").result(30)
     assert rig.store.captures() == [kept]
-    after = rig.exam.preview(before.number + 1)
+    after = live_picture(rig.exam, before.number + 1)
     assert after is not None
     assert after.number > before.number
 
 
 def test_an_error_of_the_live_pictures_is_published_once_and_cleared(rig: Any, wait_until: Callable[..., None]) -> None:
     rig.world.faults.add("camera.stalled")
-    assert rig.exam.preview(0, wait_s=0.1) is None
+    assert live_picture(rig.exam, 0, wait_s=0.1) is None
     wait_until(lambda: rig.exam.problem is not None)
     wait_until(lambda: rig.clock.elapsed_s >= 3.0)  # several attempts in virtual time
     assert rig.exam.problem.code == "camera.stalled"
     assert [kind for kind, _ in rig.published_events()] == ["state", "failed"]
     assert rig.world.illumination is None
     rig.world.faults.clear()
-    assert rig.exam.preview(0) is not None
+    assert live_picture(rig.exam, 0) is not None
     wait_until(lambda: rig.exam.problem is None)
 
 
@@ -472,7 +473,7 @@ def test_aiming_in_red_and_the_picture_in_green_each_have_their_own_psf(make_rig
     assert isinstance(pipeline.live, Reconstructor)
     assert pipeline.reconstructor.calibration.psfs[0].colour == "green"
     assert pipeline.live.calibration.psfs[0].colour == "red"
-    assert rig.exam.preview(0) is not None
+    assert live_picture(rig.exam, 0) is not None
     assert rig.exam.press("OD").result(30).calibration_id == rig.exam.head.calibration.id
 
 

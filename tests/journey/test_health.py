@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from services.health.probe import probe_instrument
+from tests.journey.asking import live_picture
 
 
 def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait_until: Callable[..., None]) -> None:
@@ -16,7 +17,7 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
         "battery", "heat", "clock", "speed", "sending",
     }  # fmt: skip
     old_rig.world.faults.add("camera.missing")
-    old_rig.exam.preview(0, wait_s=0.0)
+    live_picture(old_rig.exam, 0, wait_s=0.0)
     wait_until(lambda: old_rig.exam.problem is not None)
     ill = old_rig.request("GET", "/api/health").json()
     failed = [check for check in ill["checks"] if not check["ok"]]

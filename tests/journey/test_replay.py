@@ -26,6 +26,7 @@ from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
 from tests import scenes
+from tests.journey.asking import live_picture
 
 SHAPE = (120, 160)
 RECORDINGS = Path(__file__).parents[3] / "shared" / "data" / "lensless"
@@ -116,7 +117,7 @@ def test_a_recording_of_a_simulated_raw_stays_simulated(folder: Path, play: Play
 
 def test_a_preview_of_a_recording_comes_too(folder: Path, play: Played) -> None:
     _, exam = play(folder)
-    live = exam.preview(0, wait_s=20.0)  # a busy computer may exceed the default of two seconds
+    live = live_picture(exam, 0, wait_s=20.0)  # a busy computer may exceed the default of two seconds
     assert live is not None
     with Image.open(BytesIO(live.jpeg)) as picture:
         assert b"simulated=false" in picture.info["comment"]

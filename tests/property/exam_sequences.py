@@ -8,6 +8,7 @@ everything; an action happens while the clock sleeps (in an exposure, a round or
 loop is idle.
 """
 
+import asyncio
 import logging
 import sys
 import time
@@ -402,7 +403,7 @@ class Run:
             case "release lease":
                 self.lease.release(action.screen or "A")
             case "aim":
-                self.requests.preview(10**9, 0.0, LiveRequest((action.eye,), self._permit))
+                asyncio.run(self.requests.preview(10**9, 0.0, LiveRequest((action.eye,), self._permit)))
             case "close":
                 self.requests.close()
             case _:

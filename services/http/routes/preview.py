@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 
 from fastapi import APIRouter, Query, Response
+from fastapi.concurrency import run_in_threadpool
 
 from device.values import EYES, Eye
 from services.http.media import JpegResponse, file_responses, no_picture
@@ -20,7 +21,7 @@ def preview_router(arbiter: HeadArbiter, repository: VisitRepository) -> APIRout
     router = APIRouter()
 
     @router.get("/api/preview", response_class=JpegResponse, responses=RESPONSES)
-    def preview(
+    async def preview(
         after: int = Query(0, ge=0), eye: Eye | None = None, visit: str | None = Query(None, pattern=ID_PATTERN)
     ) -> Response:
         """Return the next live picture with a number above `after`, as JPEG; the request turns the aiming light on.
@@ -28,11 +29,12 @@ def preview_router(arbiter: HeadArbiter, repository: VisitRepository) -> APIRout
         `eye`: the eye whose light dose is counted, by default both. Headers: `X-Frame` (picture number), `X-Age-Ms`,
         `X-Aim` (aiming hint, JSON). 204 if no picture arrives within 2 s. With `visit`, 409 unless its consent is
         `agreed`; the lamp stays off. Without it, the picture is a test picture. CSRF protection: the request needs a
-        same-origin `Sec-Fetch-Site` or any `X-Controller` header, else 403, since it turns the lamp on.
+        same-origin `Sec-Fetch-Site` or any `X-Controller` header, else 403, since it turns the lamp on. 503 if too
+        many requests wait at once.
         """
         wanted = LiveRequest(EYES if eye is None else (eye,), repository.pictures.permission(visit))
-        wanted.permit()
-        live = arbiter.preview(after, wanted)
+        await run_in_threadpool(wanted.permit)  # reads the database
+        live = await arbiter.preview(after, wanted)
         if live is None:
             return Response(status_code=204)
         age_ms = max(0, round((arbiter.context.clock.now_s() - live.exposed_s) * 1000))
