@@ -12,6 +12,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── ControlLeaseHeld              another screen holds the control lease
 │   ├── CrossOriginRequest            cross-origin request (CSRF check)
 │   ├── UntrustedHost                 Host header is not a name of the instrument
+│   ├── ServerFull                    too many clients at once
 │   ├── IdempotencyKeyConflict        idempotency key of another request
 │   ├── VisitFinished                 the visit is finished
 │   ├── ConsentMissing                no consent recorded for the visit
@@ -118,6 +119,13 @@ class IdempotencyKeyConflict(RequestRefused):
 
     code = "refused.key"
     default_remedy = "Reload the page and try again."
+
+
+class ServerFull(RequestRefused):
+    """As many clients as permitted use the endpoint already; `wait_s` is the time until a retry."""
+
+    code = "link.full"
+    default_remedy = "Too many screens are connected. Close the page on the others, then wait a little."
 
 
 class VisitFinished(RequestRefused):

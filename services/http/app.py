@@ -12,6 +12,7 @@ from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.alert_monitor import AlertMonitor, AlertSources
 from services.http.authentication import PinAuthenticator
+from services.http.client_limits import PREVIEW_LIMITS, STREAM_LIMITS, ClientLimits, limit_clients
 from services.http.control_lease import ControlLease
 from services.http.dependencies import acquire_control_lease, login_required
 from services.http.openapi import DocumentedApp
@@ -57,12 +58,14 @@ def create_app(
     arbiter: HeadArbiter, authenticator: PinAuthenticator, protocol: Protocol | None = None,
     host_names: tuple[str, ...] | None = None, usb_drives: UsbDrives | None = None,
     technician_routers: Sequence[APIRouter] = (), uploader: Uploader | None = None,
+    stream_limits: ClientLimits = STREAM_LIMITS, preview_limits: ClientLimits = PREVIEW_LIMITS,
 ) -> Application:  # fmt: skip
     """Return the HTTP application for one head arbiter, with every endpoint, middleware and background worker.
 
     `host_names` are the host names that the server accepts, beside IP addresses, localhost and *.local; None is the
     name of this computer. `protocol` None loads the default programme. `technician_routers` are routers that require
     the technician's login. `uploader` uploads finished visits; None means that no receiver is set up.
+    `stream_limits`, `preview_limits`: numbers of open event streams and of requests that wait for a live picture.
     """
     store, clock = arbiter.context.store, arbiter.context.clock
     visits, lease = VisitRepository(store.engine, protocol or load_protocol(), clock), ControlLease(clock)
@@ -82,8 +85,8 @@ def create_app(
     app.include_router(exports_router(visits, store, usb_drives or UsbDrives()), dependencies=controlled)
     app.include_router(upload_router(worker), dependencies=controlled)
     app.include_router(status_router(arbiter, visits, lease, alerts, worker))
-    app.include_router(preview_router(arbiter, visits))
-    app.include_router(event_router(arbiter))
+    app.include_router(preview_router(arbiter, visits), dependencies=[Depends(limit_clients(preview_limits))])
+    app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator))
     app.include_router(calibration_router(arbiter, authenticator))
     for router in technician_routers:

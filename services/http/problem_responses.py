@@ -1,5 +1,7 @@
 """Problem responses: the HTTP status of each error, and the handlers that answer every exception with one."""
 
+import math
+
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
@@ -38,6 +40,7 @@ from services.errors import (
     PinWrong,
     RecordNotFound,
     RequestRefused,
+    ServerFull,
     StoreDamaged,
     UntrustedHost,
     UpdateError,
@@ -56,6 +59,7 @@ HTTP_STATUS: dict[type[DiffuscopeError], int] = {
     RequestRefused: 409,
     ControlLeaseHeld: 409,
     VisitFinished: 409,
+    ServerFull: 503,
     CrossOriginRequest: 403,
     UntrustedHost: 400,
     InputError: 422,
@@ -93,9 +97,13 @@ HTTP_STATUS: dict[type[DiffuscopeError], int] = {
 
 
 def problem_response(error: DiffuscopeError) -> Response:
-    """Return the problem response of an error; its HTTP status is that of its nearest ancestor in `HTTP_STATUS`."""
+    """Return the problem response of an error; its HTTP status is that of its nearest ancestor in `HTTP_STATUS`.
+
+    `wait_s` of the error is also in the header `Retry-After`.
+    """
     status = next(HTTP_STATUS[kind] for kind in type(error).__mro__ if kind in HTTP_STATUS)
-    return JSONResponse(problem_body(error).model_dump(), status)
+    headers = None if error.wait_s is None else {"Retry-After": str(math.ceil(error.wait_s))}
+    return JSONResponse(problem_body(error).model_dump(), status, headers)
 
 
 def problem_body(error: DiffuscopeError) -> ProblemResponse:

@@ -26,7 +26,8 @@ def event_router(arbiter: HeadArbiter) -> APIRouter:
         `message`, `remedy`). `explorer`: progress of the accuracy explorer.
         `notice`: an alert, by its `code`, is active from now on, with its values (`n`, `date`, `wait_s`), or ended
         (`over`); alerts that are active already are part of the status. `calibration`: new findings of the calibration
-        monitor. With `Last-Event-ID` the stream resumes after that event.
+        monitor. With `Last-Event-ID` the stream resumes after that event. 503 if too many streams are
+        open.
         """
 
         async def lines() -> AsyncIterator[str]:
