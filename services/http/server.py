@@ -20,7 +20,7 @@ from typing import Self
 import uvicorn
 
 from device.calibration.archive import Archive
-from device.clock import SystemClock
+from device.clock import Clock, SystemClock
 from device.config.head_file import InstrumentSpec
 from device.errors import DiffuscopeError, InputError
 from device.head import open_bench, open_head
@@ -30,6 +30,8 @@ from services.delivery.usb_drives import UsbDrives
 from services.health.event_log import EventLog
 from services.http.app import create_app
 from services.http.authentication import PinAuthenticator
+from services.http.connection_limits import ConnectionLimits, ConnectionTable, LimitedConfig, LimitedListener
+from services.http.log_rate import LOGGER_NAMES, LogRateLimit
 from services.http.routes.accuracy import accuracy_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
@@ -46,7 +48,8 @@ from services.records.protocol import Protocol
 
 log = logging.getLogger(__name__)
 
-BACKLOG = 128
+ACCEPTS = 16  # connections accepted between two steps of the event loop
+LISTEN_QUEUE = 2048  # connections in the kernel until they are accepted; beyond it, a client tries again after 1 s
 SD_LISTEN_FD = 3  # the file descriptor of sd_listen_fds(3)
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
@@ -62,7 +65,7 @@ def bind_socket(host: str, port: int) -> socket.socket:
             listener = undo.enter_context(socket.socket(family, socket.SOCK_STREAM))
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((host, port))
-            listener.listen(BACKLOG)
+            listener.listen(LISTEN_QUEUE)
             undo.pop_all()
     except OSError as error:
         raise InputError(
@@ -101,7 +104,7 @@ def serve(
     receiver. Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
     """
     clock = SystemClock()
-    with _Stop() as stop, address, CaptureStore(data, clock=clock) as store, ExitStack() as undo:
+    with _Stop() as stop, address, CaptureStore(data, clock=clock) as store, ExitStack() as undo, _limited_logs(clock):
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "diary")))
@@ -119,12 +122,13 @@ def serve(
         ]
         names = own_host_names() + host_names
         app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
-        config = uvicorn.Config(app.http, log_level="warning", timeout_graceful_shutdown=1)
+        table = ConnectionTable(ConnectionLimits(), clock)
+        config = LimitedConfig(app.http, table, backlog=ACCEPTS, timeout_graceful_shutdown=1)
         log.info("started, version %s", app.http.version)
         if torn := ", ".join(store.newly_quarantined):
             log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
         ready()
-        stop.register(_Server(config, context.event_bus)).run(sockets=[address])
+        stop.register(Server(config, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
 
@@ -182,17 +186,42 @@ class _Stop:
         self._server.handle_exit(number, frame)
 
 
-class _Server(uvicorn.Server):
-    """uvicorn server that closes its event streams before it waits for open connections."""
+@contextmanager
+def _limited_logs(clock: Clock) -> Iterator[None]:
+    """Limit the rate of the records that clients can cause, in the loggers of asyncio and uvicorn."""
+    limits = {logging.getLogger(name): LogRateLimit(clock) for name in LOGGER_NAMES}
+    for logger, limit in limits.items():
+        logger.addFilter(limit)
+    try:
+        yield
+    finally:
+        for logger, limit in limits.items():
+            logger.removeFilter(limit)
 
-    def __init__(self, config: uvicorn.Config, event_bus: EventBus) -> None:
+
+class Server(uvicorn.Server):
+    """uvicorn server that drops overdue connections, and closes its event streams before it waits for open ones."""
+
+    def __init__(self, config: LimitedConfig, event_bus: EventBus) -> None:
         super().__init__(config)
-        self._event_bus = event_bus
+        self._connections, self._event_bus = config.connections, event_bus
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Leave signal handling to `_Stop`."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to accept connections; asyncio sets the queue of the sockets to its number of accepts in a row."""
+        listeners = [LimitedListener(one, self._connections) for one in sockets or []]
+        await super().startup(list[socket.socket](listeners))
+        for listener in listeners:
+            listener.listen(LISTEN_QUEUE)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Drop the connections whose time-out is over, ten times per second; return whether the server ends."""
+        self._connections.drop_overdue()
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close the event bus, which ends the event streams, then shut down."""
