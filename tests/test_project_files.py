@@ -24,6 +24,7 @@ import device.errors
 import services.errors
 from device.config.head_file import load_head
 from services.cli import app
+from services.http.connection_limits import ConnectionLimits
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import BEAT_S
 from services.records.capture import BUDGET_S
@@ -406,6 +407,7 @@ UNITS = [
     name for name in files() if re.fullmatch(r"systemd/(image/card/luks/)?[^/]+\.(service|socket|timer|path)", name)
 ]
 IMAGE_SETTINGS = ROOT / "systemd" / "image" / "update.toml"
+RESIDENT_MB, THREADS = 768, 64  # most that `make bench-attacks` and 48 clients ever took
 BLANKER = "/usr/bin/python3 -I -S /opt/diffuscope/device/drivers/blank.py --device /dev/spidev0.0"
 
 
@@ -440,6 +442,17 @@ def test_the_watchdog_interval_covers_heartbeats_and_the_budget() -> None:
 def test_the_stop_timeout_covers_the_longest_capture() -> None:
     """A capture under way is finished and stored; uvicorn and the close each get one second more."""
     assert float(unit_of("systemd/diffuscope.service")["Service"]["TimeoutStopSec"]) >= SHUTDOWN_TIMEOUT_S + 2
+
+
+def test_the_instrument_unit_limits_files_memory_tasks_and_log() -> None:
+    """Files: every permitted connection and as many of our own; memory and tasks: twice the figures of use."""
+    service = unit_of("systemd/diffuscope.service")["Service"]
+    clients = ConnectionLimits().clients
+    assert int(service["LimitNOFILE"]) >= 2 * (clients.local + clients.remote)
+    assert int(service["MemoryMax"].removesuffix("M")) >= 2 * RESIDENT_MB
+    assert int(service["TasksMax"]) >= 2 * THREADS
+    lines_per_min = int(service["LogRateLimitBurst"]) * 60 / float(service["LogRateLimitIntervalSec"])
+    assert lines_per_min * 1000 <= 1e6, "a log line has less than 1000 bytes"
 
 
 def test_stop_boot_and_failure_call_the_same_blanker() -> None:
