@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-mutants bundle browser buses strace lint release bench bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-mutants bundle browser buses strace lint release bench bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -128,6 +128,9 @@ release: lint ## Check version, changelog and citation, build wheel and source a
 
 bench: .venv/ready browser ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
+
+bench-attacks: .venv/ready ## Measure status and press while clients hold connections that they do not use.
+	@$(BIN)/python -m tests.bench.attacks
 
 bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times, and print when it was dark.
 	@umockdev-wrapper $(BIN)/python -m tests.bench.kills
