@@ -8,8 +8,8 @@ kept/send.toml          settings of the upload
 kept/update/            the state of an update
 records/files.json      the content of all of these as read by the code
 records/schema.sql      the tables
-kept-r0004/data/        a data folder of an earlier release, with the schema in its name
-records/files-r0004.json    its content as that release read it
+kept-r0005/data/        a data folder of an earlier release, with the schema in its name
+records/files-r0005.json    its content as that release read it
 """
 
 import hashlib
@@ -51,7 +51,8 @@ from tests.journey.conftest import SMALL_HEAD, GateClock, Rig, rig_builder, trac
 from tests.unit.test_archive import WHO, calibration
 
 KEPT = Path(__file__).parent / "kept"
-EARLIER = {"r0004": Path(__file__).parent / "kept-r0004" / "data"}  # data folders of earlier releases, by schema
+# Data folders of earlier releases, by schema.
+EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in ("r0004", "r0005")}
 SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)
@@ -59,6 +60,7 @@ LATER = NOON + timedelta(days=5)  # time of reading: no finish can be undone any
 PIN = "2468"
 SETTINGS = 'address = "https://reader.example.org/inbox"\ntoken = "send.token"\nanswer_s = 12.5\n'
 NAMES = re.compile(r"\d{8}T\d{6}-(?:(?:OD|OS)-)?[0-9a-f]{6}")
+PATIENT = re.compile(r"\b(?!0{8})[0-9a-f]{16}\b")
 DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
 
 
@@ -353,7 +355,7 @@ def keys_of(value: Any) -> Any:
 
 def numbered(value: Any) -> Any:
     """Return the value with names of captures and visits numbered, and digests replaced by a placeholder."""
-    text = DIGEST.sub("sha256", json.dumps(value))
+    text = PATIENT.sub("patient", DIGEST.sub("sha256", json.dumps(value)))
     for number, name in enumerate(dict.fromkeys(NAMES.findall(text)), 1):
         text = text.replace(name, f"name-{number}")
     return json.loads(text)

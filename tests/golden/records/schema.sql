@@ -1,6 +1,10 @@
 CREATE INDEX captures_by_time ON captures (taken_at, id);
 
+CREATE INDEX captures_to_sign ON captures (id) WHERE record_sha256 IS NULL;
+
 CREATE INDEX keys_by_time ON keys (done_at);
+
+CREATE INDEX persons_to_sign ON persons (number) WHERE record_sha256 IS NULL;
 
 CREATE INDEX shots_by_visit ON shots (visit);
 
@@ -9,6 +13,8 @@ CREATE INDEX visits_by_day ON visits (day);
 CREATE INDEX visits_by_time ON visits (begun_at, id);
 
 CREATE INDEX visits_to_send ON visits (finished_at) WHERE finished_at IS NOT NULL AND (sent IS NULL OR sent <> finished_at);
+
+CREATE INDEX visits_to_sign ON visits (id) WHERE record_sha256 IS NULL;
 
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
@@ -21,7 +27,7 @@ CREATE TABLE captures (
 	taken_at TEXT NOT NULL, 
 	simulated INTEGER NOT NULL, 
 	calibration_id TEXT NOT NULL, 
-	report TEXT NOT NULL, visit TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.visit') WHEN 'text' THEN json_extract(report, '$.visit') END END) VIRTUAL, slot TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.slot') WHEN 'text' THEN json_extract(report, '$.slot') END END) VIRTUAL, verdict TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.verdict') WHEN 'object' THEN json_extract(report, '$.verdict') END END) VIRTUAL, laterality TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.laterality') WHEN 'object' THEN json_extract(report, '$.laterality') END END) VIRTUAL, 
+	report TEXT NOT NULL, visit TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.visit') WHEN 'text' THEN json_extract(report, '$.visit') END END) VIRTUAL, slot TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.slot') WHEN 'text' THEN json_extract(report, '$.slot') END END) VIRTUAL, verdict TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.verdict') WHEN 'object' THEN json_extract(report, '$.verdict') END END) VIRTUAL, laterality TEXT GENERATED ALWAYS AS (CASE WHEN json_valid(report) THEN CASE json_type(report, '$.laterality') WHEN 'object' THEN json_extract(report, '$.laterality') END END) VIRTUAL, request TEXT, revision INTEGER DEFAULT '0' NOT NULL, record_sha256 TEXT, 
 	PRIMARY KEY (id), 
 	CONSTRAINT eye_is_an_eye CHECK (eye IN ('OD', 'OS')), 
 	CONSTRAINT simulated_is_yes_or_no CHECK (simulated IN (0, 1)), 
@@ -104,7 +110,7 @@ CREATE TABLE light_time (
 
 CREATE TABLE persons (
 	number TEXT NOT NULL, 
-	made_at TEXT NOT NULL, 
+	made_at TEXT NOT NULL, patient_id TEXT, revision INTEGER DEFAULT '0' NOT NULL, record_sha256 TEXT, 
 	PRIMARY KEY (number), 
 	CONSTRAINT number_is_short CHECK (length(number) BETWEEN 1 AND 20)
 )
@@ -156,11 +162,49 @@ CREATE TABLE visits (
 	day TEXT NOT NULL, 
 	begun_at TEXT NOT NULL, 
 	finished_at TEXT, 
-	outcome TEXT, sent TEXT, 
+	outcome TEXT, sent TEXT, request TEXT, revision INTEGER DEFAULT '0' NOT NULL, record_sha256 TEXT, 
 	PRIMARY KEY (id), 
 	CONSTRAINT what_is_finished_has_an_outcome CHECK ((finished_at IS NULL) = (outcome IS NULL)), 
 	CONSTRAINT outcome_is_json CHECK (outcome IS NULL OR json_valid(outcome)), 
 	FOREIGN KEY(person) REFERENCES persons (number)
 )
  STRICT;
+
+CREATE TRIGGER captures_changed AFTER UPDATE OF eye, taken_at, simulated, calibration_id, report, request ON captures BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = NEW.id; END;
+
+CREATE TRIGGER captures_of_visit_changed AFTER UPDATE OF eye, report ON captures BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER fields_delete AFTER DELETE ON fields BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = OLD.visit; END;
+
+CREATE TRIGGER fields_insert AFTER INSERT ON fields BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER fields_update AFTER UPDATE ON fields BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER files_delete AFTER DELETE ON files BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = OLD.capture_id; END;
+
+CREATE TRIGGER files_insert AFTER INSERT ON files BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = NEW.capture_id; END;
+
+CREATE TRIGGER files_update AFTER UPDATE ON files BEGIN UPDATE captures SET record_sha256 = NULL WHERE id = NEW.capture_id; END;
+
+CREATE TRIGGER identifiers_delete AFTER DELETE ON identifiers BEGIN UPDATE persons SET record_sha256 = NULL WHERE number = OLD.person; END;
+
+CREATE TRIGGER identifiers_insert AFTER INSERT ON identifiers BEGIN UPDATE persons SET record_sha256 = NULL WHERE number = NEW.person; END;
+
+CREATE TRIGGER identifiers_update AFTER UPDATE ON identifiers BEGIN UPDATE persons SET record_sha256 = NULL WHERE number = NEW.person; END;
+
+CREATE TRIGGER persons_changed AFTER UPDATE OF number, made_at, patient_id ON persons BEGIN UPDATE persons SET record_sha256 = NULL WHERE number = NEW.number; END;
+
+CREATE TRIGGER sendings_delete AFTER DELETE ON sendings WHEN OLD.sent_at IS NOT NULL BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = OLD.visit; END;
+
+CREATE TRIGGER sendings_insert AFTER INSERT ON sendings WHEN NEW.sent_at IS NOT NULL BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER sendings_update AFTER UPDATE ON sendings WHEN NEW.sent_at IS NOT NULL BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER slots_delete AFTER DELETE ON slots BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = OLD.visit; END;
+
+CREATE TRIGGER slots_insert AFTER INSERT ON slots BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER slots_update AFTER UPDATE ON slots BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.visit; END;
+
+CREATE TRIGGER visits_changed AFTER UPDATE OF person, day, begun_at, finished_at, outcome, sent, request ON visits BEGIN UPDATE visits SET record_sha256 = NULL WHERE id = NEW.id; END;
 
