@@ -470,7 +470,7 @@ def test_no_unfinished_mark_or_machine_path_is_left() -> None:
 AVOIDED = re.compile(
     rf"\b(?:{'|'.join(tomllib.loads(text('pyproject.toml'))['tool']['diffuscope']['avoided-words'])})\b", re.IGNORECASE
 )
-RECORDS = ("tests/golden/records/", "tests/golden/kept/", "tests/golden/kept-r0004/", "tests/golden/kept-r0005/", "tests/frozen_names.txt")
+RECORDS = ("tests/golden/records/", "tests/golden/kept", "tests/frozen_names.txt")
 
 
 def frozen_names(name: str) -> list[str]:

@@ -40,7 +40,7 @@ def restore(
     with storage_errors(), atomic_io.file_lock(data / ".lock"):
         if name in snapshots.names() and (missing := snapshots.missing_from(name, data / "captures")):
             typer.echo(f"{len(missing)} captures were kept since, from {missing[0]} on.")
-            typer.echo("The next start lists them again; answers given since are in the tables put aside only.")
+            typer.echo("The next start restores them, and later answers, from their files.")
         if not sure:
             typer.confirm(f"Go back to {name}?", abort=True)
         aside = snapshots.restore(name)

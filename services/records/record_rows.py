@@ -101,24 +101,45 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
     return {row.id: _or_error(lambda row=row: content(row)) for row in rows}
 
 
-def restore_patient(session: Session, content: JsonObject) -> None:
-    """Write the rows of a patient as described; ValueError, TypeError or KeyError for a content of another form."""
+def restore_patient(session: Session, content: JsonObject) -> bool:
+    """Write the rows of a patient as described; return whether the number could stay.
+
+    If another patient has the number, as after a rollback on older tables, this one gets the number with the first free
+    of the endings "-2", "-3", ...: two patients are never mixed up. ValueError, TypeError or KeyError for a content of
+    another form.
+    """
     row, identifiers = _patient_rows(content)
+    described = row.number
+    row.number = _free_number(session, described, row.patient_id)
+    for one in identifiers:
+        one.person = row.number
     session.execute(delete(IdentifierRow).where(IdentifierRow.person == row.number))
     session.merge(row)
     session.flush()
     session.add_all(identifiers)
     session.flush()
+    return row.number == described
 
 
-def restore_visit(session: Session, content: JsonObject) -> None:
-    """Write the rows of a visit as described, but its decisions on slots; errors as in `restore_patient`.
+def _free_number(session: Session, number: str, patient_id: str | None) -> str:
+    """Return the number that the patient with this id has, else the number itself or the first free one beside it."""
+    known = session.scalar(select(PatientRow.number).where(PatientRow.patient_id == patient_id))
+    if known is not None:
+        return known
+    taken = set(session.scalars(select(PatientRow.number).where(PatientRow.number.startswith(number))))
+    candidates = (number, *(f"{number}-{count}" for count in range(2, len(taken) + 3)))
+    return next(one for one in candidates if one not in taken)
 
-    A patient without rows gets a row with that number and no identifying field.
+
+def restore_visit(session: Session, content: JsonObject) -> bool:
+    """Write the rows of a visit as described, but its decisions on slots; return whether its patient has that number.
+
+    A patient without rows gets a row with that number and no identifying field. Errors as in `restore_patient`.
     """
     row, answers, uploads, _ = _visit_rows(content)
+    described, patient_id = row.person, _text_or_none(content["patient_id"])
+    row.person = _free_number(session, described, patient_id)
     if session.get(PatientRow, row.person) is None:
-        patient_id = _text_or_none(content["patient_id"])
         session.add(PatientRow(number=row.person, made_at=row.begun_at, patient_id=patient_id))
         session.flush()
     session.execute(delete(AnswerRow).where(AnswerRow.visit == row.id))
@@ -130,6 +151,7 @@ def restore_visit(session: Session, content: JsonObject) -> None:
     for upload in uploads:
         session.merge(upload)
     session.flush()
+    return row.person == described
 
 
 def restore_decisions(session: Session, content: JsonObject) -> list[str]:

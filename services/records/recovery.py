@@ -9,6 +9,7 @@ patient, a visit or a capture is in its rows and in a file (record_document.py),
     whole, older            newer                   restore the rows from the file
     whole, unsigned         no newer revision       sign the rows, write the file (an earlier release changed them)
     whole, unsigned         newer, other content    the later change is used, the other is stored in `conflicts/`
+    another patient's       whole                   restore with another number: patients are never mixed up
     damaged or missing      whole                   restore the rows from the file
     damaged                 damaged or missing      none: one damaged record in the lists
 
@@ -90,7 +91,7 @@ class Recovery:
     def __init__(self, folder: Path, engine: Engine, rebuilt_because: str | None) -> None:
         self._folder, self._engine, self._files = folder, engine, RecordFiles(folder)
         self.report = RecoveryReport(rebuilt_because=rebuilt_because)
-        self._restored_visits: list[RecordDocument] = []
+        self._restored_visits: list[tuple[RecordDocument, bool]] = []
 
     def run(self) -> RecoveryReport:
         """Restore what has to be restored, sign what is unsigned, and write the files that are missing or older.
@@ -114,24 +115,34 @@ class Recovery:
         suspicious = {*self.report.visits, *(one.id for one in to_write if one.kind == "visit")}
         to_write += self._reconcile(session, "capture", suspicious)
         record_rows.restore_slots(session)
-        for document in self._restored_visits:
+        for document, as_described in self._restored_visits:
             missing = record_rows.restore_decisions(session, document.content)
             self.report.missing += missing
-            if not missing:
+            if as_described and not missing:
                 write_signature(session, document)
         self._files.write([*to_write, *sign_changed(session)])
 
     def _name_known_patients(self, session: Session) -> None:
-        """Give patients without an id, which an earlier release made or older tables hold, the id in their file."""
+        """Give patients without an id, which an earlier release made or older tables hold, the id in their file.
+
+        A patient with the same number that was made at another moment is another one: after a rollback on older tables
+        the earlier release may have given the number again.
+        """
         nameless = session.scalars(select(PatientRow).where(PatientRow.patient_id.is_(None))).all()
         if not nameless:
             return
         documents = (self._file("patient", id) for id in self._files.ids("patient"))
-        ids = {one.content["number"]: one.id for one in documents if one is not None}
+        ids = {(one.content["number"], one.content["made_at"]): one.id for one in documents if one is not None}
         for row in nameless:
             if row is not None:
-                row.patient_id = ids.get(row.number)
+                row.patient_id = ids.get((row.number, row.made_at))
         session.flush()
+
+    def _id_in_file(self, damaged: PatientRow) -> str | None:
+        """Return the id of the patient whose file has the number of a damaged row, which may have another id."""
+        documents = (self._file("patient", id) for id in self._files.ids("patient"))
+        numbered = [one for one in documents if one is not None and one.content["number"] == damaged.number]
+        return numbered[0].id if numbered else damaged.patient_id
 
     def _reconcile(self, session: Session, kind: Kind, of_visits: set[str] | None = None) -> list[RecordDocument]:
         """Compare the rows of all records of a kind with their files and restore rows; return the files to write.
@@ -145,6 +156,9 @@ class Recovery:
             contents = contents_of(session, kind, rows)
             for row in rows:
                 rows_document = _document_in_rows(kind, row, contents[schema.record_key(row)])
+                if isinstance(row, PatientRow) and rows_document is None and row.record_sha256 is not None:
+                    row.patient_id = self._id_in_file(row)
+                    session.flush()
                 id = row.patient_id or "" if isinstance(row, PatientRow) else row.id
                 known.add(id)
                 if _is_settled(kind, row, rows_document, of_visits):
@@ -200,17 +214,20 @@ class Recovery:
             with row_validation.reading_record(document.id), storage_errors(), session.begin_nested():
                 if not known:
                     _delete_misnamed(session, document)
+                as_described = True
                 if document.kind == "patient":
-                    record_rows.restore_patient(session, document.content)
+                    as_described = record_rows.restore_patient(session, document.content)
                     self.report.patients.append(document.id)
                 elif document.kind == "visit":
-                    record_rows.restore_visit(session, document.content)
+                    as_described = record_rows.restore_visit(session, document.content)
                     self.report.visits.append(document.id)
-                    self._restored_visits.append(document)
+                    self._restored_visits.append((document, as_described))
                 else:
                     self._restore_capture(session, document)
                     (self.report.healed if known else self.report.adopted).append(document.id)
-                if document.revision:
+                if not as_described:
+                    self.report.conflicts.append(document.id)
+                elif document.revision:
                     write_signature(session, document)
         except StoreError as error:
             log.error("rows of the %s %s were not restored: %s", document.kind, document.id, error)

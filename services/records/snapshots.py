@@ -10,13 +10,16 @@ only after a harmful migration. They hold the database only: migrations do not c
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError, StoreFull
+from device.light_safety.dose_ledger import DoseLedgerState
+from device.values import EYES
 from services.errors import RecordNotFound, StoreDamaged
+from services.records.dose_ledger_log import DoseLedgerLog, raise_to
 
 KEPT_VERSIONS = 3
 LOG_SUFFIXES = ("journal", "wal", "shm")  # SQLite would apply a leftover log to the restored database
@@ -58,7 +61,7 @@ class Snapshots:
         self._delete_old(name)
 
     def restore(self, name: str) -> Path:
-        """Replace the database by a snapshot; return the folder that holds the replaced files.
+        """Replace the database by a snapshot, but for its doses; return the folder that holds the replaced files.
 
         Errors: RecordNotFound (unknown name), StoreDamaged (the snapshot fails the integrity check), StoreError
         (another process uses the database), OSError. After a power cut during the replacement the store may refuse to
@@ -70,6 +73,7 @@ class Snapshots:
         refuse_in_use(self.database)
         new = self.database.with_name(".shelf.part")
         shutil.copyfile(self.folder / name, new)
+        _carry_dose(self.database, new)
         atomic_io.fsync_file(new)
         atomic_io.fsync_folder(self.database.parent)
         replaced = self._new_replaced_folder()
@@ -122,6 +126,36 @@ class Snapshots:
 def _connected(path: Path) -> Iterator[sqlite3.Connection]:
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         yield connection
+
+
+def _carry_dose(replaced: Path, restored: Path) -> None:
+    """Raise the doses in the restored tables to those in the replaced ones and in the second copy of the ledger.
+
+    Also an earlier release, which does not read the copy, then counts every dose. A replaced database that cannot be
+    read has its doses in the copy.
+    """
+    state = DoseLedgerLog(replaced.parent).newest() or DoseLedgerState()
+    if replaced.exists():
+        with suppress(sqlite3.DatabaseError), _connected(replaced) as tables:
+            raise_to(state, _ledger_in(tables))
+    with _connected(restored) as tables:
+        tables.execute("PRAGMA journal_mode = DELETE")
+        if "light_time" not in {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}:
+            return
+        raise_to(state, _ledger_in(tables))
+        tables.execute("BEGIN IMMEDIATE")
+        for (eye, slot), dose_j_per_cm2 in state.doses.items():
+            tables.execute("INSERT OR REPLACE INTO light_doses VALUES (?, ?, ?)", (eye, slot, dose_j_per_cm2))
+        time = (1, state.boot, state.now_s, state.observed_s)
+        tables.execute("INSERT OR REPLACE INTO light_time VALUES (?, ?, ?, ?)", time)
+        tables.execute("COMMIT")
+
+
+def _ledger_in(tables: sqlite3.Connection) -> DoseLedgerState:
+    """Return the dose ledger in a database; sqlite3.DatabaseError if it has none."""
+    rows = tables.execute("SELECT eye, slot, dose_j_per_cm2 FROM light_doses").fetchall()
+    time = tables.execute("SELECT observed_s, boot, now_s FROM light_time").fetchone() or (0.0, "", 0.0)
+    return DoseLedgerState({(eye, slot): dose for eye, slot, dose in rows if eye in EYES}, *time)
 
 
 def _number(tables: sqlite3.Connection, pragma: str) -> int:

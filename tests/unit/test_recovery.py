@@ -18,6 +18,7 @@ from services.records.capture import Capture, CaptureReport, PictureVerdict
 from services.records.capture_store import CaptureStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
+from services.records.record_document import RecordDocument, parse_document
 from services.records.record_files import CAPTURE_RECORD as RECORD
 from services.records.recovery_report import RecoveryReport
 from services.records.snapshots import Snapshots
@@ -285,3 +286,46 @@ def test_after_a_rollback_on_older_tables_the_later_change_is_used_and_the_other
         assert [one["answers"]["age"]["value"] for one in stored] == [other]
     with CaptureStore(tmp_path, reserve_bytes=0) as store:
         assert store.recovery == RecoveryReport()
+
+
+def test_a_number_that_was_given_again_after_a_rollback_mixes_up_no_patients(tmp_path: Path) -> None:
+    clock = VirtualClock(start=datetime(2026, 3, 1, 13, tzinfo=UTC))
+    store_of_version(tmp_path, "r0005")
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        people = VisitRepository(store.engine, load_protocol(), clock)
+        visit = people.begin(next(KEYS), "X1").id
+        people.answer(next(KEYS), visit, "name", "Asha")
+        people.answer(next(KEYS), visit, "age", 30)
+    snapshots = Snapshots(tmp_path / "shelf.sqlite", clock)
+    snapshots.restore(snapshots.names()[0])
+    now = "'2026-03-01T18:00:00.000000+00:00'"
+    without_rows(  # the earlier release gives the number to another patient
+        tmp_path,
+        f"INSERT INTO persons (number, made_at) VALUES ('X1', {now})",
+        "INSERT INTO identifiers (person, name, value) VALUES ('X1', 'name', '\"Usha\"')",
+        f"INSERT INTO visits (id, person, day, begun_at) VALUES ('v1', 'X1', '2026-03-01', {now})",
+        f"INSERT INTO fields (visit, name, value, set_at) VALUES ('v1', 'age', '51', {now})",
+    )
+    for _ in range(2):
+        with CaptureStore(tmp_path, reserve_bytes=0) as store:
+            people = VisitRepository(store.engine, load_protocol(), clock)
+            found = {one.id: (one.number, one.fields["name"], one.fields["age"]) for one in people.visits(10)}
+            assert found == {"v1": ("X1", "Usha", 51), visit: ("X1-2", "Asha", 30)}
+    assert sorted(one.content["number"] for one in documents(tmp_path)) == ["X1", "X1-2"]
+
+
+def documents(folder: Path) -> list[RecordDocument]:
+    return [parse_document(path.read_bytes()) for path in (folder / "patients").iterdir()]
+
+
+def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
+    people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+    people.answer(next(KEYS), people.begin(next(KEYS)).id, "name", "Asha")
+    before = people.visits(10)
+    store.close()
+    id = documents(store.folder)[0].id
+    changed = ("f" if id[0] != "f" else "e") + id[1:]
+    flip(store.folder / "shelf.sqlite", id.encode(), changed.encode())
+    with CaptureStore(store.folder, reserve_bytes=0) as again:
+        assert VisitRepository(again.engine, load_protocol(), VirtualClock()).visits(10) == before
+    assert [one.id for one in documents(store.folder)] == [id]
