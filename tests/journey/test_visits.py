@@ -202,7 +202,7 @@ def test_a_repeated_request_changes_nothing_even_after_a_restart(make_rig: Any) 
     assert len(restarted.request("GET", "/api/visits").json()["visits"]) == 1
     assert len(restarted.store.captures()) == 1
     answer = restarted.request("POST", f"/api/visits/{visit['id']}/finish", json={"key": key})
-    assert "another request" in refused(answer, 422, "input")["message"]
+    assert "another request" in refused(answer, 409, "refused.key")["message"]
 
 
 @pytest.mark.parametrize("text", HOSTILE)

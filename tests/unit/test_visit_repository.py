@@ -10,8 +10,8 @@ import pytest
 from alembic import command
 
 from device.clock import VirtualClock
-from device.errors import InputError, SpecError
-from services.errors import RecordNotFound, VisitFinished
+from device.errors import SpecError
+from services.errors import IdempotencyKeyConflict, RecordNotFound, VisitFinished
 from services.records import schema
 from services.records.capture import Capture, CaptureReport, PictureVerdict
 from services.records.capture_report import read_report
@@ -200,7 +200,7 @@ def test_an_idempotency_key_belongs_to_one_request(people: VisitRepository) -> N
     visit = people.begin(key)
     assert people.begin(key) == visit
     for other in (lambda: people.begin(key, "B1"), lambda: people.answer(key, visit.id, "age", 5)):
-        with pytest.raises(InputError, match="another request"):
+        with pytest.raises(IdempotencyKeyConflict, match="another request"):
             other()
 
 
