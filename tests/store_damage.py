@@ -101,7 +101,6 @@ def shown(folder: Path) -> tuple[Shown, int]:
         for id, capture in captures.items():
             for name in capture.files:
                 try:
-                    store.get(id)
                     files[id, name] = store.read(id, name)
                 except (StoreDamaged, RecordNotFound):
                     reported += 1
@@ -266,7 +265,7 @@ class Trial:
 
 
 def run_trial(stores: Mapping[bool, Path], before: Mapping[bool, Shown], planned: Planned, scratch: Path) -> Trial:
-    """Copy the store, damage the copy, open it twice, and return what was found; the copy is removed.
+    """Copy the store, damage the copy, open it, every tenth time once more, and return what was found.
 
     `stores` and `before`: the stores by `with_log`, and what they show undamaged.
     """
@@ -274,11 +273,11 @@ def run_trial(stores: Mapping[bool, Path], before: Mapping[bool, Shown], planned
     folder = shutil.copytree(stores[planned.with_log], scratch / f"{damage}-{target}-{seed}")
     change = DAMAGES[damage](folder, targets(folder, target), random.Random(f"{damage} {target} {seed}"))
     outcome, violations = judge(folder, before[planned.with_log])
-    second, more = judge(folder, before[planned.with_log])
-    if second != outcome:
-        violations.append(f"the second opening shows another state: {second}")
+    if seed % 10 == 0:
+        second, more = judge(folder, before[planned.with_log])
+        violations += more if second == outcome else [*more, f"the second opening shows another state: {second}"]
     shutil.rmtree(folder)
-    return Trial(damage, target, change, outcome, (*violations, *more))
+    return Trial(damage, target, change, outcome, tuple(violations))
 
 
 def table(trials: list[Trial]) -> str:
