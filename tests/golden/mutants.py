@@ -20,7 +20,7 @@ NEEDED = ("device", "services", "web", "tests", "hardware", "pyproject.toml", "C
 LIMIT_S = 300.0  # a hanging mutant counts as killed
 GUARD, LEDGER, BOOK, COPY = (
     "device/light_safety/guard.py", "device/light_safety/dose_ledger.py",
-    "services/records/dose_ledger_tables.py", "services/records/dose_copy.py",
+    "services/records/dose_ledger_tables.py", "services/records/dose_ledger_log.py",
 )  # fmt: skip
 STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
     "services/records/capture_store.py",
@@ -32,6 +32,8 @@ STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
     "services/instrument/live_pictures.py",
     "services/instrument/capture_pipeline.py",
 )
+SIGNING, RECOVERY = "services/records/record_signing.py", "services/records/recovery.py"
+T_LOG, T_RECOVERY = "tests/unit/test_dose_ledger_log.py", "tests/unit/test_recovery.py"
 T_GUARD, T_BOOK, T_DOSES = (
     "tests/unit/test_guard.py", "tests/unit/test_dose_ledger_tables.py", "tests/property/test_guard_dose_limit.py",
 )  # fmt: skip
@@ -93,11 +95,15 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(LEDGER, "given_j_per_cm2 - reserved.dose_j_per_cm2)", "given_j_per_cm2)", T_BOOK),
     Mutant(LEDGER, "total = self.spent(eye) + dose_j_per_cm2\n", "total = self.spent(eye)\n", T_BOOK),
     Mutant(LEDGER, "DailyLightLimit if wait_s > LONGEST_REST_S", "DailyLightLimit if wait_s < LONGEST_REST_S", T_BOOK),
-    Mutant(BOOK, "            self._copy.raise_to_copy(state)\n", "", "tests/unit/test_checkpointing.py"),
+    Mutant(BOOK, "            raise_to(state, copy)\n", "            pass\n", T_LOG),
     Mutant(BOOK, "row.eye in EYES else EYES", "row.eye in EYES else ()", T_BOOK),
-    Mutant(BOOK, "now_s=state.now_s, observed_s=state.observed_s)", "now_s=state.now_s, observed_s=0.0)", T_BOOK),
-    Mutant(COPY, "= max(state.doses.get(", "= min(state.doses.get(", "tests/unit/test_checkpointing.py"),
-    Mutant(COPY, "self._number % 2 * BLOCK_BYTES", "0", "tests/unit/test_checkpointing.py"),
+    Mutant(BOOK, "now_s=state.now_s, observed_s=state.observed_s)", "now_s=state.now_s, observed_s=0.0)", T_LOG),
+    Mutant(COPY, "= max(state.doses.get(", "= min(state.doses.get(", T_LOG),
+    Mutant(COPY, "for line in reversed(lines):", "for line in lines:", T_LOG),
+    # Records
+    Mutant(SIGNING, "elif document.sha256() != row.record_sha256:", "elif False:", T_RECOVERY),
+    Mutant(RECOVERY, "if signed and in_file.revision > in_rows.revision:", "if False:", T_RECOVERY),
+    Mutant(RECOVERY, "checksum not in (0,", "checksum == 0 and checksum not in (0,", T_RECOVERY),
     # Store
     Mutant(STORE, "if hashlib.sha256(content).hexdigest() != files[name]:", "if False:", T_RECORDS),
     Mutant(STORE, "            self._refuse_duplicate(part, kept)\n", "", T_RECORDS),

@@ -72,6 +72,13 @@ def shelf_with_one(folder: Path) -> None:
         store.save(capture("before"), FILES)
 
 
+def shelf_with_ledger(folder: Path) -> None:
+    """A device that was used has a ledger; without one both eyes count as full."""
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, boot="boot")
+    shelf_with_one(folder)
+
+
 def keep(folder: Path, acknowledge: Callable[[str], None]) -> None:
     with CaptureStore(folder, reserve_bytes=0) as store:
         for number in (1, 2):
@@ -315,7 +322,7 @@ CASES = {
     "a capture is kept": Case(shelf_with_one, keep, judge_kept_beside, frozenset({"old", "torn", "new"})),
     "the first capture of a new device": Case(nothing, keep, judge_kept, frozenset({"old", "torn", "new"})),
     "answers of a visit": Case(shelf_with_one, answer, judge_answers, OLD_NEW),
-    "the book of light": Case(shelf_with_one, reserve_dose, judge_light, OLD_NEW),
+    "the book of light": Case(shelf_with_ledger, reserve_dose, judge_light, OLD_NEW),
     "a calibration is kept and taken back": Case(calibrated, recalibrate, judge_calibration, OLD_NEW),
     "a calibration is taken in": Case(with_exported_calibration, import_calibration, judge_calibration, OLD_NEW),
     "the first calibration": Case(nothing, first_calibration, judge_calibration, frozenset({"none", "new"})),

@@ -9,6 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from tests.store_damage import Planned, Trial, expected, filled_store, plan, run_trial, table
 
 TRIALS = 1_250
@@ -26,6 +28,7 @@ def run_all(folder: Path, trials: int) -> list[Trial]:
         return list(pool.map(partial(run_trial, stores, before, scratch=scratch), planned, chunksize=20))
 
 
+@pytest.mark.timeout(900)  # a quarter of an hour, for 1,250 openings beside other tests
 def test_no_damage_of_one_file_is_silent(tmp_path: Path) -> None:
     trials = run_all(tmp_path, TRIALS)
     assert not [one for one in trials if one.violations]

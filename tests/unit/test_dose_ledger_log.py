@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from device.clock import VirtualClock
 from device.errors import LightLimit, StoreError
-from device.light_safety.dose_ledger import DoseLedgerState
+from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import EARLIER_BLOCK_BYTES, EARLIER_COPY, LOG, MAX_BYTES, DoseLedgerLog
@@ -108,6 +108,18 @@ def test_a_settled_dose_replaces_its_reservation_in_both_copies(store: CaptureSt
     for damage in (lose_rows, lose_file):
         damage(store.folder)
         assert ledger_of(store, VirtualClock()).spent_j_per_cm2("OS") == 0.25
+
+
+def test_the_observed_time_survives_the_loss_of_the_file(store: CaptureStore) -> None:
+    clock = VirtualClock()
+    ledger = ledger_of(store, clock)
+    ledger.reserve(("OD",), 1.0, STOP)
+    clock.sleep(DAY_S / 2)
+    ledger.reserve(("OS",), 1.0, STOP)
+    lose_file(store.folder)
+    again = ledger_of(store, clock)
+    clock.sleep(DAY_S / 2 + 2 * SLOT_S)
+    assert (again.spent_j_per_cm2("OD"), again.spent_j_per_cm2("OS")) == (0.0, 1.0)
 
 
 def test_a_change_that_the_database_refuses_counts_the_higher_dose(store: CaptureStore) -> None:

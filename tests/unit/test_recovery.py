@@ -203,6 +203,7 @@ def test_an_older_database_does_not_undo_later_changes(tmp_path: Path) -> None:
         people = VisitRepository(store.engine, load_protocol(), clock)
         assert tuple(people.get(one.id) for one in latest) == latest
         assert sorted(store.recovery.visits) == sorted(one.id for one in latest)
+        assert store.recovery.conflicts == []
 
 
 def test_repeated_requests_have_no_further_effect_after_a_rebuild(tmp_path: Path) -> None:
@@ -329,3 +330,13 @@ def test_a_damaged_id_of_a_patient_is_restored(store: CaptureStore) -> None:
     with CaptureStore(store.folder, reserve_bytes=0) as again:
         assert VisitRepository(again.engine, load_protocol(), VirtualClock()).visits(10) == before
     assert [one.id for one in documents(store.folder)] == [id]
+
+
+def test_a_changed_definition_of_a_table_rebuilds_the_database(store: CaptureStore) -> None:
+    """SQLite's integrity check passes, because the definition is valid."""
+    kept = saved(store, "a")
+    store.close()
+    flip(store.folder / "shelf.sqlite", b"length(value) <= 2000", b"length(value) <= 3000")
+    with CaptureStore(store.folder, reserve_bytes=0) as again:
+        assert again.recovery.rebuilt_because == "the definitions of its tables are not those that were written"
+        assert again.captures() == [kept]
