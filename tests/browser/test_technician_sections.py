@@ -73,7 +73,7 @@ def layout_faults(page: Page, ready: str) -> list[str]:
 def test_health_lists_every_check(technician_page: Page) -> None:
     open_section(technician_page, "health")
     checks = technician_page.locator("li[data-check]")
-    expect(checks).to_have_count(10)
+    expect(checks).to_have_count(len(CHECKS))
     assert {check.get_attribute("data-ok") for check in checks.all()} == {"true"}
     assert layout_faults(technician_page, "li[data-check]") == []
 
