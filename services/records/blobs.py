@@ -19,6 +19,13 @@ def write_blob(path: Path, content: bytes) -> None:
     atomic_io.write_atomically(path, content)
 
 
+def write_blob_unsynced(path: Path, content: bytes) -> None:
+    """Write or replace a file atomically for other processes, but not durably: a power cut may leave it incomplete."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(content)
+    part.rename(path)
+
+
 def write_folder(folder: Path, contents: Mapping[str, bytes]) -> None:
     """Write a new folder with these files (name -> content), durable on return but for the folder's own name.
 

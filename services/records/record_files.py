@@ -1,5 +1,6 @@
 """Files of the records in a store: `patients/<id>.json`, `visits/<id>.json` and `captures/<id>/record.json`."""
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -67,6 +68,21 @@ class RecordFiles:
             path = self.path(document.kind, document.id)
             if path.parent.is_dir():
                 blobs.write_blob(path, document.encoded())
+
+    def write_all(self, documents: Iterable[RecordDocument]) -> None:
+        """Write or replace the files of many records, durable on return by one sync instead of two for each file.
+
+        A power cut before the end may leave incomplete files, which differ from their digest and are written again.
+        OSError if the disk refuses.
+        """
+        written = False
+        for document in documents:
+            path = self.path(document.kind, document.id)
+            if path.parent.is_dir():
+                blobs.write_blob_unsynced(path, document.encoded())
+                written = True
+        if written:
+            os.sync()
 
     def remove(self, kind: Kind, id: str) -> None:
         """Remove the file of a patient or visit whose rows were not committed; without a file do nothing."""

@@ -120,7 +120,7 @@ class Recovery:
             self.report.missing += missing
             if as_described and not missing:
                 write_signature(session, document)
-        self._files.write([*to_write, *sign_changed(session)])
+        self._files.write_all([*to_write, *sign_changed(session)])
 
     def _name_known_patients(self, session: Session) -> None:
         """Give patients without an id, which an earlier release made or older tables hold, the id in their file.
