@@ -1,20 +1,24 @@
 """Command `diffuscope snapshots list|restore`: list the snapshots of the database; restore one of them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from device import atomic_io
 from device.clock import SystemClock
 from services.errors import RecordNotFound
-from services.records.snapshots import Snapshots
+
+if TYPE_CHECKING:
+    from services.records.snapshots import Snapshots
 
 app = typer.Typer(help="The tables as they were before each migration, and the way back.", no_args_is_help=True)
 Data = Annotated[Path, typer.Option(help="Where captures are kept.")]
 
 
-def _snapshots(data: Path) -> Snapshots:
+def _snapshots(data: Path) -> "Snapshots":
+    from services.records.snapshots import Snapshots  # deferred: imports SQLAlchemy
+
     if not (data / "captures").is_dir():
         raise RecordNotFound(f"{data} holds no captures", "Give the folder of the captures with --data.")
     return Snapshots(data / "shelf.sqlite", SystemClock())
