@@ -82,6 +82,13 @@ def write_atomically(path: Path, content: bytes, mode: int | None = None) -> Non
     fsync_folder(path.parent)
 
 
+def write_atomically_unsynced(path: Path, content: bytes) -> None:
+    """Write or replace a file atomically for other processes, but not durably: a power cut may leave it incomplete."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_bytes(content)
+    part.rename(path)
+
+
 def replace_durably(source: Path, target: Path) -> None:
     """Rename a file or folder to `target` durably; it replaces a file, or an empty folder, of that name.
 

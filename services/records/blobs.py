@@ -21,9 +21,7 @@ def write_blob(path: Path, content: bytes) -> None:
 
 def write_blob_unsynced(path: Path, content: bytes) -> None:
     """Write or replace a file atomically for other processes, but not durably: a power cut may leave it incomplete."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(content)
-    part.rename(path)
+    atomic_io.write_atomically_unsynced(path, content)
 
 
 def write_folder(folder: Path, contents: Mapping[str, bytes]) -> None:
