@@ -1,7 +1,7 @@
 """Second copy of the dose ledger: an append-only file, so that lost or restored rows of the database lower no dose.
 
     dose-ledger.log     one line per change: CRC-32 (8 hexadecimal digits), space, JSON of the whole ledger
-    light.copy          two blocks of an earlier release, read while there is no line yet
+    light.copy          two blocks of an earlier release, read while there is no line yet, removed after the first one
 
 Each line holds the whole ledger, so the last line with a valid CRC is enough. Lines are appended without fsync, so that
 no exposure waits for it: only the database is durable across a power cut. A log of MAX_BYTES is replaced atomically by
@@ -42,7 +42,7 @@ class DoseLedgerLog:
         return self._newest_of_earlier_release()
 
     def append(self, state: DoseLedgerState) -> None:
-        """Append a ledger, without fsync; OSError if the disk refuses."""
+        """Append a ledger, without fsync, and remove the copy of an earlier release; OSError if the disk refuses."""
         line = _line(state)
         if self._path.exists() and self._path.stat().st_size + len(line) > MAX_BYTES:
             atomic_io.write_atomically(self._path, line, 0o600)
@@ -52,6 +52,8 @@ class DoseLedgerLog:
             os.write(descriptor, line)
         finally:
             os.close(descriptor)
+        # Outdated from now on: with table and log gone, it would be used instead of counting both eyes as full.
+        self._earlier.unlink(missing_ok=True)
 
     def _newest_of_earlier_release(self) -> DoseLedgerState | None:
         file = self._earlier.read_bytes() if self._earlier.exists() else b""

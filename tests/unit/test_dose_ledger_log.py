@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from device.clock import VirtualClock
 from device.errors import LightLimit, StoreError
 from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState
+from device.values import EYES, Eye
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_log import EARLIER_BLOCK_BYTES, EARLIER_COPY, LOG, MAX_BYTES, DoseLedgerLog
@@ -62,10 +64,27 @@ def nothing(_: Path) -> None:
     pass
 
 
+@dataclass(frozen=True)
+class Exposure:
+    """Light on one eye: reserved dose (J/cm2) and the share of it that was given."""
+
+    eye: Eye
+    reserved_j_per_cm2: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Damage of one copy; with `reopen` the program starts again after it."""
+
+    do: Callable[[Path], None]
+    reopen: bool
+
+
 ACTIONS = st.lists(
     st.one_of(
-        st.tuples(st.just("light"), st.sampled_from(("OD", "OS")), st.floats(0, 0.01), st.floats(0, 1)),
-        st.tuples(st.sampled_from((lose_rows, lose_file, tear_last_line, zero_file)), st.booleans()),
+        st.builds(Exposure, st.sampled_from(EYES), st.floats(0, 0.01), st.floats(0, 1)),
+        st.builds(Damage, st.sampled_from((lose_rows, lose_file, tear_last_line, zero_file)), st.booleans()),
     ),
     max_size=12,
 )
@@ -73,24 +92,23 @@ ACTIONS = st.lists(
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(ACTIONS)
-def test_no_damage_of_one_copy_lowers_a_dose(actions: list[tuple[object, ...]]) -> None:
+def test_no_damage_of_one_copy_lowers_a_dose(actions: list[Exposure | Damage]) -> None:
     """Damage of one copy at a time; after each, the ledger is used or opened again, which restores the other copy."""
     with TemporaryDirectory() as place, CaptureStore(Path(place) / "store", reserve_bytes=0) as store:
-        clock, given_doses = VirtualClock(), {"OD": 0.0, "OS": 0.0}
-        ledger = ledger_of(store, clock)
+        clock = VirtualClock()
+        ledger, given_j_per_cm2 = ledger_of(store, clock), dict.fromkeys(EYES, 0.0)
         for action in actions:
-            if action[0] == "light":
-                _, eye, dose, share = action
-                ledger.settle(ledger.reserve((eye,), dose, STOP), dose * share)  # type: ignore[arg-type, operator]
-                given_doses[eye] += dose * share  # type: ignore[index, operator]
+            if isinstance(action, Exposure):
+                dose_j_per_cm2 = action.reserved_j_per_cm2 * action.share
+                ledger.settle(ledger.reserve((action.eye,), action.reserved_j_per_cm2, STOP), dose_j_per_cm2)
+                given_j_per_cm2[action.eye] += dose_j_per_cm2
             else:
-                damage, reopen = action
-                damage(store.folder)  # type: ignore[operator]
-                if reopen:
+                action.do(store.folder)
+                if action.reopen:
                     ledger = ledger_of(store, clock)
                 ledger.settle(ledger.reserve(("OD",), 0.0, STOP), 0.0)
-            for eye, dose in given_doses.items():
-                assert ledger.spent_j_per_cm2(eye) >= dose - 1e-12  # type: ignore[arg-type]
+            for eye, dose_j_per_cm2 in given_j_per_cm2.items():
+                assert ledger.spent_j_per_cm2(eye) >= dose_j_per_cm2 - 1e-12  # rounding of the sums
 
 
 def test_rows_that_are_deleted_while_the_instrument_runs_lower_no_dose(store: CaptureStore) -> None:
@@ -144,12 +162,12 @@ def test_both_eyes_of_a_used_device_count_as_full_if_table_and_file_are_gone(sto
     lose_rows(store.folder)
     lose_file(store.folder)
     again = ledger_of(store, clock)
-    for eye in ("OD", "OS"):
+    for eye in EYES:
         if used:
             with pytest.raises(LightLimit):
-                again.reserve((eye,), 0.001, STOP)  # type: ignore[arg-type]
+                again.reserve((eye,), 0.001, STOP)
         else:
-            again.reserve((eye,), 0.001, STOP)  # type: ignore[arg-type]
+            again.reserve((eye,), 0.001, STOP)
     clock.sleep(DAY_S + 2000)
     again.reserve(("OS",), 0.001, STOP)
 
@@ -166,17 +184,30 @@ def test_a_restored_snapshot_lowers_no_dose(store: CaptureStore) -> None:
         ledger_of(restored, clock).reserve(("OD",), 1.0, STOP)
 
 
-def test_the_copy_of_an_earlier_release_is_read(tmp_path: Path) -> None:
-    def block(number: int, dose: float) -> bytes:
-        entry = {"number": number, "boot": "b", "now_s": 5.0, "observed_s": 7.0, "doses": [["OD", 0, dose]]}
-        content = json.dumps(entry).encode()
-        head = struct.pack("<II", len(content), zlib.crc32(content))
-        return (head + content).ljust(EARLIER_BLOCK_BYTES, b"\0")
+def block_of_earlier_release(number: int, dose_j_per_cm2: float) -> bytes:
+    entry = {"number": number, "boot": "b", "now_s": 5.0, "observed_s": 7.0, "doses": [["OD", 0, dose_j_per_cm2]]}
+    content = json.dumps(entry).encode()
+    head = struct.pack("<II", len(content), zlib.crc32(content))
+    return (head + content).ljust(EARLIER_BLOCK_BYTES, b"\0")
 
-    (tmp_path / EARLIER_COPY).write_bytes(block(2, 0.5) + block(3, 0.75))
+
+def test_the_copy_of_an_earlier_release_is_read(tmp_path: Path) -> None:
+    (tmp_path / EARLIER_COPY).write_bytes(block_of_earlier_release(2, 0.5) + block_of_earlier_release(3, 0.75))
     assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.75}, 7.0, "b", 5.0)
-    (tmp_path / EARLIER_COPY).write_bytes(block(2, 0.5) + b"x" * EARLIER_BLOCK_BYTES)
+    (tmp_path / EARLIER_COPY).write_bytes(block_of_earlier_release(2, 0.5) + b"x" * EARLIER_BLOCK_BYTES)
     assert DoseLedgerLog(tmp_path).newest() == DoseLedgerState({("OD", 0): 0.5}, 7.0, "b", 5.0)
+
+
+def test_an_outdated_copy_of_an_earlier_release_is_not_used_for_a_lost_ledger(store: CaptureStore) -> None:
+    clock = VirtualClock()
+    (store.folder / EARLIER_COPY).write_bytes(block_of_earlier_release(1, 0.0))
+    ledger = ledger_of(store, clock)
+    ledger.settle(ledger.reserve(("OD",), STOP, STOP), STOP)
+    store.save(Capture("a", "OD", clock.wall(), True, "00ff", CaptureReport(), {}), {"raw.tiff": b"raw"})
+    lose_rows(store.folder)
+    lose_file(store.folder)
+    with pytest.raises(LightLimit):
+        ledger_of(store, clock).reserve(("OD",), 0.001, STOP)
 
 
 def test_the_file_does_not_grow_without_limit(tmp_path: Path) -> None:
