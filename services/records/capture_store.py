@@ -78,7 +78,7 @@ class CaptureStore:
     ) -> None:
         self.folder = folder
         self._captures, self._lock = folder / "captures", folder / ".lock"
-        database, torn = folder / "shelf.sqlite", folder / "torn"
+        database, torn = folder / schema.DATABASE, folder / "torn"
         with storage_errors(), ExitStack() as cleanup:
             atomic_io.make_folder(self._captures)
             atomic_io.make_folder(torn)
@@ -221,7 +221,7 @@ class CaptureStore:
         A store whose visits never had files cannot be rebuilt: its damaged database is opened as it is, row by row, and
         StoreDamaged is raised if it is missing or empty, because a new one would have no rows for the captures.
         """
-        database = self.folder / "shelf.sqlite"
+        database = self.folder / schema.DATABASE
         damage = damage_of(database)
         if damage is not None and RecordFiles(self.folder).exist():
             log.error("the database is moved to %s: %s", set_aside(database), damage)

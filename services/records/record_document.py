@@ -58,12 +58,12 @@ def parse_document(content: bytes) -> RecordDocument:
     entries = as_object(row_validation.parsed_json(content.decode()))
     if entries["format"] == 1:
         capture = as_object(entries["capture"])
-        _refuse_changed(_digest(capture), entries["sha256"])
+        _refuse_other_digest(_digest(capture), entries["sha256"])
         return RecordDocument("capture", 0, {**capture, "request": None})
     kind: Kind = row_validation.one_of(entries["kind"], *get_args(Kind))
     row_validation.one_of(entries["format"], FORMAT)
     document = RecordDocument(kind, whole_number(entries["revision"]), as_object(entries["record"]))
-    _refuse_changed(document.sha256(), entries["sha256"])
+    _refuse_other_digest(document.sha256(), entries["sha256"])
     return document
 
 
@@ -88,7 +88,7 @@ def as_number(value: object) -> float:
     return float(value)
 
 
-def _refuse_changed(digest: str, expected: object) -> None:
+def _refuse_other_digest(digest: str, expected: object) -> None:
     if digest != expected:
         raise ValueError("the SHA-256 of the record differs")
 

@@ -43,12 +43,10 @@ from services.records.record_signing import (
 )
 from services.records.recovery_report import RecoveryReport
 from services.records.schema import CaptureRow, PatientRow, RecordRow
-from services.records.snapshots import refuse_in_use
+from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
 
 log = logging.getLogger(__name__)
-
-LOG_SUFFIXES = ("-wal", "-shm", "-journal")
 
 
 def damage_of(database: Path) -> str | None:
@@ -74,15 +72,7 @@ def damage_of(database: Path) -> str | None:
 
 def set_aside(database: Path) -> Path:
     """Move a database with its logs to the next free folder `damaged/<n>`; return that folder. OSError on failure."""
-    number = 1
-    while (folder := database.parent / "damaged" / str(number)).exists():
-        number += 1
-    atomic_io.make_folder(folder)
-    for suffix in (*LOG_SUFFIXES, ""):  # the database last: a kill in between leaves one that is still examined
-        present = database.with_name(database.name + suffix)
-        if present.exists():
-            atomic_io.replace_durably(present, folder / present.name)
-    return folder
+    return move_to_numbered_folder(database, database.parent / "damaged", "")
 
 
 class Recovery:
@@ -320,6 +310,6 @@ def rebuild_database(folder: Path) -> Path:
     """
     if not RecordFiles(folder).exist():
         raise StoreDamaged(f"{folder} has no files of its visits", "Start this release once with the present database.")
-    refuse_in_use(folder / "shelf.sqlite")
+    refuse_in_use(folder / schema.DATABASE)
     with atomic_io.file_lock(folder / ".lock"):
-        return set_aside(folder / "shelf.sqlite")
+        return set_aside(folder / schema.DATABASE)

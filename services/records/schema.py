@@ -37,6 +37,7 @@ from device.errors import SettingError
 from services.records.capture import Capture
 from services.records.capture_report import report_as_json
 
+DATABASE = "shelf.sqlite"  # as the first release named it
 MIGRATIONS = Path(__file__).parent / "migrations"
 
 # WAL with FULL is the fastest pair that lost no acknowledged row in power-cut trials; NORMAL lost the last ones.

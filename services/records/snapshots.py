@@ -65,7 +65,7 @@ class Snapshots:
 
         Errors: RecordNotFound (unknown name), StoreDamaged (the snapshot fails the integrity check), StoreError
         (another process uses the database), OSError. After a power cut during the replacement the store may refuse to
-        open; a second restoration repairs it.
+        open, or rebuild its tables from the files of the records; a second restoration repairs it.
         """
         if name not in self.names():
             raise RecordNotFound(f"there is no snapshot {name!r}", "`diffuscope snapshots list` names them.")
@@ -76,14 +76,7 @@ class Snapshots:
         _carry_dose(self.database, new)
         atomic_io.fsync_file(new)
         atomic_io.fsync_folder(self.database.parent)
-        replaced = self._new_replaced_folder()
-        for present in (
-            self.database,
-            *(self.database.with_name(f"{self.database.name}-{log}") for log in LOG_SUFFIXES),
-        ):
-            if present.exists():
-                # The database first: the store refuses to open without it.
-                atomic_io.replace_durably(present, replaced / present.name)
+        replaced = move_to_numbered_folder(self.database, self.folder, "replaced-")
         atomic_io.replace_durably(new, self.database)
         return replaced
 
@@ -92,14 +85,6 @@ class Snapshots:
         with _connected(self.folder / name) as tables:
             known = {id for (id,) in tables.execute("SELECT id FROM captures")}
         return sorted(path.name for path in captures.glob("[!.]*") if path.name not in known)
-
-    def _new_replaced_folder(self) -> Path:
-        """Create and return the next free folder `replaced-<n>`."""
-        number = 1
-        while (self.folder / f"replaced-{number}").exists():
-            number += 1
-        atomic_io.make_folder(self.folder / f"replaced-{number}")
-        return self.folder / f"replaced-{number}"
 
     def _refuse_without_room(self, size_bytes: int) -> None:
         """Raise StoreFull if less space than 2 `size_bytes` + MARGIN_BYTES is free, for the copy and the migration.
@@ -120,6 +105,23 @@ class Snapshots:
         for name in self.names():
             if name not in kept:
                 (self.folder / name).unlink()
+
+
+def move_to_numbered_folder(database: Path, parent: Path, prefix: str) -> Path:
+    """Move a database with its logs to the first free of the folders `<parent>/<prefix><n>`; return it.
+
+    The database is moved first: what remains after a kill or a power cut is no database with another's log. OSError if
+    the disk refuses.
+    """
+    number = 1
+    while (folder := parent / f"{prefix}{number}").exists():
+        number += 1
+    atomic_io.make_folder(folder)
+    for suffix in ("", *(f"-{log}" for log in LOG_SUFFIXES)):
+        present = database.with_name(database.name + suffix)
+        if present.exists():
+            atomic_io.replace_durably(present, folder / present.name)
+    return folder
 
 
 @contextmanager

@@ -60,7 +60,7 @@ def check_store(folder: Path, progress: Progress) -> list[Checked]:
 
 
 def _checked_database(folder: Path) -> Checked:
-    result, damage = Checked("database"), damage_of(folder / "shelf.sqlite")
+    result, damage = Checked("database"), damage_of(folder / schema.DATABASE)
     if damage is None:
         result.whole = 1
     elif RecordFiles(folder).exist():
@@ -107,7 +107,7 @@ def _checked_records(
 
 def _records_in_rows(folder: Path, kind: Kind) -> Iterator[tuple[str, RecordDocument | None]]:
     """Yield the id of each record that has rows, and its document; None if the rows are damaged."""
-    engine = schema.open_engine(folder / "shelf.sqlite")
+    engine = schema.open_engine(folder / schema.DATABASE)
     try:
         with Session(engine) as session:
             keys = row_validation.readable_keys(session.scalars(select(schema.RECORD_KEYS[kind])))
