@@ -13,7 +13,8 @@ DAMM = (
     "3674209581", "5869720134", "8945362017", "9438617205", "2581436790",
 )  # fmt: skip
 MIN_DIGITS = 4
-_NUMBER = re.compile(r"[A-Z0-9][A-Z0-9-]{0,19}")
+MAX_LENGTH = 20
+_NUMBER = re.compile(rf"[A-Z0-9][A-Z0-9-]{{0,{MAX_LENGTH - 1}}}")
 
 
 def check_digit(digits: str) -> str:
@@ -55,6 +56,11 @@ def join_check_digit(number: str) -> str:
     """
     apart = re.fullmatch(rf"([A-Z]+)([0-9]{{{MIN_DIGITS},}})-([0-9])", number, re.ASCII)
     return "".join(apart.groups()) if apart and check_digit(apart[2] + apart[3]) == "0" else number
+
+
+def with_ending(number: str, ending: str) -> str:
+    """Return a number with an ending, cut before it so that the result has at most MAX_LENGTH characters."""
+    return number[: MAX_LENGTH - len(ending)] + ending
 
 
 def normalise(number: str) -> str:

@@ -7,16 +7,16 @@ visit are not in its record: each capture's own record names visit and slot.
 import base64
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import Row, delete, select
 from sqlalchemy.dialects.sqlite import insert
 from sqlalchemy.orm import Session
 
 from device.values import EYES
-from services.records import row_validation
+from services.records import numbering, row_validation
 from services.records.capture_report import read_report
 from services.records.json_values import JsonObject, JsonValue
 from services.records.record_document import Kind, as_object, whole_number
@@ -34,8 +34,10 @@ from services.records.schema import (
 )
 
 CAPTURE_VALUES = ("eye", "taken_at", "simulated", "calibration_id", "report", "request")
+MOST_OF_ONE_NUMBER = 99  # patients that got the same number from several releases
 IDENTITY_VERSION = 1  # version of the encoding of the identifying fields
 Content = dict[str, JsonValue]
+R = TypeVar("R", PatientRow, VisitRow)
 FileEntry = tuple[Any, Any, Any]  # name, SHA-256 and length of a file, as the row has them
 
 
@@ -71,7 +73,7 @@ def patient_contents(session: Session, rows: Sequence[PatientRow]) -> dict[str, 
         identity: Content = {"version": IDENTITY_VERSION, "blob": blob}
         return {"id": row.patient_id, "number": row.number, "made_at": row.made_at, "identity": identity}
 
-    return {row.number: _or_error(lambda row=row: content(row)) for row in rows}
+    return {row.number: _or_error(content, row) for row in rows}
 
 
 def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Content | ValueError]:
@@ -98,7 +100,7 @@ def visit_contents(session: Session, rows: Sequence[VisitRow]) -> dict[str, Cont
             "uploads": {at: _upload_content(upload) for at, upload in uploads[row.id]},
         }  # fmt: skip
 
-    return {row.id: _or_error(lambda row=row: content(row)) for row in rows}
+    return {row.id: _or_error(content, row) for row in rows}
 
 
 def restore_patient(session: Session, content: JsonObject) -> bool:
@@ -126,9 +128,11 @@ def _free_number(session: Session, number: str, patient_id: str | None) -> str:
     known = session.scalar(select(PatientRow.number).where(PatientRow.patient_id == patient_id))
     if known is not None:
         return known
-    taken = set(session.scalars(select(PatientRow.number).where(PatientRow.number.startswith(number))))
-    candidates = (number, *(f"{number}-{count}" for count in range(2, len(taken) + 3)))
-    return next(one for one in candidates if one not in taken)
+    candidates = (number, *(numbering.with_ending(number, f"-{count}") for count in range(2, MOST_OF_ONE_NUMBER + 1)))
+    for candidate in candidates:
+        if session.get(PatientRow, candidate) is None:
+            return candidate
+    raise ValueError(f"{MOST_OF_ONE_NUMBER} patients have the number {number!r:.60}")
 
 
 def restore_visit(session: Session, content: JsonObject) -> bool:
@@ -302,7 +306,7 @@ def _moment(value: object) -> str:
     return row_validation.text(value)
 
 
-def _grouped(rows: Any) -> dict[str, list[tuple[str, Any]]]:
+def _grouped(rows: Iterable[tuple[str, str, Any]]) -> dict[str, list[tuple[str, Any]]]:
     """Return (name, value) pairs by record from (record, name, value) triples."""
     out: dict[str, list[tuple[str, Any]]] = defaultdict(list)
     for record, name, value in rows:
@@ -310,9 +314,8 @@ def _grouped(rows: Any) -> dict[str, list[tuple[str, Any]]]:
     return out
 
 
-def _or_error(read: Any) -> Content | ValueError:
+def _or_error(read: Callable[[R], Content], row: R) -> Content | ValueError:
     try:
-        content: Content = read()
+        return read(row)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         return ValueError(str(error))
-    return content
