@@ -16,7 +16,8 @@ DiffuscopeError
 │   ├── LightFault               the lamp does not execute its commands
 │   ├── LightLimit               light refused by the light guard
 │   │   ├── LightCut             light ended by the guard during an exposure
-│   │   └── DailyLightLimit      daily light limit of an eye reached
+│   │   ├── DailyLightLimit      daily light limit of an eye reached
+│   │   └── LightWithoutVisit    limit of light without a visit reached
 │   ├── BusFault                 no answer from a chip on the I2C bus
 │   │   └── MemoryDamaged        incomplete identity in the head's memory
 │   ├── HeadMismatch             another head or calibration in the head's memory
@@ -153,6 +154,13 @@ class DailyLightLimit(LightLimit):
 
     code = "light.day"
     default_remedy = "This eye has had today's full light. Do not take more pictures of it."
+
+
+class LightWithoutVisit(LightLimit):
+    """The limit of light without a visit is reached for an eye; a visit may still give light."""
+
+    code = "light.visit"
+    default_remedy = "Begin a visit for this patient: without one an eye may have only a part of a day's light."
 
 
 class BusFault(HardwareError):

@@ -144,6 +144,10 @@ const eventHandlers = {
   },
 };
 
+// The age on the live picture already shows a cut light; the next frame follows. And `light.visit` refuses light
+// without a visit only, while every picture of this page has one.
+const UNSHOWN_PROBLEMS = ["light.cut", "light.visit"];
+
 let interruptedShown = false;
 
 let noticeCount = 0;
@@ -160,8 +164,7 @@ async function refreshStatus() {
   const { problem } = status;
   set({ status: Object.freeze(status), activity: status.state });
   lowerAlerts(({ from, problemCode }) => from === "status" && problemCode !== problem?.code);
-  // The age on the live picture already shows a cut light; the next frame follows.
-  if (problem && problem.code !== "light.cut") raiseAlert({ ...problem, problemCode: problem.code, from: "status" });
+  if (problem && !UNSHOWN_PROBLEMS.includes(problem.code)) raiseAlert({ ...problem, problemCode: problem.code, from: "status" });
   if (noticeCount === before) syncNotices(status.standing ?? []); // otherwise `status.standing` is older than the latest notice event
   resolveCutShots();
   raiseFindings(status.notices ?? []);

@@ -12,7 +12,7 @@ from threading import Timer
 from types import TracebackType
 
 from device.clock import Clock
-from device.errors import LightCut, LightLimit, StoreError
+from device.errors import LightCut, LightLimit, LightWithoutVisit, StoreError
 from device.light_safety.dose_ledger import Ledger, Reserved
 from device.light_safety.dose_report import DoseReport
 from device.light_safety.hazard import Hazard
@@ -54,13 +54,14 @@ class GuardedLight:
             return None
         return self._light.illumination
 
-    def on(self, glow: Illumination, eyes: Sequence[Eye] = EYES) -> LightContext:
+    def on(self, glow: Illumination, eyes: Sequence[Eye] = EYES, *, in_visit: bool = False) -> LightContext:
         """Return a context with the lamp on from entry to exit; its dose counts for `eyes`.
 
-        By default for both: it may be unknown which eye is in front of the head. Errors on entry, with the lamp off:
-        LightLimit (already on, darkness due, or a limit of irradiance or dose), StoreError of the ledger, LightFault.
+        By default for both: it may be unknown which eye is in front of the head. Light that belongs to no visit
+        (`in_visit` False) has a lower limit of dose. Errors on entry, with the lamp off: LightLimit (already on,
+        darkness due, or a limit of irradiance or dose), StoreError of the ledger, LightFault.
         """
-        return _Holding(self, glow, eyes)
+        return _Holding(self, glow, eyes, in_visit)
 
     def dose_report(self) -> DoseReport:
         """Return the light figures of a report, J/cm2: last dose, dose by eye in 24 h, limit, eyes above warning."""
@@ -73,7 +74,7 @@ class GuardedLight:
             dose_high=tuple(eye for eye, spent in eyes.items() if spent > limits.warn_j_per_cm2),
         )
 
-    def turn_on(self, glow: Illumination, eyes: Sequence[Eye]) -> None:
+    def turn_on(self, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
         """Turn the lamp on and start its timer; LightLimit if it is on, darkness is due or a limit is exceeded."""
         now_s = self._clock.now_s()
         if self._held is not None:
@@ -83,7 +84,7 @@ class GuardedLight:
             wait_s = max(1, ceil(self._debt_s - self.max_on_s))
             message = f"{self._debt_s:.1f} s of light have not yet been followed by darkness"
             raise LightLimit(message, f"Wait {wait_s} s, then press again.", wait_s=wait_s)
-        self._reserve(glow, eyes)
+        self._reserve(glow, eyes, in_visit)
         self._glow, self._lit_at_s, self._cut_at_s, self._late = glow, self._clock.now_s(), None, False
         self._held = self._light.on(glow)
         self._timer = Timer(self.max_on_s, self.cut)
@@ -93,11 +94,22 @@ class GuardedLight:
         if self._late:  # the timer fired before the lamp was on: nothing else would end the light
             raise LightCut(f"the lamp took longer to light up than the {self.max_on_s:g} s it may shine")
 
-    def _reserve(self, glow: Illumination, eyes: Sequence[Eye]) -> None:
-        """Reserve the largest dose of this stretch, before the lamp is on; LightLimit if it is not permitted."""
+    def _reserve(self, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
+        """Reserve the largest dose of this stretch, before the lamp is on; LightLimit if it is not permitted.
+
+        LightWithoutVisit if the dose would be permitted in a visit.
+        """
         self.hazard.refuse(glow)
         most_j_per_cm2 = self.hazard.dose_j_per_cm2(glow, self.max_on_s + AFTERGLOW_S)
-        self._reserved = self.ledger.reserve(eyes, most_j_per_cm2, self.hazard.limits.stop_j_per_cm2)
+        limits = self.hazard.limits
+        stop_j_per_cm2 = limits.stop_j_per_cm2 if in_visit else limits.stop_without_visit_j_per_cm2
+        try:
+            self._reserved = self.ledger.reserve(eyes, most_j_per_cm2, stop_j_per_cm2)
+        except LightLimit as error:
+            total_j_per_cm2 = most_j_per_cm2 + max(self.ledger.spent_j_per_cm2(eye) for eye in eyes)
+            if in_visit or total_j_per_cm2 > limits.stop_j_per_cm2:
+                raise
+            raise LightWithoutVisit(f"without a visit: {error.message}", n=error.n) from error
 
     def cut(self) -> None:
         """Turn the lamp off at the end of the permitted time; called by the timer."""
@@ -127,12 +139,12 @@ class GuardedLight:
 class _Holding:
     """Context of one stretch: the lamp is on from entry to exit, and off after an error on entry."""
 
-    def __init__(self, light: GuardedLight, glow: Illumination, eyes: Sequence[Eye]) -> None:
-        self._light, self._glow, self._eyes = light, glow, eyes
+    def __init__(self, light: GuardedLight, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:
+        self._light, self._glow, self._eyes, self._in_visit = light, glow, eyes, in_visit
 
     def __enter__(self) -> "_Holding":
         try:
-            self._light.turn_on(self._glow, self._eyes)
+            self._light.turn_on(self._glow, self._eyes, self._in_visit)
         except BaseException:
             self._light.off()
             raise

@@ -42,8 +42,15 @@ class _Watts(_Rate):
 
 class _Dose(_Rate):
     unit: Literal["J/cm2"]
+    share_without_visit: float = Field(gt=0, le=1)
     warn_share: float = Field(gt=0, le=1)
     window_h: float = Field(ge=24)
+
+    @model_validator(mode="after")
+    def _leaves_a_visit_its_dose(self) -> "_Dose":
+        if self.share_without_visit >= self.share:
+            raise ValueError("share_without_visit must be below share")
+        return self
 
 
 class Weight(_Source):
@@ -96,6 +103,11 @@ class Limits(Table):
     def stop_j_per_cm2(self) -> float:
         """Return the largest permitted A-weighted retinal dose of an eye within `window_s`, J/cm2."""
         return self.photochemical_dose.limit * self.photochemical_dose.share
+
+    @property
+    def stop_without_visit_j_per_cm2(self) -> float:
+        """Return the dose of an eye within `window_s`, J/cm2, that light without a visit may not exceed."""
+        return self.photochemical_dose.limit * self.photochemical_dose.share_without_visit
 
     @property
     def warn_j_per_cm2(self) -> float:

@@ -38,10 +38,14 @@ class Preview:
 
 @dataclass(frozen=True)
 class LiveRequest:
-    """Request for live pictures: the eyes that the dose counts for; `permit` raises RequestRefused without consent."""
+    """Request for live pictures: the eyes that the dose counts for, and the id of the visit, None without one.
+
+    `permit` raises RequestRefused without consent.
+    """
 
     eyes: tuple[Eye, ...] = EYES
     permit: Permit = permit_test_picture
+    visit: str | None = None
 
 
 NO_VISIT = LiveRequest()

@@ -120,10 +120,10 @@ class CapturePipeline:
         self.reconstructor, self.live = reconstructor, live
         self._head, self._clock, self._feedback = head, clock, feedback
 
-    def expose(self, eye: Eye) -> Exposure:
-        """Return a lit and a dark frame of an eye; the errors are those of the module function `expose`, below."""
+    def expose(self, eye: Eye, *, in_visit: bool = False) -> Exposure:
+        """Return a lit and a dark frame of an eye, as the module function `expose`, below, with its errors."""
         begin_s = self._clock.now_s()
-        lit, dark = expose(self._head, (eye,))
+        lit, dark = expose(self._head, (eye,), in_visit=in_visit)
         return Exposure(lit, dark, begin_s, self._clock.now_s() - begin_s)
 
     def assess(self, exposure: Exposure) -> Verdict:
@@ -162,9 +162,9 @@ class CapturePipeline:
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
         return CaptureRecord(capture, shot.frame, shot.dark, shown, self._head.spec.name)
 
-    def expose_live(self, eyes: tuple[Eye, ...]) -> LiveFrame:
-        """Return a frame in aiming light, whose dose counts for `eyes`."""
-        return LiveFrame(*expose_live(self._head, eyes, self._clock))
+    def expose_live(self, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> LiveFrame:
+        """Return a frame in aiming light, whose dose counts for `eyes`; without a visit a lower limit applies."""
+        return LiveFrame(*expose_live(self._head, eyes, self._clock, in_visit=in_visit))
 
     def live_picture(self, seen: LiveFrame) -> tuple[bytes, Aim]:
         """Return the live picture (JPEG) of a frame, and its aiming hint."""
@@ -201,8 +201,8 @@ def _best_psf(head: Head, calibration: Calibration, planner: Planner) -> int:
     return most_likely_psf(calibration, frame.counts, planner)[0]
 
 
-def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
-    """Return a lit and a dark frame; the dose counts for `eyes`.
+def expose(head: Head, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> tuple[Frame, Frame]:
+    """Return a lit and a dark frame; the dose counts for `eyes`, without a visit up to a lower limit.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
@@ -212,23 +212,25 @@ def expose(head: Head, eyes: tuple[Eye, ...]) -> tuple[Frame, Frame]:
     announce_eye(head, eyes)
     head.camera.prepare(shot)
     try:
-        with head.light.on(Illumination(head.spec.light.colour), eyes):
+        with head.light.on(Illumination(head.spec.light.colour), eyes, in_visit=in_visit):
             frame = require_lit(head.camera.expose(shot))
         return frame, head.camera.expose(shot)
     finally:
         head.light.off()
 
 
-def expose_live(head: Head, eyes: tuple[Eye, ...], clock: Clock) -> tuple[Frame, float, float]:
+def expose_live(
+    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False
+) -> tuple[Frame, float, float]:
     """Return a frame in aiming light, its time of exposure and the time at which the lamp was off (clock seconds).
 
-    The dose counts for `eyes`. The lamp is off at every exit.
+    The dose counts for `eyes`, without a visit up to a lower limit. The lamp is off at every exit.
     """
     shot = ExposureSettings(head.spec.camera.preview_exposure_s)
     announce_eye(head, eyes)
     head.camera.prepare(shot)
     try:
-        with head.light.on(Illumination(head.spec.light.preview_colour), eyes):
+        with head.light.on(Illumination(head.spec.light.preview_colour), eyes, in_visit=in_visit):
             exposed_s = clock.now_s()
             frame = require_lit(head.camera.expose(shot))
     finally:

@@ -112,7 +112,7 @@ class ExamLoop:
         press.target.permit()  # again: the consent may have been withdrawn while the press waited
         self._parts.capture_journal.begin(press.journal_entry(id), press.key)
         self._events.stage(press, id, "expose")
-        exposure = self._pipeline.expose(press.eye)
+        exposure = self._pipeline.expose(press.eye, in_visit=press.target.visit is not None)
         verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
         light = self._parts.head.light.dose_report()

@@ -48,7 +48,7 @@ class LivePictures:
         except RequestRefused:  # the consent was withdrawn after the request
             self._requests.withdraw(wanted)
             return None
-        seen = self._pipeline.expose_live(wanted.eyes)
+        seen = self._pipeline.expose_live(wanted.eyes, in_visit=wanted.visit is not None)
         if self._requests.snapshot.state.has_press:
             return None
         jpeg, aim = self._pipeline.live_picture(seen)

@@ -34,6 +34,7 @@ STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
 )
 SIGNING, RECOVERY = "services/records/record_signing.py", "services/records/recovery.py"
 T_LOG, T_RECOVERY = "tests/unit/test_dose_ledger_log.py", "tests/unit/test_recovery.py"
+T_LIGHT = "tests/journey/test_light_requests.py"
 T_GUARD, T_BOOK, T_DOSES = (
     "tests/unit/test_guard.py", "tests/unit/test_dose_ledger_tables.py", "tests/property/test_guard_dose_limit.py",
 )  # fmt: skip
@@ -82,6 +83,12 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(GUARD, "self.max_on_s + AFTERGLOW_S)", "self.max_on_s)", T_BOOK),
     Mutant(GUARD, "self.ledger.settle(reserved, self.given_j_per_cm2)", "pass", T_BOOK),
     Mutant(GUARD, "        self.hazard.refuse(glow)\n", "", T_GUARD),
+    Mutant(GUARD, "limits.stop_j_per_cm2 if in_visit else", "limits.stop_j_per_cm2 if True else", T_GUARD),
+    Mutant(GUARD, "if in_visit or total_j_per_cm2 > limits.stop_j_per_cm2:", "if in_visit:", T_GUARD),
+    Mutant(LOOP, "in_visit=press.target.visit is not None", "in_visit=True", T_LIGHT),
+    Mutant(LIVE, "in_visit=wanted.visit is not None", "in_visit=True", T_LIGHT),
+    Mutant(LOOP, "in_visit=press.target.visit is not None", "in_visit=False", T_LIGHT),
+    Mutant(LIVE, "in_visit=wanted.visit is not None", "in_visit=False", T_LIGHT),
     # Dose ledger
     Mutant(LEDGER, "if boot == self.boot:", "if True:", T_BOOK),
     Mutant(LEDGER, "self.left_s(key[1], window_s) <= 0]", "self.left_s(key[1], window_s) <= 2 * SLOT_S]", T_BOOK),
@@ -189,8 +196,8 @@ MUTANTS: tuple[Mutant, ...] = (
         "    shot = ExposureSettings(head.spec.camera.exposure_s)", scenario("head_lost"),
     ),
     Mutant(
-        PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes)",
-        "head.light.on(Illumination(head.spec.light.colour), eyes)", scenario("press_while_aiming"),
+        PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes",
+        "head.light.on(Illumination(head.spec.light.colour), eyes", scenario("press_while_aiming"),
     ),
 )  # fmt: skip
 

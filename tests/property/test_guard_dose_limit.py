@@ -28,12 +28,14 @@ MAX_ON_S, DAY_S = 30.0, 86400.0
 # Bright enough that a few exposures reach the limit; a weight of 1, so that the model needs no table.
 TRUE_W_PER_CM2 = {"red": 20e-6, "green": 100e-6, "blue": 219e-6}
 BEAMS = {"red": Beam(0.440, 20e-6, 1e-6), "green": Beam(0.440, 100e-6, 1e-6), "blue": Beam(0.440, 219e-6, 1e-6)}
-STOP_J_PER_CM2 = 0.02
+STOP_J_PER_CM2, STOP_WITHOUT_VISIT_J_PER_CM2 = 0.02, 0.012
 LIMITS = light_limits()
-SHARE = STOP_J_PER_CM2 / LIMITS.photochemical_dose.limit
-SMALL = LIMITS.model_copy(
-    update={"photochemical_dose": LIMITS.photochemical_dose.model_copy(update={"share": SHARE})}
-)  # a limit that a test can reach
+DOSE = LIMITS.photochemical_dose
+SHARES = {
+    "share": STOP_J_PER_CM2 / DOSE.limit,
+    "share_without_visit": STOP_WITHOUT_VISIT_J_PER_CM2 / DOSE.limit,
+}
+SMALL = LIMITS.model_copy(update={"photochemical_dose": DOSE.model_copy(update=SHARES)})  # limits that a test can reach
 
 
 @dataclass
@@ -114,7 +116,9 @@ class Eyes(RuleBasedStateMachine):
         self.times, self.lamp, self.disk, self.boots = Times(), Lamp(), Disk(), 0
         self.cleanup = ExitStack()
         self.received: dict[Eye, list[tuple[float, float, float]]] = {eye: [] for eye in EYES}  # from, to, J/cm2
+        self.ends_without_visit_s: dict[Eye, list[float]] = {eye: [] for eye in EYES}
         self.exposed_eyes: tuple[Eye, ...] = ()
+        self.in_visit = False
         self.open_context: Any = None
         self.lit_s = 0.0
         self.start()
@@ -136,6 +140,8 @@ class Eyes(RuleBasedStateMachine):
             dose = self.lamp.glow.level * TRUE_W_PER_CM2[self.lamp.glow.colour] * duration_s
             for eye in self.exposed_eyes:
                 self.received[eye].append((self.times.true_s, self.times.true_s + duration_s, dose))
+                if not self.in_visit:
+                    self.ends_without_visit_s[eye].append(self.times.true_s + duration_s)
         self.times.sleep(duration_s)
 
     @contextmanager
@@ -150,11 +156,12 @@ class Eyes(RuleBasedStateMachine):
         colour=st.sampled_from(sorted(BEAMS)),
         level=st.floats(0.01, 1),
         eyes=st.sampled_from([("OD",), ("OS",), ("OD", "OS")]),
+        in_visit=st.booleans(),
     )
-    def switch_on(self, colour: Any, level: float, eyes: tuple[Eye, ...]) -> None:
-        context = self.guarded.on(Illumination(colour, level), eyes)
+    def switch_on(self, colour: Any, level: float, eyes: tuple[Eye, ...], in_visit: bool) -> None:
+        context = self.guarded.on(Illumination(colour, level), eyes, in_visit=in_visit)
         assert self.lamp.glow is None
-        self.exposed_eyes, self.lit_s = eyes, 0.0
+        self.exposed_eyes, self.in_visit, self.lit_s = eyes, in_visit, 0.0
         with self.lamp_is_off_after_a_refusal():
             context.__enter__()
             assert not self.disk.full, "light without a record"
@@ -191,13 +198,13 @@ class Eyes(RuleBasedStateMachine):
 
     @rule(
         colour=st.sampled_from(sorted(BEAMS)), eye=st.sampled_from(EYES), pairs=st.integers(1, 12),
-        rest_s=st.floats(30, 90),
+        rest_s=st.floats(30, 90), in_visit=st.booleans(),
     )  # fmt: skip
-    def expose_repeatedly(self, colour: Any, eye: Eye, pairs: int, rest_s: float) -> None:
+    def expose_repeatedly(self, colour: Any, eye: Eye, pairs: int, rest_s: float, in_visit: bool) -> None:
         """Repeat exposures of the longest duration."""
         for _ in range(pairs):
             if self.open_context is None:
-                self.switch_on(colour, 1.0, (eye,))
+                self.switch_on(colour, 1.0, (eye,), in_visit)
             if self.open_context is not None:
                 self.keep_on(0.99 * MAX_ON_S)
                 self.switch_off()
@@ -242,8 +249,18 @@ class Eyes(RuleBasedStateMachine):
     def no_eye_exceeds_the_dose_limit_in_any_day(self) -> None:
         for eye, received in self.received.items():
             for _, end_s, _ in received[-40:]:  # the dose of a window is largest if it ends with an exposure
-                day = [dose for begin_s, over_s, dose in received if over_s > end_s - DAY_S and begin_s < end_s]
-                assert sum(day) <= STOP_J_PER_CM2 * (1 + 1e-9), eye
+                assert self.received_before_j_per_cm2(eye, end_s) <= STOP_J_PER_CM2 * (1 + 1e-9), eye
+
+    @invariant()
+    def no_light_without_a_visit_exceeds_its_lower_limit(self) -> None:
+        for eye, ends_s in self.ends_without_visit_s.items():
+            for end_s in ends_s[-40:]:
+                assert self.received_before_j_per_cm2(eye, end_s) <= STOP_WITHOUT_VISIT_J_PER_CM2 * (1 + 1e-9), eye
+
+    def received_before_j_per_cm2(self, eye: Eye, end_s: float) -> float:
+        """Return the true dose of the day that ends at `end_s`."""
+        received = self.received[eye]
+        return sum(dose for begin_s, over_s, dose in received if over_s > end_s - DAY_S and begin_s < end_s)
 
     @invariant()
     def the_ledger_is_at_least_the_true_dose(self) -> None:

@@ -153,7 +153,7 @@ def test_at_the_limit_the_lamp_stays_dark_for_that_eye_only(store: CaptureStore,
     guarded = guard(lamp, clock, ledger, 219e-6)
 
     def expose() -> None:
-        with guarded.on(GREEN, ("OD",)):
+        with guarded.on(GREEN, ("OD",), in_visit=True):
             clock.sleep(9.9)
         clock.sleep(10)
 

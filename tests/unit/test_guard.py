@@ -6,7 +6,7 @@ from types import TracebackType
 import pytest
 
 from device.clock import Clock, SystemClock, VirtualClock
-from device.errors import LightFault, LightLimit
+from device.errors import DailyLightLimit, LightFault, LightLimit, LightWithoutVisit
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits, radiometry
@@ -219,3 +219,28 @@ def test_light_above_the_irradiance_limit_is_refused_and_not_counted(lamp: Lamp,
     assert guarded.ledger.spent_j_per_cm2("OD") == 0.0
     with guarded.on(Illumination("green", 0.2)):
         assert lamp.illumination == Illumination("green", 0.2)
+
+
+def test_light_without_a_visit_has_a_lower_limit(guarded: GuardedLight, lamp: Lamp, clock: VirtualClock) -> None:
+    """Light without a visit leaves at least half of a day's dose to a visit."""
+    limits = light_limits()
+    lower, stop = limits.stop_without_visit_j_per_cm2, limits.stop_j_per_cm2
+    guarded.ledger.reserve(("OD",), lower, stop)
+    with pytest.raises(LightWithoutVisit, match="without a visit: the right eye") as refused, guarded.on(GREEN):
+        pytest.fail("light without a visit")
+    assert (lamp.illumination, guarded.ledger.spent_j_per_cm2("OD")) == (None, lower)
+    assert "Begin a visit" in refused.value.remedy
+    assert refused.value.n is not None
+    with guarded.on(GREEN, ("OS",)):
+        assert lamp.illumination == GREEN
+    clock.sleep(10.0)
+    with guarded.on(GREEN, ("OD",), in_visit=True):
+        assert lamp.illumination == GREEN
+
+
+def test_beyond_the_limit_of_the_day_no_visit_is_asked_for(guarded: GuardedLight) -> None:
+    stop_j_per_cm2 = light_limits().stop_j_per_cm2
+    guarded.ledger.reserve(("OD",), stop_j_per_cm2, stop_j_per_cm2)
+    for in_visit in (False, True):
+        with pytest.raises(DailyLightLimit), guarded.on(GREEN, ("OD",), in_visit=in_visit):
+            pytest.fail("it shone")

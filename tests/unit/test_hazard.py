@@ -23,6 +23,7 @@ def test_limits_are_the_chosen_shares_of_group_1() -> None:
     assert limits.photochemical_w_per_cm2 == pytest.approx(220e-6)
     assert limits.photochemical_dose.limit == pytest.approx(limits.photochemical_w_per_cm2 * 7200)  # two hours of it
     assert limits.stop_j_per_cm2 == pytest.approx(0.1584)
+    assert limits.stop_without_visit_j_per_cm2 == pytest.approx(0.0792)
     assert limits.warn_j_per_cm2 == pytest.approx(0.0792)
     assert limits.thermal_w_per_cm2 == pytest.approx(0.07)
     assert limits.waist_w_per_cm2 == pytest.approx(0.4)
@@ -104,7 +105,7 @@ def test_a_measured_colour_has_its_guard_factor_and_others_the_worst_case() -> N
     ("original", "replacement"),
     [("limit = 220.0", ""), ("limit = 220.0", "limit = -1"), ("uW/cm2", "mW/cm2"), ("\nchecked = false", ""),
      ("share = 0.10", "share = 10"), ("[thermal_irradiance]", "[thermal"), ("1.43, ", ""),
-     ("window_h = 24.0", "window_h = 2"),
+     ("window_h = 24.0", "window_h = 2"), ("share_without_visit = 0.05", "share_without_visit = 0.10"),
      ("[waist_irradiance]", "[waste_irradiance]")],
 )  # fmt: skip
 def test_a_damaged_limits_file_raises_spec_error(tmp_path: Path, original: str, replacement: str) -> None:

@@ -1,0 +1,76 @@
+"""Requests of light: counted for the named eye, and limited without a visit."""
+
+import pytest
+
+from device.light_safety.guard import GuardedLight
+from device.values import Eye
+from tests.journey.asking import post_capture, status_problem, visit_with_consent
+from tests.journey.conftest import MakeRig, Rig
+from tests.journey.faults import wait_until_idle
+
+OTHER_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
+SLOTS: dict[Eye, str] = {"OD": "R-centre", "OS": "L-centre"}
+
+
+def light_of(rig: Rig) -> GuardedLight:
+    light = rig.exam.head.light
+    assert isinstance(light, GuardedLight)
+    return light
+
+
+def doses_j_per_cm2(rig: Rig) -> dict[Eye, float]:
+    wait_until_idle(rig)  # a live picture may have a reservation
+    return {eye: light_of(rig).ledger.spent_j_per_cm2(eye) for eye in ("OD", "OS")}
+
+
+def live_status(rig: Rig, query: str = "") -> int:
+    """Return the status of a request of a live picture, repeated while none comes in time on a busy computer."""
+    for _ in range(20):
+        status = rig.request("GET", f"/api/preview?after=0{query}").status_code
+        if status != 204:
+            return status
+    return 204
+
+
+def spend_share_without_visit(rig: Rig, eye: Eye) -> None:
+    """Charge an eye with the whole dose that light without a visit may give."""
+    limits, ledger = light_of(rig).hazard.limits, light_of(rig).ledger
+    rest_j_per_cm2 = limits.stop_without_visit_j_per_cm2 - ledger.spent_j_per_cm2(eye)
+    ledger.reserve((eye,), rest_j_per_cm2, limits.stop_j_per_cm2)
+
+
+def slot_of(rig: Rig, eye: Eye, in_visit: bool) -> dict[str, str]:
+    """Return visit and slot of a press, empty for a test picture."""
+    return {"visit": visit_with_consent(rig)["id"], "slot": SLOTS[eye]} if in_visit else {}
+
+
+@pytest.mark.parametrize("in_visit", [False, True])
+@pytest.mark.parametrize("eye", ["OD", "OS"])
+def test_all_light_is_counted_for_the_named_eye(make_rig: MakeRig, eye: Eye, in_visit: bool) -> None:
+    rig = make_rig()
+    slot = slot_of(rig, eye, in_visit)
+    visit = f"&visit={slot['visit']}" if in_visit else ""
+    doses = [doses_j_per_cm2(rig)]
+    assert post_capture(rig, eye, **slot).way == "verdict"
+    doses.append(doses_j_per_cm2(rig))
+    assert live_status(rig, f"&eye={eye}{visit}") == 200
+    doses.append(doses_j_per_cm2(rig))
+    assert doses[0][eye] < doses[1][eye] < doses[2][eye]
+    assert len({one[OTHER_EYE[eye]] for one in doses}) == 1
+
+
+def test_light_without_a_visit_ends_while_a_visit_gets_light(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    slot = slot_of(rig, "OD", True)
+    wait_until_idle(rig)
+    spend_share_without_visit(rig, "OD")
+    frames = rig.world.frames
+    refused = post_capture(rig)
+    assert (refused.way, refused.code) == ("423", "light.visit")
+    assert "Begin a visit" in refused.remedy
+    assert status_problem(rig).code == "light.visit"
+    assert rig.request("GET", "/api/preview?after=0&eye=OD").status_code == 204
+    assert (rig.world.frames, rig.world.illumination) == (frames, None)
+    assert post_capture(rig, "OS").way == "verdict", "the other eye has its own limit"
+    assert post_capture(rig, "OD", **slot).way == "verdict"
+    assert live_status(rig, f"&eye=OD&visit={slot['visit']}") == 200
