@@ -4,7 +4,9 @@ The probe does not use the unit state: systemd calls a release "running" even if
 """
 
 import json
+import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import version
 
@@ -41,10 +43,13 @@ def http_get(base_url: str, path: str, timeout_s: float = TIMEOUT_S) -> tuple[in
     httpx.HTTPError without an answer, and for an error status (400 or above). Each wait for the network takes at most
     `timeout_s` seconds.
     """
-    headers = {"X-Controller": "health"}  # required for a request that lights the lamp
-    with httpx.Client(timeout=timeout_s, trust_env=False) as client:  # this device: no proxy
-        answer = client.get(base_url + path, headers=headers).raise_for_status()
+    with _client(base_url, timeout_s) as client:
+        answer = client.get(path).raise_for_status()
     return answer.status_code, answer.content
+
+
+def _client(base_url: str, timeout_s: float) -> httpx.Client:
+    return httpx.Client(base_url=base_url, timeout=timeout_s, trust_env=False)  # this device: no proxy
 
 
 def status(base_url: str = BASE_URL, timeout_s: float = TIMEOUT_S) -> ReportedStatus | None:
@@ -59,7 +64,8 @@ def probe_instrument(base_url: str = BASE_URL, with_picture: bool = False, timeo
     """Return the checks of the probe (`page`, `version`), and those of the instrument; only `page` without an answer.
 
     `with_picture` adds the check `picture`, unless the instrument is starting: one live picture, which lights the lamp
-    for a moment as aiming does, and tests lamp, camera and computation.
+    for a moment as aiming does, and tests lamp, camera and computation. For this moment the probe takes the control
+    lease, so that a screen shows that another one takes pictures.
     """
     reply = status(base_url, timeout_s)
     answers = Check(
@@ -96,12 +102,28 @@ def _instrument_checks(at: str, patience_s: float) -> list[Check]:
 def _picture(at: str, patience_s: float) -> Check:
     """Request one live picture and return the check `picture`: ok if the answer is a JPEG."""
     try:
-        code, body = http_get(at, "/api/preview", patience_s)
+        code, body = _live_picture(at, patience_s)
     except httpx.HTTPError as error:
         return Check("picture", False, f"does not come: {error}", "a live picture", RESTART_REMEDY, True)
     ok = code == 200 and body.startswith(b"\xff\xd8")
     value = f"{len(body)} bytes" if ok else "none came"
     return Check("picture", ok, value, "a live picture", RESTART_REMEDY, True)
+
+
+def _live_picture(at: str, patience_s: float) -> tuple[int, bytes]:
+    """Take the control lease, request one live picture and release the lease; return status code and body.
+
+    httpx.HTTPError as for `http_get`. A lease that cannot be released expires.
+    """
+    key = secrets.token_hex(8)
+    with _client(at, patience_s) as client:
+        client.post("/api/controller", json={"key": key, "take": True}).raise_for_status()
+        try:
+            answer = client.get("/api/preview", headers={"X-Controller": key}).raise_for_status()
+        finally:
+            with suppress(httpx.HTTPError):
+                client.post("/api/controller", json={"key": key, "release": True})
+    return answer.status_code, answer.content
 
 
 def table(checks: Sequence[Check]) -> str:

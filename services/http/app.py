@@ -14,7 +14,7 @@ from services.health.alert_monitor import AlertMonitor, AlertSources
 from services.http.authentication import PinAuthenticator
 from services.http.client_limits import PREVIEW_LIMITS, STREAM_LIMITS, ClientLimits, limit_clients
 from services.http.control_lease import ControlLease
-from services.http.dependencies import acquire_control_lease, login_required
+from services.http.dependencies import acquire_control_lease, acquire_lease_for_light, login_required
 from services.http.openapi import DocumentedApp
 from services.http.problem_responses import problem_response, register_error_handlers
 from services.http.routes.calibration import calibration_router
@@ -85,7 +85,8 @@ def create_app(
     app.include_router(exports_router(visits, store, usb_drives or UsbDrives()), dependencies=controlled)
     app.include_router(upload_router(worker), dependencies=controlled)
     app.include_router(status_router(arbiter, visits, lease, alerts, worker))
-    app.include_router(preview_router(arbiter, visits), dependencies=[Depends(limit_clients(preview_limits))])
+    lit = [Depends(acquire_lease_for_light(lease)), Depends(limit_clients(preview_limits))]
+    app.include_router(preview_router(arbiter, visits), dependencies=lit)
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator))
     app.include_router(calibration_router(arbiter, authenticator))

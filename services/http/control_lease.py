@@ -67,6 +67,15 @@ class ControlLease:
         if key is not None and not self.acquire(key).mine:
             raise ControlLeaseHeld("another screen holds the camera")
 
+    def acquire_for_light(self, key: str | None) -> None:
+        """Acquire or renew the lease for a request of live pictures; ControlLeaseHeld if another screen holds it.
+
+        A request without a key passes only while no screen holds the lease.
+        """
+        if key is None and self.holder is not None:
+            raise ControlLeaseHeld("a screen holds the camera")
+        self.acquire_or_refuse(key)
+
     def _is_live(self) -> bool:
         return self._clock.now_s() < self._until_s
 

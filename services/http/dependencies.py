@@ -1,6 +1,6 @@
 """Dependencies of endpoints: the control lease of a screen and the technician's login."""
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Annotated
 
 from fastapi import Cookie, Header, Request
@@ -25,6 +25,18 @@ def acquire_control_lease(lease: ControlLease) -> Callable[..., None]:
             lease.renew(x_controller or "")
         else:
             lease.acquire_or_refuse(x_controller)
+
+    return acquire
+
+
+def acquire_lease_for_light(lease: ControlLease) -> Callable[..., Awaitable[None]]:
+    """Return the dependency that acquires or renews the control lease for a request of live pictures.
+
+    ControlLeaseHeld if another screen holds the lease, for a request without a key if any screen does.
+    """
+
+    async def acquire(x_controller: Annotated[str | None, Header(max_length=64)] = None) -> None:
+        lease.acquire_for_light(x_controller)
 
     return acquire
 

@@ -57,6 +57,13 @@ def served() -> Iterator[Page]:
             self.end_headers()
             self.wfile.write(body)
 
+        def do_POST(self) -> None:
+            """Answer a request of the control lease."""
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b'{"lease": "probe", "mine": true}')
+
         def log_message(self, format: str, *args: object) -> None:
             pass
 

@@ -20,6 +20,7 @@ from device.sim.chips import SimHeadMemory
 from device.values import BatteryState, HeadIdentity
 from services.delivery.uploader import HttpsUploader, UploadSettings
 from services.http.app import create_app
+from services.http.control_lease import LEASE_S
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import HeadArbiter
 from tests.journey import asking, faults
@@ -192,6 +193,7 @@ def test_a_cross_site_request_for_live_pictures_is_refused_without_light(
     old_rig: Rig, headers: dict[str, str], status: int
 ) -> None:
     faults.wait_until_idle(old_rig)
+    old_rig.clock.elapsed_s += LEASE_S  # a request without a key needs a free control lease
     frames = old_rig.world.frames
 
     async def request_preview(client: httpx.AsyncClient) -> httpx.Response:

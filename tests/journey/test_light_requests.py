@@ -1,12 +1,18 @@
-"""Requests of light: counted for the named eye, and limited without a visit."""
+"""Requests of light: counted for the named eye, limited without a visit, live pictures with the control lease."""
+
+import secrets
+from typing import Any
 
 import pytest
 
 from device.light_safety.guard import GuardedLight
 from device.values import Eye
+from services.health.probe import probe_instrument
+from services.http.connection_limits import ConnectionLimits
 from tests.journey.asking import post_capture, status_problem, visit_with_consent
 from tests.journey.conftest import MakeRig, Rig
 from tests.journey.faults import wait_until_idle
+from tests.journey.serving import served
 
 OTHER_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 SLOTS: dict[Eye, str] = {"OD": "R-centre", "OS": "L-centre"}
@@ -23,10 +29,11 @@ def doses_j_per_cm2(rig: Rig) -> dict[Eye, float]:
     return {eye: light_of(rig).ledger.spent_j_per_cm2(eye) for eye in ("OD", "OS")}
 
 
-def live_status(rig: Rig, query: str = "") -> int:
+def live_status(rig: Rig, query: str = "", key: str | None = None) -> int:
     """Return the status of a request of a live picture, repeated while none comes in time on a busy computer."""
+    headers = {} if key is None else {"X-Controller": key}
     for _ in range(20):
-        status = rig.request("GET", f"/api/preview?after=0{query}").status_code
+        status = rig.request("GET", f"/api/preview?after=0{query}", headers=headers).status_code
         if status != 204:
             return status
     return 204
@@ -74,3 +81,44 @@ def test_light_without_a_visit_ends_while_a_visit_gets_light(make_rig: MakeRig) 
     assert post_capture(rig, "OS").way == "verdict", "the other eye has its own limit"
     assert post_capture(rig, "OD", **slot).way == "verdict"
     assert live_status(rig, f"&eye=OD&visit={slot['visit']}") == 200
+
+
+def request_lease(rig: Rig, key: str, **more: Any) -> bool:
+    """Request the control lease; return whether the screen holds it now."""
+    return bool(rig.request("POST", "/api/controller", json={"key": key} | more).json()["mine"])
+
+
+def test_a_live_picture_needs_the_control_lease(make_rig: MakeRig) -> None:
+    rig, mine, other = make_rig(), secrets.token_hex(8), secrets.token_hex(8)
+    assert live_status(rig) == 200, "without a key while no screen holds the lease"
+    assert request_lease(rig, mine)
+    wait_until_idle(rig)
+    frames = rig.world.frames
+    strangers: tuple[dict[str, str], ...] = ({}, {"X-Controller": other})
+    for headers in strangers:
+        answer = rig.request("GET", "/api/preview?after=0&eye=OD", headers=headers)
+        assert (answer.status_code, answer.json()["code"]) == (409, "link.other")
+    assert rig.world.frames == frames
+    rig.clock.elapsed_s += 9
+    assert live_status(rig, key=mine) == 200
+    rig.clock.elapsed_s += 9
+    assert not request_lease(rig, other), "a live picture renews the lease"
+    assert request_lease(rig, other, take=True)
+    assert live_status(rig, key=mine) == 409
+
+
+def test_a_live_picture_acquires_a_free_lease(make_rig: MakeRig) -> None:
+    rig, mine, other = make_rig(), secrets.token_hex(8), secrets.token_hex(8)
+    assert live_status(rig, key=mine) == 200
+    assert not request_lease(rig, other)
+
+
+def test_the_probe_takes_a_live_picture_although_a_screen_holds_the_lease(make_rig: MakeRig) -> None:
+    rig, screen = make_rig(), secrets.token_hex(8)
+    assert request_lease(rig, screen)
+    with served(rig.app, ConnectionLimits()) as (port,):
+        checks = {one.name: one for one in probe_instrument(f"http://127.0.0.1:{port}", with_picture=True)}
+        rig.event_bus.close()
+    assert checks["picture"].ok, checks["picture"].value
+    rig.clock.elapsed_s += 3
+    assert request_lease(rig, screen), "the probe released the lease"

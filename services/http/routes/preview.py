@@ -17,7 +17,7 @@ RESPONSES = file_responses("image/jpeg") | no_picture("no picture within 2 s")
 
 
 def preview_router(arbiter: HeadArbiter, repository: VisitRepository) -> APIRouter:
-    """Return the router of the live picture."""
+    """Return the router of the live picture; the application adds the check of the control lease."""
     router = APIRouter()
 
     @router.get("/api/preview", response_class=JpegResponse, responses=RESPONSES)
@@ -28,9 +28,10 @@ def preview_router(arbiter: HeadArbiter, repository: VisitRepository) -> APIRout
 
         `eye`: the eye whose light dose is counted, by default both. Headers: `X-Frame` (picture number), `X-Age-Ms`,
         `X-Aim` (aiming hint, JSON). 204 if no picture arrives within 2 s. With `visit`, 409 unless its consent is
-        `agreed`; the lamp stays off. Without it, the picture is a test picture, whose light has a lower limit. CSRF
-        protection: the request needs a same-origin `Sec-Fetch-Site` or any `X-Controller` header, else 403, since it
-        turns the lamp on. 503 if too many requests wait at once.
+        `agreed`; the lamp stays off. Without it, the picture is a test picture, whose light has a lower limit. 409
+        while another screen holds the control lease; without `X-Controller`, while any screen does. CSRF protection:
+        the request needs a same-origin `Sec-Fetch-Site` or any `X-Controller` header, else 403, since it turns the
+        lamp on. 503 if too many requests wait at once.
         """
         wanted = LiveRequest(EYES if eye is None else (eye,), repository.pictures.permission(visit), visit)
         await run_in_threadpool(wanted.permit)  # reads the database
