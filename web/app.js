@@ -237,8 +237,11 @@ function showAim(aim) {
 addEventListener("pagehide", releaseControl);
 
 actions.previewAim = ({ detail }) => showAim(detail);
-// Consent changed on another screen: reload the visit to show the reason.
-actions.previewRefused = ({ detail: { code } }) => code.startsWith("consent.") && refreshVisit(get().route.visit);
+// Consent or control changed on another screen: reload the visit or the lease to show the reason.
+actions.previewRefused = ({ detail: { code } }) => {
+  if (code.startsWith("consent.")) refreshVisit(get().route.visit);
+  else if (code === "link.other") renewControl();
+};
 actions.previewLate = ({ detail: seconds }) => {
   if (seconds && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
   if (seconds >= LATE_S && get().link === "live") {

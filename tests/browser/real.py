@@ -5,6 +5,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -27,10 +28,11 @@ from device.values import Calibration, HeadIdentity
 from services.delivery.uploader import HttpsUploader, UploadSettings
 from services.delivery.usb_drives import UsbDrives
 from services.http.app import create_app
+from services.instrument.capture import LiveRequest
 from services.instrument.exam import ExamService
 from services.instrument.head_arbiter import HeadArbiter
 from services.records.capture_store import CaptureStore
-from tests.journey.asking import DiskStub, PressHookBus, with_all_chips
+from tests.journey.asking import DiskStub, PressHookBus, live_picture, with_all_chips
 from tests.journey.conftest import GateClock, Rig, rig_builder, traced_world, until
 from tests.simulated import SCENES, coarse, with_keys
 
@@ -233,7 +235,9 @@ class Real:
         def is_there() -> bool:
             nonlocal problem
             before_each()
-            self._client.get("/api/preview?after=0&eye=OD", headers={"Sec-Fetch-Site": "same-origin"})
+            # Not over HTTP: an open page may hold the control lease. In a thread: this one has an event loop.
+            with ThreadPoolExecutor(1) as pool:
+                pool.submit(live_picture, self.rig.exam, 0, wanted=LiveRequest(("OD",))).result()
             problem = self.request("GET", "/api/status")["problem"] or {}
             return problem.get("code") == code
 

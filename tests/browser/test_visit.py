@@ -356,13 +356,15 @@ def test_visit_is_copied_to_usb_and_saved_as_zip(open_page: Open, real: Real) ->
     expect(page.get_by_role("note")).to_contain_text("Look in its downloads.")
 
 
-def test_control_is_taken_from_another_screen(open_page: Open, real: Real) -> None:
+def test_control_is_taken_from_another_screen(open_page: Open, real: Real, complaints: Complaints) -> None:
+    complaints.expect(r"409 .*/api/preview")  # the next live picture of the first screen
     first = aiming(open_page, real)
     second = after_debounce(open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre"))
     expect(second.locator(SHUTTER)).to_contain_text("Other screen")
     second.locator("[data-do=useHere]").tap()
     expect(second.locator(SHUTTER)).to_contain_text("Take picture")
     expect(first.locator(SHUTTER)).to_contain_text("Other screen", timeout=15_000)
+    expect(first.locator("eye-live[data-frame]")).to_have_count(0)
 
 
 def test_markup_is_shown_as_text(open_page: Open, real: Real) -> None:

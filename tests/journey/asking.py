@@ -15,7 +15,7 @@ from device.head import Head
 from device.ports import Chips
 from device.sim.camera import SimCamera
 from device.sim.chips import SimBattery, SimThermometer
-from services.instrument.capture import Preview
+from services.instrument.capture import NO_VISIT, LiveRequest, Preview
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from tests.journey.conftest import Rig
@@ -26,9 +26,9 @@ MAKE_WEEKS = 10  # age of the calibration
 MOST_BYTES = 10**12
 
 
-def live_picture(exam: ExamService, after: int, wait_s: float = 2.0) -> Preview | None:
+def live_picture(exam: ExamService, after: int, wait_s: float = 2.0, wanted: LiveRequest = NO_VISIT) -> Preview | None:
     """Return the next live picture as the server's event loop does; for a thread without such a loop."""
-    return asyncio.run(exam.preview(after, wait_s))
+    return asyncio.run(exam.preview(after, wait_s, wanted))
 
 
 @dataclass

@@ -12,6 +12,7 @@ export const isExamScreen = ({ route }) => route.screen === "aim" || route.scree
 export function pictureArea(state, actions) {
   const shot = currentShot(state);
   const none = state.picture === "none" || !shot;
+  const visit = state.hasControl && allowsLight(state) ? state.route.visit : null;
   return html`
     <section class="stage-area" aria-label=${t("part.live")} ?hidden=${!isExamScreen(state)}>
       <div class="stage" data-mark=${none ? "none" : state.picture}>
@@ -20,9 +21,9 @@ export function pictureArea(state, actions) {
           .head=${state.status}
           .link=${state.link}
           .eye=${eyeOf(state, state.route.slot)}
-          .visit=${allowsLight(state) ? state.route.visit : null}
+          .visit=${visit}
           .hint=${topAlert(state) ? null : state.prompt}
-          .active=${state.route.screen === "aim" && allowsLight(state)}
+          .active=${state.route.screen === "aim" && visit !== null}
           @refused=${actions.previewRefused}
           @aim=${actions.previewAim}
           @late=${actions.previewLate}

@@ -33,7 +33,7 @@ export const store = createStore({
   link: "opening", // opening | live | lost
   status: null,
   activity: "aim", // state of the instrument, as in its status
-  hasControl: true, // this page holds the control lease; another page can take it
+  hasControl: false, // this page holds the control lease, which live pictures need; another page can take it
   alerts: Object.freeze([]), // active alerts, see alerts.js
   route: Object.freeze({ screen: "home" }),
   protocol: null, // slots, reasons and retakes of the programme
