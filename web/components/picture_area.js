@@ -8,11 +8,13 @@ import { clockTime, has, t } from "../i18n/translate.js";
 
 export const isExamScreen = ({ route }) => route.screen === "aim" || route.screen === "picture";
 
+/** The visit that live pictures are requested for: the present one, if its consent and the control lease permit light. */
+const litVisit = (state) => (state.hasControl && allowsLight(state) ? state.route.visit : null);
+
 /** Live preview, picture viewer and prompt line; hidden outside the exam screens. */
 export function pictureArea(state, actions) {
   const shot = currentShot(state);
   const none = state.picture === "none" || !shot;
-  const visit = state.hasControl && allowsLight(state) ? state.route.visit : null;
   return html`
     <section class="stage-area" aria-label=${t("part.live")} ?hidden=${!isExamScreen(state)}>
       <div class="stage" data-mark=${none ? "none" : state.picture}>
@@ -21,9 +23,9 @@ export function pictureArea(state, actions) {
           .head=${state.status}
           .link=${state.link}
           .eye=${eyeOf(state, state.route.slot)}
-          .visit=${visit}
+          .visit=${litVisit(state)}
           .hint=${topAlert(state) ? null : state.prompt}
-          .active=${state.route.screen === "aim" && visit !== null}
+          .active=${state.route.screen === "aim" && litVisit(state) !== null}
           @refused=${actions.previewRefused}
           @aim=${actions.previewAim}
           @late=${actions.previewLate}
