@@ -19,6 +19,7 @@ from device.recon.methods import DEFAULT
 from device.recon.model.grid import Grid
 from device.values import Colour
 from services import resources
+from services.backup import command as backup_command
 from services.lab import calibration_archive
 from services.lab.datasets import open_dataset
 from services.lab.peers import ENVIRONMENT, installed_peer
@@ -38,8 +39,10 @@ app.add_typer(calibration_archive.app, name="calibrations")
 app.add_typer(update_app, name="update")
 app.add_typer(snapshots, name="snapshots")
 app.add_typer(store, name="store")
+store.command()(backup_command.backup)
+store.command()(backup_command.restore)
 
-INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography"})
+INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage"})
 SIM_HEAD = resources.HEADS / "sim.toml"
 
 DataSet = Annotated[Path, typer.Argument(help="Folder of a data set: DLMD, DiffuserCam, LenslessPiCam or own pairs.")]

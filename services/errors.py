@@ -19,6 +19,9 @@ DiffuscopeError                       base class in device/errors.py
 │   └── ConsentDeclined               consent declined or withdrawn
 ├── StoreError                        base class in device/errors.py
 │   ├── StoreDamaged                  stored file missing or changed
+│   ├── BackupKeyWrong                passphrase or key does not fit the backup
+│   ├── BackupDamaged                 backup incomplete or changed
+│   ├── RestoreRefused                the store holds records already
 │   ├── UsbDriveFull                  no space on the USB drive
 │   ├── UsbDriveUnavailable           USB drive removed or not writable
 │   └── RecordNotFound (LookupError)  no such capture
@@ -154,6 +157,27 @@ class StoreDamaged(StoreError):
 
     code = "store.damaged"
     default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+
+
+class BackupKeyWrong(StoreError):
+    """A passphrase or a key does not decrypt a backup, or cannot be used for one."""
+
+    code = "backup.key"
+    default_remedy = "Give the passphrase or the key that was chosen when the backups were set up."
+
+
+class BackupDamaged(StoreError):
+    """A backup is incomplete or changed, or none was found."""
+
+    code = "backup.damaged"
+    default_remedy = "Use another copy of the backup, and another stick for the next one."
+
+
+class RestoreRefused(StoreError):
+    """A backup is not restored over records that are stored already."""
+
+    code = "backup.used"
+    default_remedy = "Restore on a new device, or into a new folder with --data."
 
 
 class UsbDriveFull(StoreError):

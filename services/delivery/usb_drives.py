@@ -66,7 +66,7 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
     this name after all files are written; after an error in writing them the partial copy is deleted, if the drive is
     still there. Errors: UsbDriveFull, UsbDriveUnavailable.
     """
-    with _drive_errors(drive):
+    with drive_errors(drive):
         target, number = drive / name, 1
         while target.exists():
             number += 1
@@ -84,7 +84,7 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
 
 
 @contextmanager
-def _drive_errors(drive: Path) -> Iterator[None]:
+def drive_errors(drive: Path) -> Iterator[None]:
     """Convert OSError to UsbDriveFull (no space) or UsbDriveUnavailable (other errors); a context manager."""
     try:
         yield

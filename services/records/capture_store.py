@@ -45,6 +45,7 @@ from services.records.record_rows import capture_content, file_entries
 from services.records.record_signing import PAGE_ROWS, recorded, write_signature
 from services.records.recovery import Recovery, damage_of, set_aside
 from services.records.recovery_report import RecoveryReport
+from services.records.restoration import finish_restoration
 from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots
@@ -89,6 +90,7 @@ class CaptureStore:
             self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
             self.space = StoreSpace(folder, self.engine, self.quarantine, reserve_bytes, free_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
+                finish_restoration(folder)
                 damage = self._set_damaged_database_aside()
                 schema.migrate(self.engine, snapshots.create)
                 self.recovery = Recovery(folder, self.engine, damage).run()

@@ -73,7 +73,7 @@ class Snapshots:
         refuse_in_use(self.database)
         new = self.database.with_name(".shelf.part")
         shutil.copyfile(self.folder / name, new)
-        _carry_dose(self.database, new)
+        carry_dose(self.database, new)
         atomic_io.fsync_file(new)
         atomic_io.fsync_folder(self.database.parent)
         replaced = move_to_numbered_folder(self.database, self.folder, "replaced-")
@@ -130,7 +130,7 @@ def _connected(path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-def _carry_dose(replaced: Path, restored: Path) -> None:
+def carry_dose(replaced: Path, restored: Path) -> None:
     """Raise the doses in the restored tables to those in the replaced ones and in the second copy of the ledger.
 
     Also an earlier release, which does not read the copy, then counts every dose. A replaced database that cannot be

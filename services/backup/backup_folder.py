@@ -1,0 +1,146 @@
+"""Folder of the backups of one device on a stick or path: encrypted objects that are written once.
+
+    diffuscope-backup-<id>/
+        README.txt              how to restore
+        backup.json             id and recipients, in the clear (backup_key.py)
+        objects/<sha256>.age    one folder of the store (a capture), as an encrypted tar archive
+        index.txt               append-only: name of each backed-up content, and its object
+        backups/<number>.age    one backup: everything else in the store, and the list of its objects
+
+An object is named by the SHA-256 of its encrypted content, so that a copy can be checked without a key. A line of the
+index is written after its object is durable, a backup after all of its objects: a backup that was interrupted leaves
+the earlier ones complete, and the next one continues.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from device import atomic_io
+from services.backup.backup_key import KEY_FILE, BackupHeader, read_header
+from services.delivery.usb_drives import drive_errors
+from services.errors import BackupDamaged, UsbDriveUnavailable
+from services.records import blobs
+
+PREFIX = "diffuscope-backup-"
+_LINE = re.compile(r"([0-9a-f]{64}) ([0-9a-f]{64}) ([0-9]+)")
+README = """Backups of one Diffuscope device, encrypted with age (https://age-encryption.org).
+
+Restore them on a new device, with the passphrase or with the file of the secret key:
+
+    diffuscope store restore --from THIS-FOLDER --data /var/lib/diffuscope
+
+Every file in objects/ is named by its SHA-256. Remove nothing: later backups need the earlier objects.
+"""
+
+
+class BackupFolder:
+    """Folder of the backups with this header, below `place`; it is made if it is missing.
+
+    BackupDamaged if the folder there has the header of other backups. UsbDriveFull or UsbDriveUnavailable if the place
+    refuses, here and in every method.
+    """
+
+    def __init__(self, place: Path, header: BackupHeader) -> None:
+        self.folder = place / f"{PREFIX}{header.id}"
+        self._objects, self._backups, self._index = (self.folder / name for name in ("objects", "backups", "index.txt"))
+        with drive_errors(place):
+            if not place.is_dir():
+                raise UsbDriveUnavailable(f"{place} is no folder that is there now")
+            for folder in (self._objects, self._backups):
+                atomic_io.make_folder(folder)
+            self._write_header(header)
+            self._known = self._read_index()
+
+    def object_of(self, name: str) -> str | None:
+        """Return the object (SHA-256) of a content with that name; None if it is missing or of another length."""
+        entry = self._known.get(name)
+        return None if entry is None else entry[0]
+
+    def add(self, name: str, encrypted: bytes) -> str:
+        """Write an object durably, read it back, list it in the index, and return its SHA-256."""
+        sha256 = hashlib.sha256(encrypted).hexdigest()
+        with drive_errors(self.folder):
+            _write_and_read_back(self._objects / f"{sha256}.age", encrypted)
+            line = f"\n{name} {sha256} {len(encrypted)}\n".encode()  # a torn line before it stays a line of its own
+            descriptor = os.open(self._index, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
+            with open(descriptor, "ab") as index:
+                index.write(line)
+            atomic_io.fsync_file(self._index)
+        self._known[name] = (sha256, len(encrypted))
+        return sha256
+
+    def forget_damaged(self, progress: Callable[[int, int], None]) -> list[str]:
+        """Read every object and return those (SHA-256) that have changed; `object_of` then treats them as missing.
+
+        `progress` gets the number of objects read, and of all.
+        """
+        damaged = []
+        for done, (name, (sha256, _)) in enumerate(list(self._known.items()), 1):
+            with drive_errors(self.folder):
+                content = blobs.read_blob(self._objects / f"{sha256}.age")
+            if hashlib.sha256(content).hexdigest() != sha256:
+                damaged.append(sha256)
+                del self._known[name]
+            progress(done, len(self._known) + len(damaged))
+        return damaged
+
+    def next_number(self) -> int:
+        """Return the number of the next backup."""
+        return max(backup_numbers(self.folder), default=0) + 1
+
+    def add_backup(self, number: int, encrypted: bytes) -> None:
+        """Write a backup durably, after all of its objects, and read it back."""
+        with drive_errors(self.folder):
+            _write_and_read_back(backup_path(self.folder, number), encrypted)
+
+    def _write_header(self, header: BackupHeader) -> None:
+        path = self.folder / KEY_FILE
+        if not path.exists():
+            atomic_io.write_atomically(self.folder / "README.txt", README.encode())
+            atomic_io.write_atomically(path, header.model_dump_json(indent=1).encode())
+        elif read_header(self.folder) != header:
+            raise BackupDamaged(f"{path} is not that of this device's backups")
+
+    def _read_index(self) -> dict[str, tuple[str, int]]:
+        """Return object and length by name; without torn lines, and without objects that are missing or incomplete."""
+        lines = self._index.read_text("ascii", "replace").splitlines() if self._index.exists() else []
+        lengths = {path.stem: path.stat().st_size for path in self._objects.glob("*.age")}
+        found = [match.groups() for line in lines if (match := _LINE.fullmatch(line))]
+        return {
+            name: (sha256, int(length)) for name, sha256, length in found if lengths.get(sha256) == int(length)
+        }  # fmt: skip
+
+
+def backup_numbers(folder: Path) -> list[int]:
+    """Return the numbers of the backups in a folder of backups, oldest first."""
+    return sorted(int(path.stem) for path in (folder / "backups").glob("*.age") if path.stem.isdecimal())
+
+
+def backup_path(folder: Path, number: int) -> Path:
+    """Return the file of a backup in a folder of backups."""
+    return folder / "backups" / f"{number:06}.age"
+
+
+def find_folder(place: Path) -> Path:
+    """Return the folder of backups at `place`, or in it; BackupDamaged if there is none, or more than one."""
+    if (place / KEY_FILE).is_file() and (place / "objects").is_dir():
+        return place
+    found = sorted(path for path in place.glob(f"{PREFIX}*") if path.is_dir())
+    if len(found) != 1:
+        listed = ", ".join(path.name for path in found) or "none"
+        remedy = "Give the folder of one device's backups with --from."
+        raise BackupDamaged(f"folders of backups in {place}: {listed}", remedy)
+    return found[0]
+
+
+def _write_and_read_back(path: Path, content: bytes) -> None:
+    """Write a file durably and compare what the disk, and not the page cache, returns; BackupDamaged if it differs."""
+    atomic_io.write_atomically(path, content)
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        if file.read() != content:
+            raise BackupDamaged(f"{path} cannot be read back as it was written")

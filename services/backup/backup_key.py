@@ -1,0 +1,180 @@
+"""Key of a device's backups: who can decrypt them, and a secret that gives what was backed up names without meaning.
+
+`backup.json` in the folder of the store (mode 600) and, without the secret, in the folder of the backups. Encryption is
+age's (X25519, https://age-encryption.org/v1): the device knows the public keys only, so a lost device decrypts no
+backup. With a passphrase, a new secret key is encrypted with it (scrypt) and stored beside the backups.
+"""
+
+import base64
+import hashlib
+import hmac
+import secrets
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import pyrage
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from device import atomic_io
+from services.errors import BackupDamaged, BackupKeyWrong
+from services.records import blobs
+
+KEY_FILE = "backup.json"
+MIN_PASSPHRASE = 8  # characters; scrypt makes each guess cost about a second
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def _public_key(value: str) -> str:
+    try:
+        pyrage.x25519.Recipient.from_str(value)
+    except pyrage.RecipientError as error:
+        raise ValueError(f"{value!r:.80} is no public key of age") from error
+    return value
+
+
+class SecretKey:
+    """Secret key of age; `text` is its line in a file of `age-keygen`. BackupKeyWrong if it is none."""
+
+    def __init__(self, text: str) -> None:
+        try:
+            self._identity = pyrage.x25519.Identity.from_str(text)
+        except pyrage.IdentityError as error:
+            raise BackupKeyWrong(f"no secret key of age: {error}") from error
+
+    @property
+    def public_key(self) -> str:
+        """The public key that encrypts for this key."""
+        return str(self._identity.to_public())
+
+    def decrypted(self, content: bytes) -> bytes:
+        """Return decrypted content; BackupDamaged if it has changed or is for other keys."""
+        try:
+            decrypted: bytes = pyrage.decrypt(content, [self._identity])
+        except pyrage.DecryptError as error:
+            raise BackupDamaged(f"cannot be decrypted: {error}") from error
+        return decrypted
+
+
+class BackupHeader(BaseModel):
+    """What the folder of the backups says in the clear: id, recipients, and the secret key behind a passphrase.
+
+    `recipients`: public keys of age. `sealed_identity`: their secret key, encrypted with the passphrase (Base64); empty
+    if the secret keys are elsewhere.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    format: Literal[1] = 1
+    id: str = Field(pattern=r"^[0-9a-f]{8}$")
+    recipients: tuple[Annotated[str, AfterValidator(_public_key)], ...] = Field(min_length=1)
+    sealed_identity: str = ""
+
+    def encrypted(self, content: bytes) -> bytes:
+        """Return content that only the holder of the secret key or of the passphrase can decrypt."""
+        recipients = [pyrage.x25519.Recipient.from_str(one) for one in self.recipients]
+        encrypted: bytes = pyrage.encrypt(content, recipients)
+        return encrypted
+
+
+class LastBackup(BaseModel):
+    """The last complete backup of a device: number, time, folder, folders of the store in it, and bytes written."""
+
+    model_config = ConfigDict(frozen=True)
+
+    number: int
+    made_at: datetime
+    folder: str
+    units: int
+    written_bytes: int
+
+
+class BackupKey(BaseModel):
+    """Key of the backups of one device: header, secret (hex) of the names of what was backed up, and last backup."""
+
+    model_config = ConfigDict(frozen=True)
+
+    header: BackupHeader
+    naming_secret: str = Field(pattern=r"^[0-9a-f]{64}$")
+    last: LastBackup | None = None
+
+    def name(self, fingerprint: bytes) -> str:
+        """Return the name (HMAC-SHA256, hex) of a content with this fingerprint."""
+        return hmac.new(bytes.fromhex(self.naming_secret), fingerprint, hashlib.sha256).hexdigest()
+
+
+def key_for_recipients(recipients: Sequence[str]) -> BackupKey:
+    """Return a new key for holders of secret keys elsewhere; BackupKeyWrong if one is no public key of age."""
+    try:
+        return _new_key(BackupHeader(id=_new_id(), recipients=tuple(recipients)))
+    except ValueError as error:
+        listed = ", ".join(recipients)
+        raise BackupKeyWrong(f"no public keys of age: {listed:.200}", "Give a key that begins with age1.") from error
+
+
+def key_for_passphrase(passphrase: str) -> BackupKey:
+    """Return a new key whose secret half is encrypted with a passphrase; BackupKeyWrong if that is too short.
+
+    Takes some seconds and up to 512 MB, because scrypt makes guesses expensive.
+    """
+    if len(passphrase) < MIN_PASSPHRASE:
+        raise BackupKeyWrong("the passphrase is too short", f"Use {MIN_PASSPHRASE} characters or more.")
+    identity = pyrage.x25519.Identity.generate()
+    sealed = base64.b64encode(pyrage.passphrase.encrypt(str(identity).encode(), passphrase)).decode()
+    return _new_key(BackupHeader(id=_new_id(), recipients=(str(identity.to_public()),), sealed_identity=sealed))
+
+
+def read_key(store: Path) -> BackupKey | None:
+    """Return the key in the folder of a store; None if none is set, BackupDamaged if it cannot be read."""
+    return read_model(store / KEY_FILE, BackupKey) if (store / KEY_FILE).exists() else None
+
+
+def write_key(store: Path, key: BackupKey) -> None:
+    """Write the key into the folder of a store, atomically; OSError if the disk refuses."""
+    atomic_io.write_atomically(store / KEY_FILE, key.model_dump_json(indent=1).encode(), 0o600)
+
+
+def read_header(folder: Path) -> BackupHeader:
+    """Return the header of a folder of backups; BackupDamaged if it cannot be read."""
+    return read_model(folder / KEY_FILE, BackupHeader)
+
+
+def read_model(path: Path, model: type[Model]) -> Model:
+    """Return the content of a JSON file as a model; BackupDamaged if it cannot be read."""
+    try:
+        return model.model_validate_json(blobs.read_blob(path))
+    except (OSError, ValueError) as error:
+        raise BackupDamaged(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
+
+
+def key_of_passphrase(header: BackupHeader, passphrase: str) -> SecretKey:
+    """Return the secret key of backups; BackupKeyWrong for another passphrase, or if there is none."""
+    if not header.sealed_identity:
+        raise BackupKeyWrong("these backups have no passphrase", "Give the file of the secret key with --identity.")
+    try:
+        content = pyrage.passphrase.decrypt(base64.b64decode(header.sealed_identity), passphrase)
+    except (pyrage.DecryptError, ValueError) as error:
+        raise BackupKeyWrong("the passphrase is not that of these backups") from error
+    return SecretKey(content.decode())
+
+
+def key_in(path: Path) -> SecretKey:
+    """Return the secret key in a file of `age-keygen`; BackupKeyWrong if it has none."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BackupKeyWrong(f"{path} cannot be read: {error}") from error
+    for line in lines:
+        if line.startswith("AGE-SECRET-KEY-"):
+            return SecretKey(line)
+    raise BackupKeyWrong(f"{path} has no secret key of age")
+
+
+def _new_id() -> str:
+    return secrets.token_hex(4)
+
+
+def _new_key(header: BackupHeader) -> BackupKey:
+    return BackupKey(header=header, naming_secret=secrets.token_hex(32))

@@ -1,0 +1,159 @@
+"""Restoration of a backup on a device that has no records yet: all that is whole, and the names of what is not."""
+
+import hashlib
+import logging
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from device import atomic_io
+from device.errors import StoreFull
+from services.backup import store_contents
+from services.backup.backup_folder import backup_numbers, backup_path
+from services.backup.backup_key import SecretKey, read_header
+from services.backup.write_backup import MANIFEST, Manifest
+from services.delivery.usb_drives import drive_errors
+from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused
+from services.records import blobs, schema
+from services.records.restoration import begin_restoration, commit_restoration
+from services.records.snapshots import carry_dose, refuse_in_use
+from services.records.storage_errors import storage_errors
+
+log = logging.getLogger(__name__)
+
+Progress = Callable[[int, int], None]
+RECORD_FOLDERS = ("captures", "patients", "visits", "torn")
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What was restored: number and time of the backup, units, damaged units, and numbers of damaged newer backups."""
+
+    number: int
+    made_at: datetime
+    units: int
+    damaged_units: tuple[str, ...]
+    damaged_backups: tuple[int, ...]
+
+
+def restore_backup(
+    folder: Path,
+    key: SecretKey,
+    store: Path,
+    progress: Progress,
+    number: int | None = None,
+    free_bytes: Callable[[Path], int] = atomic_io.free_bytes,
+) -> Restored:
+    """Restore the newest readable backup in a folder of backups, or that with `number`, into an unused store.
+
+    Every unit is checked against its SHA-256 and age's authentication; a damaged one is left out and named. A dose that
+    the device has counted is never lowered. Until the last step nothing in the store changes; a power cut later is
+    completed by the next opening. Errors: RestoreRefused (the store has records), BackupKeyWrong, BackupDamaged (no
+    backup can be read), UsbDriveUnavailable, StoreFull, StoreError (the instrument is running, or the disk refuses).
+    """
+    if key.public_key not in read_header(folder).recipients:
+        raise BackupKeyWrong("the key is not that of these backups")
+    with storage_errors():
+        atomic_io.make_folder(store)
+        refuse_in_use(store / schema.DATABASE)
+        with atomic_io.file_lock(store / ".lock"):
+            _refuse_used(store)
+            manifest, rest, damaged_backups = _newest_readable(folder, key, number)
+            _refuse_without_room(folder, manifest, len(rest), free_bytes(store))
+            part = begin_restoration(store)
+            _write_files(part, rest)
+            damaged: list[str] = []
+            for done, (unit, sha256) in enumerate(manifest.units.items()):
+                progress(done, len(manifest.units))
+                try:
+                    _write_files(part, _decrypted_object(folder, sha256, key))
+                except BackupDamaged as error:
+                    log.error("%s is not restored: %s", unit, error.message)
+                    damaged.append(unit)
+            carry_dose(store / schema.DATABASE, part / schema.DATABASE)
+            _sync_folders(part)
+            commit_restoration(store)
+    progress(len(manifest.units), len(manifest.units))
+    return Restored(manifest.number, manifest.made_at, len(manifest.units), tuple(damaged), damaged_backups)
+
+
+def _refuse_used(store: Path) -> None:
+    """Raise RestoreRefused if the store has captures, visits or patients."""
+    used = [name for name in RECORD_FOLDERS if (store / name).is_dir() and any((store / name).iterdir())]
+    database = store / schema.DATABASE
+    if database.exists() and database.stat().st_size and not used:
+        with closing(sqlite3.connect(database)) as tables:
+            names = {name for (name,) in tables.execute("SELECT name FROM sqlite_schema")}
+            for table in {"captures", "visits", "persons"} & names:
+                if tables.execute(f"SELECT EXISTS (SELECT 1 FROM {table})").fetchone()[0]:
+                    used.append(f"the table {table}")
+    if used:
+        raise RestoreRefused(f"{store} has records already: {', '.join(used)}")
+
+
+def _newest_readable(folder: Path, key: SecretKey, number: int | None) -> tuple[Manifest, bytes, tuple[int, ...]]:
+    """Return manifest and archive of a backup, and the numbers of newer ones that are damaged."""
+    numbers = backup_numbers(folder)
+    wanted = [one for one in reversed(numbers) if number is None or one == number]
+    if not wanted:
+        listed = ", ".join(map(str, numbers)) or "none"
+        raise BackupDamaged(f"there is no backup {number or ''} in {folder}; present: {listed}")
+    damaged: list[int] = []
+    for one in wanted:
+        try:
+            archive = _decrypted(backup_path(folder, one), key)
+            return _manifest(archive), archive, tuple(damaged)
+        except BackupDamaged as error:
+            log.error("backup %s cannot be used: %s", one, error.message)
+            damaged.append(one)
+    raise BackupDamaged(f"no backup in {folder} can be read with this key")
+
+
+def _manifest(archive: bytes) -> Manifest:
+    path, _, content = next(store_contents.unpacked(archive))
+    if str(path) != MANIFEST:
+        raise BackupDamaged("the archive of the backup has no list of its content")
+    return Manifest.model_validate_json(content)
+
+
+def _decrypted_object(folder: Path, sha256: str, key: SecretKey) -> bytes:
+    path = folder / "objects" / f"{sha256}.age"
+    if not path.exists():
+        raise BackupDamaged(f"{path.name} is missing")
+    with drive_errors(folder):
+        if hashlib.sha256(blobs.read_blob(path)).hexdigest() != sha256:
+            raise BackupDamaged(f"{path.name} has changed")
+    return _decrypted(path, key)
+
+
+def _decrypted(path: Path, key: SecretKey) -> bytes:
+    with drive_errors(path.parent):
+        content = blobs.read_blob(path)
+    try:
+        return key.decrypted(content)
+    except BackupDamaged as error:
+        raise BackupDamaged(f"{path.name}: {error.message}") from error
+
+
+def _refuse_without_room(folder: Path, manifest: Manifest, rest_bytes: int, free_bytes: int) -> None:
+    """Raise StoreFull if the restored files do not fit; encrypted objects are a little longer than their content."""
+    paths = [folder / "objects" / f"{sha256}.age" for sha256 in manifest.units.values()]
+    need_bytes = rest_bytes + sum(path.stat().st_size for path in paths if path.exists())
+    if not atomic_io.has_room(need_bytes, free_bytes, 0):
+        raise StoreFull(f"{free_bytes} bytes are free, {need_bytes} are needed", "Restore on a larger card.")
+
+
+def _write_files(part: Path, archive: bytes) -> None:
+    for path, mode, content in store_contents.unpacked(archive):
+        if str(path) != MANIFEST:
+            (part / path).parent.mkdir(parents=True, exist_ok=True)
+            atomic_io.write_file(part / path, content, mode)
+
+
+def _sync_folders(part: Path) -> None:
+    """Sync every folder once; the files in them are durable."""
+    for folder in [part, *(path for path in part.rglob("*") if path.is_dir())]:
+        atomic_io.fsync_folder(folder)

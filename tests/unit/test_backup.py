@@ -1,0 +1,319 @@
+"""Backups: a new device shows the same visits, captures, files and doses; damage is named and never silent."""
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pyrage
+import pytest
+
+from device.clock import VirtualClock
+from device.errors import StoreFull
+from services.backup import store_contents
+from services.backup.backup_folder import BackupFolder, find_folder
+from services.backup.backup_key import (
+    BackupKey,
+    SecretKey,
+    key_for_passphrase,
+    key_for_recipients,
+    key_in,
+    key_of_passphrase,
+    read_header,
+    read_key,
+)
+from services.backup.restore_backup import Restored, restore_backup
+from services.backup.write_backup import write_backup
+from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused, StoreDamaged, UsbDriveUnavailable
+from services.records.capture import Capture, CaptureReport
+from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
+from tests.store_damage import FILES, expected, filled_store, shown
+
+
+def secret_key() -> SecretKey:
+    """Return a new secret key of age."""
+    return SecretKey(str(pyrage.x25519.Identity.generate()))
+
+
+SECRET = secret_key()
+RECIPIENT = SECRET.public_key
+CLOCK = VirtualClock()
+
+
+def quiet(done: int, total: int) -> None:
+    assert 0 <= done <= total
+
+
+@pytest.fixture
+def key() -> BackupKey:
+    return key_for_recipients([RECIPIENT])
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    return filled_store(tmp_path / "old", with_log=True)
+
+
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    (tmp_path / "stick").mkdir()
+    return tmp_path / "stick"
+
+
+def restored_from(stick: Path, store: Path, number: int | None = None) -> Restored:
+    return restore_backup(find_folder(stick), SECRET, store, quiet, number)
+
+
+def add_capture(store: Path, id: str) -> None:
+    with CaptureStore(store, reserve_bytes=0) as opened:
+        opened.save(Capture(id, "OD", CLOCK.wall(), True, "00ff", CaptureReport(), {}), FILES)
+
+
+def test_a_new_device_shows_what_the_old_one_showed(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    """The drill: the old device is gone, the new one was started once."""
+    before = expected(store)
+    made = write_backup(store, stick, CLOCK, quiet, key)
+    shutil.rmtree(store)
+    CaptureStore(tmp_path / "new", reserve_bytes=0).close()
+    assert restored_from(stick, tmp_path / "new") == Restored(made.number, made.made_at, made.units, (), ())
+    assert shown(tmp_path / "new") == (before, 0)
+
+
+def test_every_file_of_the_store_is_restored_bit_for_bit(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    (store / "calibrations" / "head" / "a").mkdir(parents=True)
+    (store / "calibrations" / "head" / "a" / "psf0.npy").write_bytes(b"psf")
+    (store / "technician.json").write_bytes(b"pin")
+    (store / "technician.json").chmod(0o600)
+    write_backup(store, stick, CLOCK, quiet, key)
+    restored_from(stick, tmp_path / "new")
+
+    def files(folder: Path) -> dict[str, tuple[bytes, int]]:
+        paths = (path for path in folder.rglob("*") if path.is_file())
+        found = {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mode) for path in paths}
+        return {name: one for name, one in found.items() if not name.startswith(("shelf.sqlite", ".lock", "snapshots"))}
+
+    assert files(tmp_path / "new") == files(store) | {"backup.json": files(tmp_path / "new")["backup.json"]}
+    assert read_key(tmp_path / "new") == key
+
+
+def test_a_second_backup_writes_only_what_is_new(store: Path, stick: Path, key: BackupKey, tmp_path: Path) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    objects = {path: path.stat().st_mtime_ns for path in stick.rglob("objects/*")}
+    add_capture(store, "later")
+    made = write_backup(store, stick, CLOCK, quiet)
+    after = {path: path.stat().st_mtime_ns for path in stick.rglob("objects/*")}
+    assert (made.number, len(after) - len(objects)) == (2, 1)
+    assert after.items() >= objects.items()
+    assert restored_from(stick, tmp_path / "first", 1).units == made.units - 1
+    assert restored_from(stick, tmp_path / "newest").units == made.units
+
+
+def test_a_restored_device_continues_the_backups(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    objects = set(stick.rglob("objects/*"))
+    restored_from(stick, tmp_path / "new")
+    assert write_backup(tmp_path / "new", stick, CLOCK, quiet).number == 2
+    assert set(stick.rglob("objects/*")) == objects
+
+
+def test_nothing_on_the_stick_is_readable_without_the_key(store: Path, stick: Path, key: BackupKey) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    everything = b"".join(path.read_bytes() for path in stick.rglob("*") if path.is_file())
+    names = " ".join(str(path) for path in stick.rglob("*"))
+    for secret in (b"Name 1", b"vision", *FILES.values()):
+        assert secret in b"".join(path.read_bytes() for path in store.rglob("*") if path.is_file())
+        assert secret not in everything
+    assert "2026-1-OD" not in names
+    assert key.naming_secret.encode() not in everything
+    with pytest.raises(BackupKeyWrong, match="not that of these backups"):
+        restore_backup(find_folder(stick), secret_key(), stick / "new", quiet)
+
+
+def test_a_passphrase_restores_and_another_does_not(store: Path, stick: Path, tmp_path: Path) -> None:
+    before = expected(store)
+    write_backup(store, stick, CLOCK, quiet, key_for_passphrase("four plain words here"))
+    header = read_header(find_folder(stick))
+    with pytest.raises(BackupKeyWrong):
+        key_of_passphrase(header, "four plain words hers")
+    identity = key_of_passphrase(header, "four plain words here")
+    restore_backup(find_folder(stick), identity, tmp_path / "new", quiet)
+    assert shown(tmp_path / "new") == (before, 0)
+
+
+@pytest.mark.parametrize("make", [lambda: key_for_passphrase("short"), lambda: key_for_recipients(["age1xyz"])])
+def test_a_key_that_protects_nothing_is_refused(make: Callable[[], BackupKey]) -> None:
+    with pytest.raises(BackupKeyWrong):
+        make()
+
+
+def test_a_file_without_a_secret_key_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "key").write_text("# created by age-keygen\n")
+    for path in (tmp_path / "key", tmp_path / "missing"):
+        with pytest.raises(BackupKeyWrong, match=path.name):
+            key_in(path)
+    identity = pyrage.x25519.Identity.generate()
+    (tmp_path / "key").write_text(f"# created by age-keygen\n{identity}\n")
+    assert key_in(tmp_path / "key").public_key == str(identity.to_public())
+
+
+def test_a_backup_needs_a_key(store: Path, stick: Path) -> None:
+    with pytest.raises(BackupKeyWrong, match="no passphrase"):
+        write_backup(store, stick, CLOCK, quiet)
+    assert not list(stick.iterdir())
+
+
+def test_a_device_with_records_is_not_overwritten(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    add_capture(tmp_path / "used", "mine")
+    before = expected(tmp_path / "used")
+    with pytest.raises(RestoreRefused, match="captures"):
+        restored_from(stick, tmp_path / "used")
+    assert shown(tmp_path / "used") == (before, 0)
+
+
+def test_a_restoration_lowers_no_dose(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    before = expected(store)
+    write_backup(store, stick, CLOCK, quiet, key)
+    with CaptureStore(tmp_path / "new", reserve_bytes=0) as opened:
+        ledger = DoseLedgerStore(opened.engine, VirtualClock(), 86_400.0, "boot")
+        ledger.reserve(("OS",), 5.0, 10.0)
+    restored_from(stick, tmp_path / "new")
+    doses = shown(tmp_path / "new")[0].doses
+    assert doses["OS"] == pytest.approx(5.0)  # a sum of two floating-point numbers
+    assert doses["OD"] == before.doses["OD"]
+
+
+def test_a_damaged_object_is_named_and_the_rest_is_restored(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    made = write_backup(store, stick, CLOCK, quiet, key)
+    damaged, gone, *_ = sorted(stick.rglob("objects/*.age"))
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    gone.unlink()
+    result = restored_from(stick, tmp_path / "new")
+    assert len(result.damaged_units) == 2
+    names = {Path(unit).name for unit in result.damaged_units}
+    found = shown(tmp_path / "new")[0]
+    assert {id for id, _ in found.files} == {Path(one).name for one in store_contents.units(store)} - names
+    add_capture(store, "later")
+    assert write_backup(store, stick, CLOCK, quiet, verify=True).units == made.units + 1
+    assert restored_from(stick, tmp_path / "mended").damaged_units == ()
+
+
+def test_an_older_backup_is_used_if_the_newest_is_damaged(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    write_backup(store, stick, CLOCK, quiet)
+    newest = max(stick.rglob("backups/*.age"))
+    newest.write_bytes(newest.read_bytes()[:-20])
+    assert (restored_from(stick, tmp_path / "new").number, restored_from(stick, tmp_path / "2").damaged_backups) == (
+        1,
+        (2,),
+    )
+    with pytest.raises(BackupDamaged):
+        restored_from(stick, tmp_path / "third", 2)
+    with pytest.raises(BackupDamaged, match="present: 1, 2"):
+        restored_from(stick, tmp_path / "third", 7)
+
+
+def test_a_torn_index_costs_a_copy_and_no_backup(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    before = expected(store)
+    write_backup(store, stick, CLOCK, quiet, key)
+    index = next(stick.rglob("index.txt"))
+    for content in (index.read_bytes()[:-50], b"\0" * 300):
+        index.write_bytes(content)
+        write_backup(store, stick, CLOCK, quiet)
+    restored_from(stick, tmp_path / "new")
+    assert shown(tmp_path / "new") == (before, 0)
+
+
+def test_a_stick_with_the_header_of_other_backups_gets_nothing(store: Path, stick: Path, key: BackupKey) -> None:
+    """Otherwise the next backups would be encrypted for the holder of another key."""
+    write_backup(store, stick, CLOCK, quiet, key)
+    path = find_folder(stick) / "backup.json"
+    path.write_text(path.read_text().replace(RECIPIENT, secret_key().public_key))
+    with pytest.raises(BackupDamaged, match="not that of this device"):
+        write_backup(store, stick, CLOCK, quiet)
+
+
+def test_a_stick_that_is_pulled_out_keeps_the_earlier_backups(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    before = expected(store)
+    write_backup(store, stick, CLOCK, quiet, key)
+    for number in range(3):
+        add_capture(store, f"later-{number}")
+
+    def pulled(done: int, _: int) -> None:
+        if done == len(store_contents.units(store)) - 2:
+            stick.rename(tmp_path / "in a pocket")
+
+    with pytest.raises(UsbDriveUnavailable):
+        write_backup(store, stick, CLOCK, pulled)
+    with pytest.raises(UsbDriveUnavailable):
+        write_backup(store, stick, CLOCK, quiet)
+    restored_from(tmp_path / "in a pocket", tmp_path / "new")
+    assert shown(tmp_path / "new") == (before, 0)
+    (tmp_path / "in a pocket").rename(stick)
+    assert write_backup(store, stick, CLOCK, quiet).number == 2
+    restored_from(stick, tmp_path / "newer")
+    assert shown(tmp_path / "newer") == (expected(store), 0)
+
+
+def test_a_capture_that_is_removed_during_a_backup_is_no_loss(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    removed = "captures/test"
+
+    def removing(done: int, _: int) -> None:
+        if done == 1 and (store / removed).exists():
+            shutil.rmtree(store / removed)
+            with closing(sqlite3.connect(store / "shelf.sqlite", isolation_level=None)) as tables:
+                tables.execute("DELETE FROM files WHERE capture_id = 'test'")
+                tables.execute("DELETE FROM captures WHERE id = 'test'")
+
+    write_backup(store, stick, CLOCK, removing, key)
+    restored_from(stick, tmp_path / "new")
+    found, reported = shown(tmp_path / "new")
+    assert (reported, "test" in found.captures) == (0, False)
+
+
+def test_a_damaged_database_is_not_backed_up(store: Path, stick: Path, key: BackupKey) -> None:
+    database = store / "shelf.sqlite"
+    shown(store)
+    content = bytearray(database.read_bytes())
+    content[4096 * 3 : 4096 * 5] = bytes(8192)
+    database.write_bytes(content)
+    with pytest.raises(StoreDamaged, match=r"shelf\.sqlite|malformed|refused"):
+        write_backup(store, stick, CLOCK, quiet, key)
+    assert not list(stick.rglob("backups/*.age"))
+
+
+def test_folders_that_hold_no_backup_are_named(stick: Path) -> None:
+    with pytest.raises(BackupDamaged, match="none"):
+        find_folder(stick)
+    for number in range(2):
+        BackupFolder(stick, key_for_recipients([RECIPIENT]).header)
+        assert len(list(stick.iterdir())) == number + 1
+    with pytest.raises(BackupDamaged, match="diffuscope-backup-"):
+        find_folder(stick)
+
+
+def test_a_restoration_without_room_changes_nothing(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    with pytest.raises(StoreFull):
+        restore_backup(find_folder(stick), SECRET, tmp_path / "new", quiet, free_bytes=lambda _: 1000)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == [".lock"]
+
+
+def test_an_archive_cannot_write_outside_the_store(tmp_path: Path) -> None:
+    for name in ("../outside", "/etc/outside", "captures/../../outside"):
+        with pytest.raises(BackupDamaged, match="outside"):
+            list(store_contents.unpacked(store_contents.packed({name: b"content"})))
