@@ -2,7 +2,7 @@
 
     diffuscope-backup-<id>/
         README.txt              how to restore
-        backup.json             id and recipients, in the clear (backup_key.py)
+        backup.json             id and recipients, in the clear (backup_key.py); backup-copy.json is the same
         objects/<sha256>.age    one folder of the store (a capture), as an encrypted tar archive
         index.txt               append-only: name of each backed-up content, and its object
         backups/<number>.age    one backup: everything else in the store, and the list of its objects
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from device import atomic_io
-from services.backup.backup_key import KEY_FILE, BackupHeader, read_header
+from services.backup.backup_key import HEADER_FILES, BackupHeader, read_model
 from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
 from services.records import blobs
@@ -97,12 +97,17 @@ class BackupFolder:
             _write_and_read_back(backup_path(self.folder, number), encrypted)
 
     def _write_header(self, header: BackupHeader) -> None:
-        path = self.folder / KEY_FILE
-        if not path.exists():
-            atomic_io.write_atomically(self.folder / "README.txt", README.encode())
-            atomic_io.write_atomically(path, header.model_dump_json(indent=1).encode())
-        elif read_header(self.folder) != header:
-            raise BackupDamaged(f"{path} is not that of this device's backups")
+        """Write each copy of the header that is missing or unreadable; BackupDamaged if one is of other backups."""
+        for name in HEADER_FILES:
+            path = self.folder / name
+            try:
+                present = read_model(path, BackupHeader)
+            except BackupDamaged:
+                _write_and_read_back(self.folder / "README.txt", README.encode())
+                _write_and_read_back(path, header.model_dump_json(indent=1).encode())
+                continue
+            if present != header:
+                raise BackupDamaged(f"{path} is not that of this device's backups")
 
     def _read_index(self) -> dict[str, tuple[str, int]]:
         """Return object and length by name; without torn lines, and without objects that are missing or incomplete."""
@@ -126,7 +131,7 @@ def backup_path(folder: Path, number: int) -> Path:
 
 def find_folder(place: Path) -> Path:
     """Return the folder of backups at `place`, or in it; BackupDamaged if there is none, or more than one."""
-    if (place / KEY_FILE).is_file() and (place / "objects").is_dir():
+    if (place / "objects").is_dir() and (place / "backups").is_dir():
         return place
     found = sorted(path for path in place.glob(f"{PREFIX}*") if path.is_dir())
     if len(found) != 1:
@@ -137,8 +142,14 @@ def find_folder(place: Path) -> Path:
 
 
 def _write_and_read_back(path: Path, content: bytes) -> None:
-    """Write a file durably and compare what the disk, and not the page cache, returns; BackupDamaged if it differs."""
-    atomic_io.write_atomically(path, content)
+    """Write a file durably and compare what the disk, and not the page cache, returns; BackupDamaged if it differs.
+
+    Under its own name at once: SHA-256 or age reveal an incomplete file, and on FAT a power cut within a rename can
+    damage a complete one.
+    """
+    path.unlink(missing_ok=True)  # incomplete, or changed
+    atomic_io.write_file(path, content)
+    atomic_io.fsync_folder(path.parent)
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     with open(descriptor, "rb") as file:
         os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)

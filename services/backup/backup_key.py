@@ -10,6 +10,7 @@ import hashlib
 import hmac
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -22,6 +23,7 @@ from services.errors import BackupDamaged, BackupKeyWrong
 from services.records import blobs
 
 KEY_FILE = "backup.json"
+HEADER_FILES = (KEY_FILE, "backup-copy.json")  # in a folder of backups: without the header no passphrase helps
 MIN_PASSPHRASE = 8  # characters; scrypt makes each guess cost about a second
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -137,8 +139,11 @@ def write_key(store: Path, key: BackupKey) -> None:
 
 
 def read_header(folder: Path) -> BackupHeader:
-    """Return the header of a folder of backups; BackupDamaged if it cannot be read."""
-    return read_model(folder / KEY_FILE, BackupHeader)
+    """Return the header of a folder of backups, from the first of two copies that can be read, else BackupDamaged."""
+    for name in HEADER_FILES[:-1]:
+        with suppress(BackupDamaged):
+            return read_model(folder / name, BackupHeader)
+    return read_model(folder / HEADER_FILES[-1], BackupHeader)
 
 
 def read_model(path: Path, model: type[Model]) -> Model:

@@ -36,7 +36,7 @@ def backup(
     from services.backup.write_backup import write_backup
 
     chosen = new_key or recipient is not None or passphrase_file is not None
-    needs_key = chosen or read_key(data) is None
+    needs_key = chosen or (read_key(data) is None and (data / "captures").is_dir())
     key = _new_key(recipient or [], passphrase_file) if needs_key else None
     made = write_backup(data, to, SystemClock(), _percent("backed up"), key, verify)
     typer.echo(

@@ -11,7 +11,7 @@ from device.errors import StoreError
 from services.backup import store_contents
 from services.backup.backup_folder import BackupFolder
 from services.backup.backup_key import BackupKey, LastBackup, read_key, write_key
-from services.errors import BackupKeyWrong
+from services.errors import BackupKeyWrong, RecordNotFound
 from services.records import schema
 from services.records.storage_errors import storage_errors
 
@@ -37,9 +37,12 @@ def write_backup(
 
     `progress` gets the number of folders of the store that are in the backup, and of all. `new_key` replaces the key of
     the backups, which then begin again in a folder of their own. `verify`: read the objects of earlier backups too, and
-    write what has changed again. Errors: BackupKeyWrong (no key is set), BackupDamaged (the stick does not return what
-    was written, or has a folder of other backups), UsbDriveFull, UsbDriveUnavailable, StoreDamaged, StoreError.
+    write what has changed again. Errors: RecordNotFound (no store), BackupKeyWrong (no key is set), BackupDamaged (the
+    stick does not return what was written, or has a folder of other backups), UsbDriveFull, UsbDriveUnavailable,
+    StoreDamaged, StoreError.
     """
+    if not (store / "captures").is_dir():
+        raise RecordNotFound(f"{store} holds no captures", "Give the folder of the captures with --data.")
     with storage_errors():
         key = new_key or read_key(store)
         if key is None:

@@ -67,6 +67,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "calibrations use {1} --archive {0}/b", "calibrations use 0000 --archive {0}/b",
     "snapshots", "snapshots list --data {0}/none", "snapshots restore x --data {0}/none --yes",
     "store", "store check --data {0}/none", "store rebuild --data {0}/none --yes",
+    "store backup --to {0}/none --data {0}/none", "store restore --from {0}/none --data {0}/none",
     "update", "update status --settings {0}/none.toml", "update check --settings {0}/none.toml",
     *(f"update {word} --settings {{0}}/none.toml" for word in ("restart", "settle", "answer", "tidy")),
     "update install {0}/none.raucb --settings {0}/none.toml",

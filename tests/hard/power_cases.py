@@ -25,6 +25,7 @@ from services.records.protocol import load_protocol
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 from tests.earlier import RAW, Release, store_of_version
+from tests.hard.power_backup import back_up, judge_backup, judge_restored, restore, with_backup, with_new_device
 from tests.hard.power_fat import (
     FILES,
     commit,
@@ -335,6 +336,10 @@ CASES = {
     "a visit goes onto a FAT stick": Case(
         with_stick, export, judge_export, frozenset({"old", "empty", "new"}), ("stick",)
     ),
+    "a backup is written on a FAT stick": Case(
+        with_backup, back_up, judge_backup, frozenset({"old", "unreadable", "new"}), ("stick",)
+    ),
+    "a backup is restored": Case(with_new_device, restore, judge_restored, OLD_NEW),
     "careless: no wait": Case(with_note, does_not_wait, judge_note, frozenset({"old", "new", "empty", "lost"})),
     "careless: the file alone": Case(
         with_note, waits_for_the_file_alone, judge_note, frozenset({"old", "new", "lost"})

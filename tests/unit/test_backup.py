@@ -14,6 +14,7 @@ from device.errors import StoreFull
 from services.backup import store_contents
 from services.backup.backup_folder import BackupFolder, find_folder
 from services.backup.backup_key import (
+    HEADER_FILES,
     BackupKey,
     SecretKey,
     key_for_passphrase,
@@ -241,6 +242,16 @@ def test_a_stick_with_the_header_of_other_backups_gets_nothing(store: Path, stic
     path.write_text(path.read_text().replace(RECIPIENT, secret_key().public_key))
     with pytest.raises(BackupDamaged, match="not that of this device"):
         write_backup(store, stick, CLOCK, quiet)
+
+
+@pytest.mark.parametrize("name", HEADER_FILES)
+def test_one_copy_of_the_header_is_enough(store: Path, stick: Path, tmp_path: Path, key: BackupKey, name: str) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    (find_folder(stick) / name).write_bytes(b"\0" * 100)
+    restored_from(stick, tmp_path / "new")
+    write_backup(store, stick, CLOCK, quiet)
+    contents = {(find_folder(stick) / one).read_bytes() for one in HEADER_FILES}
+    assert len(contents) == 1, "the damaged copy is written again"
 
 
 def test_a_stick_that_is_pulled_out_keeps_the_earlier_backups(
