@@ -12,7 +12,13 @@ from datetime import datetime
 from device.config.operating_limits import is_battery_low, is_too_hot
 from device.errors import DiffuscopeError, StoreError
 from services.health import thresholds
-from services.health.thresholds import MAX_COMPUTER_C, MAX_LATENESS_S, MAX_SHOWN_VISITS, MIN_VISITS_LEFT
+from services.health.thresholds import (
+    MAX_COMPUTER_C,
+    MAX_LATENESS_S,
+    MAX_SHOWN_VISITS,
+    MAX_UNSAVED_DAYS,
+    MIN_VISITS_LEFT,
+)
 from services.records.recovery_report import RecoveryReport
 
 
@@ -43,7 +49,7 @@ class StatusSnapshot:
     minus the time budget; `torn_bytes`: size of each quarantined capture; `orphans`: number of complete capture folders
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
-    restored.
+    restored; `backup_at`: time of the last backup; `unsaved_since`: time of the first capture that is in no backup.
     """
 
     state: str
@@ -67,6 +73,8 @@ class StatusSnapshot:
     damaged: int = 0
     unsent: tuple[int, int] | None = None
     recovery: RecoveryReport = field(default_factory=RecoveryReport)
+    backup_at: datetime | None = None
+    unsaved_since: datetime | None = None
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -223,6 +231,17 @@ def sending(facts: StatusSnapshot) -> Check:
     return Check("sending", stuck == 0, f"{waiting} wait, {stuck} of them need help", limit, remedy)
 
 
+def backup(facts: StatusSnapshot) -> Check:
+    """Check that no capture of more than a week ago is in no backup."""
+    value = "none yet" if facts.backup_at is None else f"last on {facts.backup_at:%Y-%m-%d}"
+    is_due = thresholds.is_backup_due(facts.now, facts.unsaved_since)
+    limit = f"every picture within {MAX_UNSAVED_DAYS:.0f} days"
+    return Check("backup", not is_due, value, limit, BACKUP_REMEDY if is_due else "")
+
+
+BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
+
+
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
@@ -230,7 +249,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
-    camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending,
+    camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
 )  # fmt: skip
 
 

@@ -1,9 +1,12 @@
 """Status collector: the inputs of the health checks from instrument, capture store, upload queue and computer."""
 
+from datetime import datetime
 from pathlib import Path
 
 from device.clock import Clock
 from device.errors import StoreError
+from services.backup.backup_key import read_key
+from services.errors import BackupDamaged
 from services.health.checks import StatusSnapshot
 from services.health.instrument_status import InstrumentStatus
 from services.records.capture import Capture
@@ -25,6 +28,7 @@ def collect_status(
 ) -> StatusSnapshot:
     """Return the current inputs of the checks; `unsent` as in `StatusSnapshot`."""
     newest, orphans, damaged, error = _store_status(store, people)
+    backup_at, unsaved_since = _backup_status(store)
     return StatusSnapshot(
         state=instrument.state,
         problem=instrument.problem,
@@ -47,7 +51,25 @@ def collect_status(
         orphans=orphans,
         damaged=damaged,
         recovery=store.recovery,
+        backup_at=backup_at,
+        unsaved_since=unsaved_since,
     )
+
+
+def _backup_status(store: CaptureStore) -> tuple[datetime | None, datetime | None]:
+    """Return the time of the last backup, and of the first capture that is in none; None without one.
+
+    A key or database that cannot be read counts as no backup and no capture: the check `captures` reports the store.
+    """
+    try:
+        key = read_key(store.folder)
+        backup_at = None if key is None or key.last is None else key.last.made_at
+    except BackupDamaged:
+        backup_at = None
+    try:
+        return backup_at, store.first_taken_after(backup_at)
+    except StoreError:
+        return backup_at, None
 
 
 def _store_status(store: CaptureStore, people: VisitRepository) -> tuple[list[Capture], int, int, StoreError | None]:

@@ -5,7 +5,7 @@ the age of a calibration is judged in device/calibration/calibration_validity.py
 """
 
 import math
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 
 from device.config.operating_limits import is_too_hot
 
@@ -16,6 +16,7 @@ MAX_COMPUTER_C = 80.0  # a Raspberry Pi reduces its clock above this
 WARM_MARGIN_C = 5.0  # margin below the limit of the head at which it counts as warm
 COOLING_S = 300.0  # the text of the alert says five minutes
 VISITS_PER_CHARGE = 60  # visits per charge: an estimate, three hours at three minutes each; no battery is chosen yet
+MAX_UNSAVED_DAYS = 7.0  # age of the first capture that is in no backup: a week of pictures may be lost with the device
 EARLIEST_DATE = datetime(2026, 1, 1, tzinfo=UTC)  # before the first instrument
 MAX_CLOCK_DRIFT_S = 3600.0  # difference of date and monotonic time; no clock drifts so far in a day
 
@@ -43,6 +44,11 @@ def is_warm(head_c: float, limit_c: float) -> bool:
 def visits_per_battery(charge_ratio: float, least_ratio: float) -> int:
     """Return the estimated number of visits until the charge (0 to 1) falls to the least one; negative below it."""
     return math.floor((charge_ratio - least_ratio) * VISITS_PER_CHARGE + 1e-9)  # 10 visits are not 9.999
+
+
+def is_backup_due(now: datetime, unsaved_since: datetime | None) -> bool:
+    """Return whether the first capture that is in no backup, if there is one, is older than MAX_UNSAVED_DAYS."""
+    return unsaved_since is not None and now - unsaved_since > timedelta(days=MAX_UNSAVED_DAYS)
 
 
 def earliest_date(newest: datetime | None) -> datetime:

@@ -32,6 +32,7 @@ from device.errors import (
     TooHot,
 )
 from services.errors import (
+    BackupKeyWrong,
     Busy,
     ControlLeaseHeld,
     CrossOriginRequest,
@@ -40,6 +41,7 @@ from services.errors import (
     PinWrong,
     RecordNotFound,
     RequestRefused,
+    RestoreRefused,
     ServerFull,
     StoreDamaged,
     UntrustedHost,
@@ -85,6 +87,8 @@ HTTP_STATUS: dict[type[DiffuscopeError], int] = {
     LoginRequired: 401,
     PinWrong: 403,
     PinLockedOut: 429,
+    BackupKeyWrong: 403,
+    RestoreRefused: 409,
     StoreFull: 507,
     UsbDriveFull: 507,
     UpdateNoRoom: 507,

@@ -25,6 +25,7 @@ from device.config.head_file import InstrumentSpec
 from device.errors import DiffuscopeError, InputError
 from device.head import open_bench, open_head
 from device.light_safety.hazard import light_limits
+from services.backup.backup_runner import BackupRunner
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
 from services.health.event_log import EventLog
@@ -33,6 +34,7 @@ from services.http.authentication import PinAuthenticator
 from services.http.connection_limits import ConnectionLimits, ConnectionTable, LimitedConfig, LimitedListener
 from services.http.log_rate import LOGGER_NAMES, LogRateLimit
 from services.http.routes.accuracy import accuracy_routes
+from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.http.security import own_host_names
@@ -115,10 +117,12 @@ def serve(
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
         authenticator = PinAuthenticator(data / "technician.json", clock)
+        backups = undo.enter_context(closing(BackupRunner(data, lambda: arbiter.is_idle, clock)))
         routers = [
             accuracy_routes(explorer, store, lambda: arbiter.exam.head.calibration),
             update_routes(UpdateRequests(*updater, clock, version("diffuscope")), authenticator),
             event_log_routes(event_log, UsbDrives(), clock),
+            backup_routes(backups, store, UsbDrives(), clock),
         ]
         names = own_host_names() + host_names
         app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)

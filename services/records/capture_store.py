@@ -24,10 +24,12 @@ import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from sqlalchemy import func, select
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session
 
@@ -35,7 +37,7 @@ from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import blobs, capture_rows, schema
+from services.records import blobs, capture_rows, row_validation, schema
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.quarantine import Quarantine
@@ -172,6 +174,21 @@ class CaptureStore:
         """
         with self._reading() as session:
             return sum(len(page.damaged) for page in capture_rows.pages(session, PAGE_ROWS))
+
+    def first_taken_after(self, moment: datetime | None) -> datetime | None:
+        """Return the time of the first capture after a moment, or of the first of all; None without one.
+
+        StoreDamaged if the database is damaged. An unreadable time counts as none.
+        """
+        query = select(func.min(CaptureRow.taken_at))
+        if moment is not None:
+            query = query.where(CaptureRow.taken_at > schema.utc_text(moment))
+        with self._reading() as session:
+            first = session.scalar(query)
+        try:
+            return None if first is None else row_validation.timestamp(first)
+        except ValueError:
+            return None
 
     def get(self, id: str) -> Capture:
         """Return the capture with that id; its files are not checked.

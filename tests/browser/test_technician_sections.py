@@ -188,3 +188,21 @@ def test_health_report_is_copied_saved_and_shown_as_qr_code(technician_page: Pag
     technician_page.locator("#report-code").tap()
     expect(technician_page.get_by_role("img", name="The report as a code for a telephone")).to_be_visible()
     assert layout_faults(technician_page, ".report svg") == []
+
+
+def test_a_passphrase_is_set_before_the_first_backup(technician_page: Page) -> None:
+    open_section(technician_page, "backup")
+    section = technician_page.locator("instrument-backup")
+    expect(section.get_by_role("status")).to_have_text("There is no backup yet.")
+    first, second = section.locator("input").all()
+    first.fill("four plain words here")
+    second.fill("four plain words hers")
+    section.get_by_role("button").tap()
+    expect(section.get_by_role("alert")).to_have_text("The two passphrases differ.")
+    assert layout_faults(technician_page, "instrument-backup form") == []
+    second.fill("four plain words here")
+    section.get_by_role("button").tap()
+    expect(section.get_by_role("note")).to_contain_text("The passphrase is set.", timeout=30_000)
+    section.locator("#back-up").tap()
+    expect(section.get_by_role("note")).to_contain_text("stick")
+    assert layout_faults(technician_page, "#back-up") == []

@@ -177,7 +177,20 @@ def exports() -> list[dict[str, Any]]:
         log.ask(copy, at, json=log.key(folder="/etc"))
         log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=str(device.stick)))
         _diary(log)
+        _backups(log)
         return log.exchanges
+
+
+def _backups(log: Transcript) -> None:
+    """Record a backup; the technician is logged in."""
+    at, passphrase = "/api/technician/backup", "POST /api/technician/backup/passphrase"
+    log.ask(f"GET {at}")
+    log.ask(passphrase, json={"passphrase": "short"})
+    log.ask(passphrase, json={"passphrase": "four plain words here"})
+    log.ask(f"POST {at}", json={"folder": "/etc"})
+    log.ask(f"POST {at}", json={"folder": str(log.instrument.stick)})
+    log.ask("POST /api/technician/lock")
+    log.ask(f"GET {at}", note="nobody is logged in")
 
 
 def _diary(log: Transcript) -> None:

@@ -25,6 +25,7 @@ from device.errors import CameraMissing
 from device.head import Bench, Head, open_bench, open_head
 from device.ports import Camera
 from device.values import ExposureSettings, Frame
+from services.backup.backup_runner import BackupRunner
 from services.delivery.uploader import Uploader, VisitArchive
 from services.delivery.usb_drives import UsbDrives
 from services.errors import UploadRejected
@@ -32,6 +33,7 @@ from services.health.event_log import EventLog
 from services.http.app import Application, create_app
 from services.http.authentication import PinAuthenticator
 from services.http.routes.accuracy import accuracy_routes
+from services.http.routes.backup import backup_routes
 from services.http.routes.event_log import event_log_routes
 from services.http.routes.updates import update_routes
 from services.instrument.accuracy_explorer import AccuracyExplorer
@@ -225,10 +227,13 @@ def instrument(calibrated_before: bool = True, carrier: Uploader | None = None) 
         diary = EventLog(folder / "diary")
         undo.callback(diary.close)
         desk = UpdateRequests(board.state, board.requests, clock, "1.0")
+        backups = BackupRunner(folder / "data", lambda: owner.is_idle, clock)
+        undo.callback(backups.close)
         rooms = [
             accuracy_routes(explorer, store, lambda: owner.exam.head.calibration),
             update_routes(desk, door),
             event_log_routes(diary, sticks, clock),
+            backup_routes(backups, store, sticks, clock),
         ]
         application = create_app(
             owner, door, host_names=("eye.local",), usb_drives=sticks, technician_routers=rooms, uploader=carrier

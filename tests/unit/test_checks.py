@@ -17,6 +17,7 @@ HEALTHY = StatusSnapshot(
     state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
     battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
     newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0),
+    unsaved_since=datetime(2026, 11, 14, 12, tzinfo=UTC),
 )  # fmt: skip
 FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("camera", {"problem": CameraMissing("the camera is gone")}),
@@ -38,6 +39,7 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("database", {"recovery": RecoveryReport(rebuilt_because="it is missing or empty")}),
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
+    ("backup", {"unsaved_since": datetime(2026, 11, 14, 11, tzinfo=UTC)}),
 ]
 
 

@@ -2,6 +2,7 @@
 
 import "./event_log.js";
 import "./accuracy_time.js";
+import "./backup.js";
 import "./health.js";
 import "./software_update.js";
 import { html } from "../vendor/lit-html.js";
@@ -12,6 +13,7 @@ const SECTIONS = {
   health: html`<instrument-health class="column"></instrument-health>`,
   explorer: html`<accuracy-time class="column"></accuracy-time>`,
   diary: html`<instrument-diary class="column"></instrument-diary>`,
+  backup: html`<instrument-backup class="column"></instrument-backup>`,
   update: html`<software-update class="column"></software-update>`,
 };
 
