@@ -128,13 +128,17 @@ def serve(
         app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
         table = ConnectionTable(ConnectionLimits(), clock)
         config = LimitedConfig(app.http, table, backlog=ACCEPTS, timeout_graceful_shutdown=1)
-        log.info("started, version %s", app.http.version)
-        if torn := ", ".join(store.newly_quarantined):
-            log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
+        _log_start(app.http.version, store)
         ready()
         stop.register(Server(config, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _log_start(version: str, store: CaptureStore) -> None:
+    log.info("started, version %s", version)
+    if torn := ", ".join(store.newly_quarantined):
+        log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
 
 
 def _open_exam(context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer) -> ExamService:
