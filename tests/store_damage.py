@@ -10,27 +10,35 @@ import shutil
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Literal
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from device.calibration.archive import Archive
 from device.clock import VirtualClock
-from device.errors import DiffuscopeError
+from device.errors import CalibrationDamaged, CalibrationMissing, DiffuscopeError
+from services.backup.backup_key import KEY_FILE, key_for_recipients, read_key, write_key
 from services.delivery.visit_json import visit_as_json
-from services.errors import RecordNotFound, StoreDamaged
+from services.errors import BackupDamaged, LoginRequired, RecordNotFound, StoreDamaged
+from services.http.authentication import PinAuthenticator
 from services.records.capture import Capture, CaptureReport, PictureVerdict
-from services.records.capture_journal import CaptureJournal
+from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_log import LOG
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.quarantine import REQUIRED_FILES
 from services.records.upload_queue import UploadQueue, UploadReceipt
 from services.records.visit_repository import VisitRepository
+from tests.unit.test_archive import WHO, calibration
 
 VISITS = 4
+PIN = "2580"
+RECIPIENT = "age1zvkyg2lqzraa2lnjvqej32nkuu0ues2s82hzrye869xeexvn73equnujwj"  # a public key of the tests of age
+RECORD_FOLDERS = ("captures", "patients", "visits")
 WINDOW_S = 86_400.0
 FILES = {name: name.encode() * 40 for name in sorted(REQUIRED_FILES)}
 Outcome = Literal["whole", "reported"]
@@ -39,12 +47,13 @@ PIECE_BYTES = 4096
 
 @dataclass(frozen=True)
 class Shown:
-    """What a store shows: captures and visits by id, files by (capture, name), doses (J/cm2) by eye."""
+    """What a store shows: captures and visits by id, files by (capture, name), doses (J/cm2) by eye, settings."""
 
     captures: Mapping[str, Capture]
     visits: Mapping[str, str]
     files: Mapping[tuple[str, str], bytes]
     doses: Mapping[str, float]
+    settings: Mapping[str, str] = field(default_factory=dict)
 
 
 def filled_store(folder: Path, *, with_log: bool) -> Path:
@@ -79,18 +88,25 @@ def filled_store(folder: Path, *, with_log: bool) -> Path:
         queue = UploadQueue(store.engine, clock)
         first = queue.queued()[0]
         queue.record_success(first, UploadReceipt("0" * 64, "sha256"))
+        CaptureJournal(store).begin(InterruptedCapture("2026-9-OD", "OD", visit, "R-centre", 1), next(keys))
+        Archive(original / "calibrations" / "head").add_and_activate(calibration(), WHO)
+        PinAuthenticator(original / "technician.json", clock).set_pin(PIN, None)
+        write_key(original, key_for_recipients([RECIPIENT]))
         if with_log:
             return shutil.copytree(original, folder / "with log")
     return original
 
 
-def shown(folder: Path) -> tuple[Shown, int]:
-    """Open a store as the program does; return what it shows, and the number of records reported as damaged."""
+def shown(folder: Path, with_settings: bool = False) -> tuple[Shown, int]:
+    """Open a store as the program does; return what it shows, and the number of records reported as damaged.
+
+    `with_settings`: also the journal, the calibration, the login and the key of the backups.
+    """
     clock = VirtualClock(elapsed_s=100.0)
     with CaptureStore(folder, reserve_bytes=0) as store:
         people = VisitRepository(store.engine, load_protocol(), clock)
         light = DoseLedgerStore(store.engine, clock, WINDOW_S, "boot")
-        CaptureJournal(store)
+        journal = CaptureJournal(store).interrupted
         queue = UploadQueue(store.engine, clock)
         queue.status()
         queue.queued(sizes=True)
@@ -106,35 +122,64 @@ def shown(folder: Path) -> tuple[Shown, int]:
                     reported += 1
         visits = {one.id: json.dumps(visit_as_json(one), sort_keys=True) for one in people.visits(1000)}
         doses = {eye: light.spent_j_per_cm2(eye) for eye in ("OD", "OS")}
-        return Shown(captures, visits, files, doses), reported
+        settings = dict[str, str]()
+        if with_settings:
+            settings, missing = settings_of(folder, journal)
+            reported += missing
+        return Shown(captures, visits, files, doses, settings), reported
 
 
-def expected(store: Path) -> Shown:
+def settings_of(folder: Path, journal: tuple[InterruptedCapture, ...]) -> tuple[dict[str, str], int]:
+    """Return what the other files of a store give, and how many of them are reported as damaged or missing.
+
+    A damaged entry of the journal is reported by its missing visit; nothing in it was acknowledged.
+    """
+    found, reported = {one.id: repr(one) for one in journal if one.visit}, sum(one.visit is None for one in journal)
+    reads: dict[str, Callable[[], object]] = {
+        "calibration": lambda: Archive(folder / "calibrations" / "head").load().calibration.id,
+        "login": lambda: bool(PinAuthenticator(folder / "technician.json", VirtualClock()).log_in(PIN)),
+        "key": lambda: read_key(folder),
+    }
+    for name, read in reads.items():
+        try:
+            value = read()
+        except (CalibrationDamaged, CalibrationMissing, StoreDamaged, BackupDamaged, LoginRequired):
+            value = None
+        reported += value is None
+        if value is not None:
+            found[name] = repr(value)
+    return found, reported
+
+
+def expected(store: Path, with_settings: bool = False) -> Shown:
     """Return what an undamaged store shows; a copy of it is opened, because an opening empties the write-ahead log."""
     copy = shutil.copytree(store, store.with_name("expected"))
-    before, reported = shown(copy)
+    before, reported = shown(copy, with_settings)
     assert not reported
+    assert len(before.settings) == (4 if with_settings else 0)
     shutil.rmtree(copy)
     return before
 
 
-def judge(folder: Path, before: Shown) -> tuple[Outcome, list[str]]:
-    """Return the outcome of opening a damaged store, and its violations.
+def judge(folder: Path, before: Shown, with_settings: bool) -> tuple[Outcome, list[str]]:
+    """Return the outcome of opening a damaged store, and its violations; `with_settings` as in `shown`.
 
     A violation is a silent loss, a silent change of what is shown, a lower dose, or an exception.
     """
     try:
-        after, reported = shown(folder)
+        after, reported = shown(folder, with_settings)
     except (DiffuscopeError, SQLAlchemyError, sqlite3.Error, OSError, ValueError, TypeError, KeyError) as error:
         return "reported", [f"failed start: {type(error).__name__}: {error}"]
     violations = []
-    for name in ("captures", "visits", "files"):
+    for name in ("captures", "visits", "files", "settings"):
         expected, found = getattr(before, name), getattr(after, name)
         violations += [f"silent change: {name} {key}" for key, value in found.items() if expected.get(key) != value]
-        if len(found) < len(expected) and not reported:
+        if len(found) < len(expected) and not reported and name != "settings":
             violations.append(f"silent loss: {name} {sorted(expected.keys() - found.keys())}")
     violations += [f"lower dose: {eye}" for eye, dose in before.doses.items() if after.doses[eye] < dose - 1e-9]
     complete = (after.captures, after.visits, after.files) == (before.captures, before.visits, before.files)
+    if with_settings:
+        complete = complete and after.settings == before.settings
     return ("whole" if complete else "reported"), violations
 
 
@@ -208,18 +253,18 @@ DAMAGES: dict[str, Damage] = {
 
 
 def targets(folder: Path, which: str) -> list[Path]:
-    """Return the files of a store that belong to a class: "database", "log", "ledger", or "files" in its folders."""
+    """Return the files of a class: "database", "log", "ledger", "files" of records, or "settings" (all others)."""
     every = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     database = {"database": "shelf.sqlite", "log": "shelf.sqlite-wal"}
     if which in database:
         return [path for path in every if path.name == database[which]]
     if which == "ledger":
-        return [
-            path
-            for path in every
-            if path.parent == folder and path.name not in ("shelf.sqlite", "shelf.sqlite-wal", "shelf.sqlite-shm")
-        ]
-    return [path for path in every if path.parent != folder]
+        return [path for path in every if path.name == LOG]
+    of_records = [path for path in every if path.relative_to(folder).parts[0] in RECORD_FOLDERS]
+    if which == "files":
+        return of_records
+    others = {"calibrations", "underway", "technician.json", KEY_FILE}
+    return [path for path in every if path.relative_to(folder).parts[0] in others]
 
 
 @dataclass(frozen=True)
@@ -241,6 +286,8 @@ SHARES = {  # of the trials, in thousandths
     ("zeros", "database"): 20, ("zeros", "log"): 15, ("zeros", "files"): 15, ("zeros", "ledger"): 5,
     ("removed", "files"): 20, ("removed", "database"): 2, ("removed", "log"): 1, ("removed", "ledger"): 2,
     ("swapped", "files"): 20, ("table", "database"): 10,
+    ("bit", "settings"): 90, ("truncated", "settings"): 15, ("zeros", "settings"): 10, ("removed", "settings"): 10,
+    ("swapped", "settings"): 10,
 }  # fmt: skip
 
 
@@ -272,9 +319,10 @@ def run_trial(stores: Mapping[bool, Path], before: Mapping[bool, Shown], planned
     damage, target, seed = planned.damage, planned.target, planned.seed
     folder = shutil.copytree(stores[planned.with_log], scratch / f"{damage}-{target}-{seed}")
     change = DAMAGES[damage](folder, targets(folder, target), random.Random(f"{damage} {target} {seed}"))
-    outcome, violations = judge(folder, before[planned.with_log])
+    with_settings = target == "settings"
+    outcome, violations = judge(folder, before[planned.with_log], with_settings)
     if seed % 10 == 0:
-        second, more = judge(folder, before[planned.with_log])
+        second, more = judge(folder, before[planned.with_log], with_settings)
         violations += more if second == outcome else [*more, f"the second opening shows another state: {second}"]
     shutil.rmtree(folder)
     return Trial(damage, target, change, outcome, tuple(violations))

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from device import atomic_io
-from services.backup.backup_key import HEADER_FILES, BackupHeader, read_model
+from services.backup.backup_key import HEADER_FILES, BackupHeader, encoded_model, read_model
 from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
 from services.records import blobs
@@ -104,7 +104,7 @@ class BackupFolder:
                 present = read_model(path, BackupHeader)
             except BackupDamaged:
                 _write_and_read_back(self.folder / "README.txt", README.encode())
-                _write_and_read_back(path, header.model_dump_json(indent=1).encode())
+                _write_and_read_back(path, encoded_model(header))
                 continue
             if present != header:
                 raise BackupDamaged(f"{path} is not that of this device's backups")

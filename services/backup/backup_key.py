@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from device import atomic_io
 from services.errors import BackupDamaged, BackupKeyWrong
-from services.records import blobs
+from services.records import blobs, digested_json
 
 KEY_FILE = "backup.json"
 HEADER_FILES = (KEY_FILE, "backup-copy.json")  # in a folder of backups: without the header no passphrase helps
@@ -135,7 +135,7 @@ def read_key(store: Path) -> BackupKey | None:
 
 def write_key(store: Path, key: BackupKey) -> None:
     """Write the key into the folder of a store, atomically; OSError if the disk refuses."""
-    atomic_io.write_atomically(store / KEY_FILE, key.model_dump_json(indent=1).encode(), 0o600)
+    atomic_io.write_atomically(store / KEY_FILE, encoded_model(key), 0o600)
 
 
 def read_header(folder: Path) -> BackupHeader:
@@ -146,10 +146,15 @@ def read_header(folder: Path) -> BackupHeader:
     return read_model(folder / HEADER_FILES[-1], BackupHeader)
 
 
+def encoded_model(model: BaseModel) -> bytes:
+    """Return a model as JSON with a digest, for `read_model`."""
+    return digested_json.encoded(model.model_dump(mode="json"))
+
+
 def read_model(path: Path, model: type[Model]) -> Model:
-    """Return the content of a JSON file as a model; BackupDamaged if it cannot be read."""
+    """Return the content of a JSON file as a model; BackupDamaged if it cannot be read, or if one bit has changed."""
     try:
-        return model.model_validate_json(blobs.read_blob(path))
+        return model.model_validate(digested_json.decoded(blobs.read_blob(path)))
     except (OSError, ValueError) as error:
         raise BackupDamaged(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
 

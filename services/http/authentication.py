@@ -2,7 +2,6 @@
 
 import hashlib
 import hmac
-import json
 import secrets
 from pathlib import Path
 from threading import Lock
@@ -11,10 +10,12 @@ from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError
 from services.errors import LoginRequired, PinLockedOut, PinWrong, StoreDamaged
+from services.records import digested_json
 
 MIN_DIGITS, MAX_DIGITS = 4, 12  # digits
 IDLE_TIMEOUT_S = 300.0
 MAX_LOCK_OUT_S = 300.0
+WITHOUT_DIGEST = frozenset({"salt", "hash"})  # entries of the file of an earlier release
 SCRYPT_COST: dict[str, int] = {"n": 2**14, "r": 8, "p": 1}  # scrypt: 16 MB and about 50 ms per guess
 
 
@@ -55,7 +56,7 @@ class PinAuthenticator:
             if not (pin.isascii() and pin.isdecimal() and MIN_DIGITS <= len(pin) <= MAX_DIGITS):
                 raise PinWrong("this cannot be a PIN", f"Choose {MIN_DIGITS} to {MAX_DIGITS} digits.")
             salt = secrets.token_bytes(16)
-            content = json.dumps({"salt": salt.hex(), "hash": _hash(pin, salt).hex()}).encode("ascii")
+            content = digested_json.encoded({"salt": salt.hex(), "hash": _hash(pin, salt).hex()})
             try:
                 atomic_io.write_atomically(self._file, content, mode=0o600)
             except OSError as error:
@@ -120,8 +121,8 @@ class PinAuthenticator:
 
     def _read_hash(self) -> tuple[bytes, bytes]:
         try:
-            stored = json.loads(self._file.read_bytes())
-            return bytes.fromhex(stored["salt"]), bytes.fromhex(stored["hash"])
+            stored = digested_json.decoded(self._file.read_bytes(), WITHOUT_DIGEST)
+            return bytes.fromhex(str(stored["salt"])), bytes.fromhex(str(stored["hash"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             message = f"the file with the technician's PIN is damaged: {error}"
             raise StoreDamaged(message, f"Remove {self._file} and choose a new PIN.") from error

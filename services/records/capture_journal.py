@@ -1,16 +1,20 @@
 """Journal of captures in progress, written before their exposure: after a power cut it lists the captures to repeat."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from device import atomic_io
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
+from services.records import digested_json
 from services.records.capture_store import CaptureStore
 from services.records.storage_errors import storage_errors
+
+WITHOUT_KEY = frozenset({"id", "eye", "visit", "slot", "tries"})  # entries of earlier releases
+WITHOUT_DIGEST = WITHOUT_KEY | {"key"}
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ class CaptureJournal:
         Errors: StoreFull, StoreError.
         """
         with storage_errors():
-            atomic_io.write_file(self._folder / f"{press.id}.json", json.dumps(asdict(press) | {"key": key}).encode())
+            content = digested_json.encoded(asdict(press) | {"key": key})
+            atomic_io.write_file(self._folder / f"{press.id}.json", content)
             atomic_io.fsync_folder(self._folder)
 
     def end(self, id: str, key: str | None = None) -> None:
@@ -97,20 +102,29 @@ def _is_kept(store: CaptureStore, id: str) -> bool:
 
 
 def _read(path: Path) -> InterruptedCapture:
+    """Return the interrupted capture in an entry; with id and eye only if the entry is incomplete or has changed."""
     try:
-        entry = json.loads(path.read_bytes())
+        entry = _entries(path)
         return InterruptedCapture(path.stem, entry["eye"], entry["visit"], entry["slot"], entry["tries"])
-    except (ValueError, KeyError, TypeError):  # incomplete after a power cut
+    except (ValueError, KeyError, TypeError):
         return InterruptedCapture(path.stem, _eye_in(path.stem))
 
 
 def _key(path: Path) -> str | None:
     """Return the idempotency key in a journal entry; None without one, or if the entry cannot be read."""
     try:
-        key = json.loads(path.read_bytes())["key"]
-    except (ValueError, KeyError, TypeError):  # incomplete, or of an earlier release
+        key = _entries(path).get("key")
+    except ValueError:
         return None
     return key if isinstance(key, str) else None
+
+
+def _entries(path: Path) -> Mapping[str, Any]:
+    """Return the entries of a journal file; ValueError if it is incomplete or has changed."""
+    content = path.read_bytes()
+    with suppress(ValueError):
+        return digested_json.decoded(content, WITHOUT_DIGEST)
+    return digested_json.decoded(content, WITHOUT_KEY)
 
 
 def _eye_in(name: str) -> Eye | None:

@@ -22,6 +22,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
+from services.records.recovery import rebuild_database
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 from tests.earlier import RAW, Release, store_of_version
@@ -216,6 +217,25 @@ def judge_migration(folder: Path, acknowledged: list[str]) -> str:
     return "old" if version == "r0001" else "new"
 
 
+def with_damaged_database(folder: Path) -> None:
+    shelf_with_one(folder)
+    (folder / "shelf.sqlite").write_bytes(b"damaged" * 1000)
+
+
+def rebuild(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    rebuild_database(folder)
+    with CaptureStore(folder, reserve_bytes=0):
+        acknowledge("before")
+
+
+def judge_rebuilt(folder: Path, acknowledged: list[str]) -> str:
+    """The capture is there at any time, and the damaged database stays."""
+    outcome = judge_kept_beside(folder, acknowledged or ["before"])
+    damaged = [path.read_bytes() for path in folder.glob("damaged/*/shelf.sqlite")]
+    assert b"damaged" * 1000 in damaged
+    return outcome
+
+
 def half_kept(folder: Path) -> None:
     shelf_with_one(folder)
     (folder / "captures" / ".half.part").mkdir()
@@ -329,6 +349,7 @@ CASES = {
     "the first calibration": Case(nothing, first_calibration, judge_calibration, frozenset({"none", "new"})),
     "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB"), ("chooser",)),
     "tables are brought forward": Case(earlier_shelf, migrate, judge_migration, OLD_NEW),
+    "a damaged database is rebuilt": Case(with_damaged_database, rebuild, judge_rebuilt, frozenset({"old"})),
     "a torn capture is moved aside": Case(half_kept, opened, judge_swept, OLD_NEW),
     "a snapshot is put back": Case(
         with_snapshot, restore_snapshot, judge_restored_snapshot, frozenset({"old", "refused", "new"})

@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -67,9 +68,11 @@ def content(folder: Path) -> tuple[object, ...]:
     """Return the files of a folder and the rows of its databases after recovery, for comparison across page layouts."""
     rows: list[object] = []
     for path in sorted(folder.rglob("shelf.sqlite")):
-        connection = sqlite3.connect(path)
-        rows += [str(path.relative_to(folder)), *connection.iterdump()]
-        connection.close()
+        with closing(sqlite3.connect(path)) as connection:
+            try:
+                rows += [str(path.relative_to(folder)), *connection.iterdump()]
+            except sqlite3.DatabaseError:  # of a case with a damaged database
+                rows.append(path.read_bytes())
     for path in sorted(folder.rglob("*")):
         if not path.name.startswith("shelf.sqlite"):
             rows += [str(path.relative_to(folder)), path.is_file() and path.read_bytes()]

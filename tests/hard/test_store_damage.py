@@ -20,7 +20,7 @@ FLIPS, OTHERS = 1_000, 200
 def run_all(folder: Path, trials: int) -> list[Trial]:
     """Run the planned trials in two processes, each on a copy of one of two stores in `folder`."""
     stores = {with_log: filled_store(folder / f"{with_log}", with_log=with_log) for with_log in (False, True)}
-    before = {with_log: expected(store) for with_log, store in stores.items()}
+    before = {with_log: expected(store, with_settings=True) for with_log, store in stores.items()}
     scratch = folder / "scratch"
     scratch.mkdir()
     planned: list[Planned] = plan(trials)

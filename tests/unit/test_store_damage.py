@@ -17,7 +17,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Path]:
 
 
 def test_no_damage_of_one_file_is_silent(stores: dict[bool, Path], tmp_path: Path) -> None:
-    before = {with_log: expected(store) for with_log, store in stores.items()}
+    before = {with_log: expected(store, with_settings=True) for with_log, store in stores.items()}
     every = plan(20 * SAMPLE)
     trials = [run_trial(stores, before, trial, tmp_path) for trial in every[:: len(every) // SAMPLE]]
     assert len(trials) >= SAMPLE

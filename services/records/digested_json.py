@@ -1,0 +1,34 @@
+"""JSON object in a file, with the SHA-256 of its other entries: one changed bit is an error and no other value."""
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+
+from services.records.json_values import JsonObject, JsonValue
+
+DIGEST = "sha256"
+
+
+def encoded(entries: Mapping[str, JsonValue]) -> bytes:
+    """Return the entries as JSON, with their digest as a further entry."""
+    return json.dumps({**entries, DIGEST: _digest(entries)}, indent=1).encode()
+
+
+def decoded(content: bytes, earlier: Collection[str] = ()) -> JsonObject:
+    """Return the entries of an object that `encoded` wrote; ValueError if it has changed.
+
+    `earlier`: names of the entries of an object that an earlier release wrote without a digest.
+    """
+    entries: JsonValue = json.loads(content)
+    if not isinstance(entries, dict):
+        raise ValueError(f"{type(entries).__name__} where an object was written")
+    if earlier and entries.keys() == set(earlier):
+        return entries
+    rest = {name: value for name, value in entries.items() if name != DIGEST}
+    if entries.get(DIGEST) != _digest(rest):
+        raise ValueError("its SHA-256 differs")
+    return rest
+
+
+def _digest(entries: Mapping[str, JsonValue]) -> str:
+    return hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
