@@ -1,16 +1,17 @@
 """Journal of captures in progress, written before their exposure: after a power cut it lists the captures to repeat."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from device import atomic_io
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
-from services.records import digested_json
+from services.records import digested_json, row_validation
 from services.records.capture_store import CaptureStore
+from services.records.json_values import JsonObject
+from services.records.record_document import whole_number
 from services.records.storage_errors import storage_errors
 
 WITHOUT_KEY = frozenset({"id", "eye", "visit", "slot", "tries"})  # entries of earlier releases
@@ -105,7 +106,9 @@ def _read(path: Path) -> InterruptedCapture:
     """Return the interrupted capture in an entry; with id and eye only if the entry is incomplete or has changed."""
     try:
         entry = _entries(path)
-        return InterruptedCapture(path.stem, entry["eye"], entry["visit"], entry["slot"], entry["tries"])
+        eye = row_validation.one_of(entry["eye"], *EYES, None)
+        visit, slot = (None if entry[name] is None else row_validation.text(entry[name]) for name in ("visit", "slot"))
+        return InterruptedCapture(path.stem, eye, visit, slot, whole_number(entry["tries"]))
     except (ValueError, KeyError, TypeError):
         return InterruptedCapture(path.stem, _eye_in(path.stem))
 
@@ -119,7 +122,7 @@ def _key(path: Path) -> str | None:
     return key if isinstance(key, str) else None
 
 
-def _entries(path: Path) -> Mapping[str, Any]:
+def _entries(path: Path) -> JsonObject:
     """Return the entries of a journal file; ValueError if it is incomplete or has changed."""
     content = path.read_bytes()
     with suppress(ValueError):

@@ -1,0 +1,98 @@
+"""A store that belongs to another user, and two programs on one store."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from device.errors import StoreError
+from services.records.capture import Capture, CaptureReport
+from services.records.capture_store import CaptureStore
+from tests.project_files import ROOT
+
+OTHER_USER_ID = 65534  # has no rights on any file
+FILES = {"raw.tiff": b"raw", "picture.png": b"picture", "report.json": b"{}", "quick.jpg": b"", "dark.tiff": b"d"}
+ADDED = 10
+WRITER = """
+import sys
+from pathlib import Path
+from tests.unit.test_store_access import add_captures
+add_captures(Path(sys.argv[1]), sys.argv[2])
+"""
+
+
+def add_captures(folder: Path, name: str) -> None:
+    """Store ADDED captures; what another process does."""
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        for number in range(ADDED):
+            store.save(capture(f"{name}-{number}"), FILES)
+
+
+def capture(id: str) -> Capture:
+    return Capture(id, "OD", datetime(2026, 3, 1, tzinfo=UTC), True, "00ff", CaptureReport(), {})
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A store with one capture, below a folder that every user can enter."""
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        with CaptureStore(Path(place) / "store", reserve_bytes=0) as store:
+            store.save(capture("mine"), FILES)
+        yield Path(place) / "store"
+
+
+def run_as(user_id: int, act: Callable[[], None]) -> int | None:
+    """Run `act` as another user in a forked process, whose modules are loaded already; return its exit status."""
+
+    def run() -> None:
+        os.setgroups([])
+        os.setgid(user_id)
+        os.setuid(user_id)
+        act()
+
+    child = multiprocessing.get_context("fork").Process(target=run)
+    child.start()
+    child.join()
+    return child.exitcode
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+@pytest.mark.filterwarnings("ignore:This process.*fork:DeprecationWarning")  # the child starts no thread
+@pytest.mark.parametrize(("folder_mode", "database_mode"), [(0o700, 0o600), (0o755, 0o644), (0o777, 0o444)])
+def test_a_store_of_another_user_is_a_clear_error_and_stays_as_it_was(
+    folder: Path, folder_mode: int, database_mode: int
+) -> None:
+    folder.chmod(folder_mode)
+    (folder / "shelf.sqlite").chmod(database_mode)
+    before = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
+
+    def open_it() -> None:
+        with pytest.raises(StoreError, match=r"refused: .*([Pp]ermission|readonly|open)"):
+            CaptureStore(folder, reserve_bytes=0)
+
+    assert run_as(OTHER_USER_ID, open_it) == 0
+    after = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
+    assert {path: after.get(path) for path in before} == before
+    folder.chmod(0o700)
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert store.read("mine", "raw.tiff") == FILES["raw.tiff"]
+
+
+def test_two_programs_on_one_store_lose_nothing(folder: Path) -> None:
+    """The lock of the store serialises writers, and an opening does not take a capture being written for a torn one."""
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, str(folder), name], cwd=ROOT) for name in ("first", "second")
+    ]
+    assert [writer.wait(120) for writer in writers] == [0, 0]
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        expected = {"mine", *(f"{name}-{number}" for name in ("first", "second") for number in range(ADDED))}
+        assert {one.id for one in store.captures()} == expected
+        assert all(store.read(one, name) == FILES[name] for one in expected for name in FILES)
+        assert store.newly_quarantined == ()
