@@ -34,7 +34,8 @@ DiffuscopeError
 │   ├── CalibrationRefused       frames do not show the target of the step
 │   └── CalibrationStopped       cancelled by the technician
 └── StoreError                   failure of a write to the disk
-    └── StoreFull                no space left
+    ├── StoreFull                no space left
+    └── StoreReadOnly            the disk takes no changes
 """
 
 from typing import ClassVar
@@ -285,3 +286,10 @@ class StoreFull(StoreError):
 
     code = "store.full"
     default_remedy = "No space left. Nothing that was kept is lost. Copy pictures to a USB stick and remove old ones."
+
+
+class StoreReadOnly(StoreError):
+    """The disk takes no changes: it is mounted read-only, fails, or belongs to another user."""
+
+    code = "store.readonly"
+    default_remedy = "Nothing that was kept is lost. Copy to a USB stick or send, and call the technician."

@@ -14,14 +14,13 @@ from contextlib import closing
 from pathlib import Path
 
 from services.errors import BackupDamaged, StoreDamaged
-from services.records import blobs
+from services.records import blobs, reserve_file, schema, snapshots
 from services.records.record_files import CAPTURE_RECORD
 
 # Logs of the database (their rows are in its copy), older copies of it, the present reserve, and measurements of the
 # computer, which another one has to make again.
-NOT_BACKED_UP = frozenset(
-    {"shelf.sqlite-wal", "shelf.sqlite-shm", "shelf.sqlite-journal", "snapshots", "replaced", "plans", "explorer"}
-)
+_DATABASE_LOGS = (f"{schema.DATABASE}-{suffix}" for suffix in snapshots.LOG_SUFFIXES)
+NOT_BACKED_UP = frozenset({*_DATABASE_LOGS, "snapshots", "replaced", "plans", "explorer", reserve_file.NAME})
 
 
 def units(store: Path) -> list[str]:

@@ -12,7 +12,7 @@ from threading import Lock
 from typing import Protocol
 
 from device.clock import Clock
-from device.errors import DiffuscopeError, StoreError
+from device.errors import DiffuscopeError, StoreError, StoreReadOnly
 from services.health import alerts
 from services.health.alerts import Alert, AlertCode, CoolingTimer
 from services.health.collector import CLOCK_SYNCHRONISED_FILE
@@ -100,6 +100,8 @@ class AlertMonitor:
 
     def _of_space(self) -> Iterator[Alert]:
         store, slots = self._sources.store, self._sources.visits.protocol.slots
+        if isinstance(store.refusal, StoreReadOnly):  # the problem of the next live picture says so
+            return iter(())
         return alerts.space_alerts(store.space.captures_left(), store.space.visits_left(len(slots)))
 
     def _of_instrument(self) -> Iterator[Alert]:

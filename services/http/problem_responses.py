@@ -29,6 +29,7 @@ from device.errors import (
     LightLimit,
     PowerLow,
     StoreFull,
+    StoreReadOnly,
     TooHot,
 )
 from services.errors import (
@@ -90,6 +91,7 @@ HTTP_STATUS: dict[type[DiffuscopeError], int] = {
     BackupKeyWrong: 403,
     RestoreRefused: 409,
     StoreFull: 507,
+    StoreReadOnly: 503,
     UsbDriveFull: 507,
     UpdateNoRoom: 507,
     UpdateError: 409,

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Self
 
 import uvicorn
+from fastapi import FastAPI
 
 from device.calibration.archive import Archive
 from device.clock import Clock, SystemClock
@@ -47,6 +48,7 @@ from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol
+from services.records.read_only_store import opened_store
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +108,8 @@ def serve(
     receiver. Everything that was opened is closed at every exit. SystemExit(0) for a signal before the server runs.
     """
     clock = SystemClock()
-    with _Stop() as stop, address, CaptureStore(data, clock=clock) as store, ExitStack() as undo, _limited_logs(clock):
+    with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
+        data = store.folder  # of a read-only store: its copy in memory
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "diary")))
@@ -126,13 +129,16 @@ def serve(
         ]
         names = own_host_names() + host_names
         app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
-        table = ConnectionTable(ConnectionLimits(), clock)
-        config = LimitedConfig(app.http, table, backlog=ACCEPTS, timeout_graceful_shutdown=1)
         _log_start(app.http.version, store)
         ready()
-        stop.register(Server(config, context.event_bus)).run(sockets=[address])
+        stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server":
+    table = ConnectionTable(ConnectionLimits(), clock)
+    return Server(LimitedConfig(app, table, backlog=ACCEPTS, timeout_graceful_shutdown=1), event_bus)
 
 
 def _log_start(version: str, store: CaptureStore) -> None:

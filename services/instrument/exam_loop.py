@@ -61,7 +61,9 @@ class ExamLoop:
     def __init__(self, parts: ExamParts, pipeline: CapturePipeline) -> None:
         self._parts, self._requests, self._events = parts, parts.requests, parts.events
         self._pipeline = pipeline
-        self._live = LivePictures(parts.head.light, parts.clock, pipeline, parts.requests, parts.events)
+        self._live = LivePictures(
+            parts.head.light, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
+        )
         self._exposed: deque[ExposedCapture] = deque()
         self._last_update_s = 0.0
 
@@ -95,7 +97,7 @@ class ExamLoop:
     def _expose_pending(self) -> None:
         """Expose the waiting press, lit and dark, publish its first verdict and queue the exposure for reconstruction.
 
-        The consent is checked again and a journal entry written before the light; an error fails the press.
+        Consent and space are checked and a journal entry is written before the light; an error fails the press.
         """
         press = self._requests.take_press()
         self._events.state()
@@ -110,6 +112,7 @@ class ExamLoop:
 
     def _expose(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
         press.target.permit()  # again: the consent may have been withdrawn while the press waited
+        self._parts.store.refuse_light_in_vain()
         self._parts.capture_journal.begin(press.journal_entry(id), press.key)
         self._events.stage(press, id, "expose")
         exposure = self._pipeline.expose(press.eye, in_visit=press.target.visit is not None)

@@ -1,5 +1,7 @@
 """Live pictures between captures and during a refinement: aiming light, picture, aiming hint, pause."""
 
+from collections.abc import Callable
+
 from device.clock import Clock
 from device.errors import DiffuscopeError
 from device.light_safety.guard import GuardedLight
@@ -12,13 +14,17 @@ RETRY_S = 1.0
 
 
 class LivePictures:
-    """Live pictures while a client requests them. Not thread-safe: the thread `head` calls it."""
+    """Live pictures while a client requests them. Not thread-safe: the thread `head` calls it.
+
+    `refuse_in_vain` raises StoreError if no capture could be stored: then there is no aiming light either.
+    """
 
     def __init__(
-        self, light: GuardedLight, clock: Clock, pipeline: CapturePipeline, requests: ExamRequests, events: ExamEvents
-    ) -> None:
+        self, light: GuardedLight, clock: Clock, pipeline: CapturePipeline, requests: ExamRequests, events: ExamEvents,
+        refuse_in_vain: Callable[[], None],
+    ) -> None:  # fmt: skip
         self._light, self._clock, self._pipeline = light, clock, pipeline
-        self._requests, self._events = requests, events
+        self._requests, self._events, self._refuse_in_vain = requests, events, refuse_in_vain
 
     @property
     def are_wanted(self) -> bool:
@@ -48,6 +54,7 @@ class LivePictures:
         except RequestRefused:  # the consent was withdrawn after the request
             self._requests.withdraw(wanted)
             return None
+        self._refuse_in_vain()
         seen = self._pipeline.expose_live(wanted.eyes, in_visit=wanted.visit is not None)
         if self._requests.snapshot.state.has_press:
             return None

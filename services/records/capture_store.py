@@ -47,6 +47,7 @@ from services.records.record_rows import capture_content, file_entries
 from services.records.record_signing import PAGE_ROWS, recorded, write_signature
 from services.records.recovery import Recovery, damage_of, set_aside
 from services.records.recovery_report import RecoveryReport
+from services.records.reserve_file import ReserveFile
 from services.records.restoration import finish_restoration
 from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
@@ -62,10 +63,11 @@ class CaptureStore:
     """Store of captures in one folder; opening it migrates the tables and moves incomplete captures to quarantine.
 
     `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening, `recovery` what was
-    restored from the files of the records. `quarantine`, `space` and `write_ahead_log` are the parts of the store for
-    those matters. Several threads may read while one writes; a lock file serialises writers across threads and
-    processes. Opening and closing checkpoint the write-ahead log. Errors at opening: StoreError, StoreFull,
-    StoreDamaged.
+    restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
+    is recovered or quarantined, and every change raises this error. `quarantine`, `space` and `write_ahead_log` are the
+    parts of the store for those matters. Several threads may read while one writes; a lock file serialises writers
+    across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at opening: StoreError,
+    StoreFull, StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
@@ -78,8 +80,9 @@ class CaptureStore:
         reserve_bytes: int = atomic_io.RESERVE_BYTES,
         free_bytes: Callable[[Path], int] = atomic_io.free_bytes,
         clock: Clock | None = None,
+        refusal: StoreError | None = None,
     ) -> None:
-        self.folder = folder
+        self.folder, self.refusal = folder, refusal
         self._captures, self._lock = folder / "captures", folder / ".lock"
         database, torn = folder / schema.DATABASE, folder / "torn"
         with storage_errors(), ExitStack() as cleanup:
@@ -95,9 +98,14 @@ class CaptureStore:
                 finish_restoration(folder)
                 damage = self._set_damaged_database_aside()
                 schema.migrate(self.engine, snapshots.create)
-                self.recovery = Recovery(folder, self.engine, damage).run()
-                self.newly_quarantined = self.quarantine.move_incomplete()
-                self.write_ahead_log.checkpoint_if_possible()
+                if refusal is None:
+                    self.recovery = Recovery(folder, self.engine, damage).run()
+                    self.newly_quarantined = self.quarantine.move_incomplete()
+                    self.write_ahead_log.checkpoint_if_possible()
+                    ReserveFile(folder).allocate_if_room(reserve_bytes, free_bytes(folder))
+                else:
+                    self.recovery, self.newly_quarantined = RecoveryReport(rebuilt_because=damage), ()
+                    schema.refuse_changes(self.engine, refusal)
             cleanup.pop_all()
 
     def close(self) -> None:
@@ -137,6 +145,7 @@ class CaptureStore:
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
+            schema.refuse_if_read_only(self.engine)
             self.space.make_room(length_bytes)
             with _removed_when_full(part, kept):
                 blobs.write_folder(part, files)
@@ -221,8 +230,14 @@ class CaptureStore:
             raise StoreDamaged(f"{name} of {id} is not what was kept: its SHA-256 differs")
         return content
 
+    def refuse_light_in_vain(self) -> None:
+        """Raise StoreFull or StoreReadOnly if a capture could not be stored: called before its light."""
+        schema.refuse_if_read_only(self.engine)
+        self.space.refuse_without_room()
+
     def check_writable(self) -> None:
         """Write and remove a folder with a small file, as durably as a capture; StoreFull or StoreError on failure."""
+        schema.refuse_if_read_only(self.engine)
         trial = self.folder / ".trial"
         with storage_errors(), atomic_io.file_lock(self._lock):
             shutil.rmtree(trial, ignore_errors=True)  # left by a killed process

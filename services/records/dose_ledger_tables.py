@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 
 from sqlalchemy import Engine, Integer, delete, literal_column, select
 from sqlalchemy.orm import Session
@@ -14,6 +13,7 @@ from device.light_safety.dose_ledger import SLOT_S, DoseLedgerState, Reserved
 from device.values import EYES, Eye
 from services.records import schema
 from services.records.dose_ledger_log import DoseLedgerLog, raise_to
+from services.records.reserve_file import ReserveFile
 from services.records.schema import CaptureRow, DoseRow, ObservedTimeRow
 from services.records.storage_errors import storage_errors
 
@@ -49,7 +49,8 @@ class DoseLedgerStore:
         self._engine, self._clock, self._window_s = engine, clock, window_s
         # With a random id the time between two openings does not count as observed, so doses expire later.
         self._boot = boot or boot_id()
-        self._log = DoseLedgerLog(Path(str(engine.url.database)).parent)
+        self._log = DoseLedgerLog(schema.folder_of(engine))
+        self._reserve = ReserveFile(schema.folder_of(engine))
         is_lost = self._is_lost()
         with self._writing() as state:
             if is_lost:
@@ -65,8 +66,9 @@ class DoseLedgerStore:
         """Count a dose (J/cm2) for each of the eyes before the exposure; return the reservation for `settle`.
 
         LightLimit if the dose of an eye would exceed `stop_j_per_cm2`: then no dose is counted. The observed time is
-        stored in both cases.
+        stored in both cases. StoreFull or StoreReadOnly if the store takes no changes: no light without its record.
         """
+        schema.refuse_if_read_only(self._engine)
         refused: LightLimit | None = None
         with self._writing() as state:
             try:
@@ -79,8 +81,12 @@ class DoseLedgerStore:
 
     def settle(self, reserved: Reserved, given_j_per_cm2: float) -> None:
         """Replace the dose of a reservation by the dose (J/cm2) that was given, for each of its eyes."""
-        with self._writing() as state:
-            state.settle(reserved, given_j_per_cm2)
+
+        def write() -> None:
+            with self._writing() as state:
+                state.settle(reserved, given_j_per_cm2)
+
+        self._reserve.retried(write)
 
     @contextmanager
     def _writing(self) -> Iterator[DoseLedgerState]:

@@ -11,6 +11,7 @@ from device.clock import Clock
 from services.errors import IdempotencyKeyConflict
 from services.records import schema
 from services.records.record_signing import recorded
+from services.records.reserve_file import ReserveFile
 from services.records.schema import IdempotencyKeyRow
 from services.records.storage_errors import storage_errors
 
@@ -22,19 +23,16 @@ class IdempotentRequests:
 
     def __init__(self, engine: Engine, clock: Clock) -> None:
         self._engine, self._clock = engine, clock
+        self._reserve = ReserveFile(schema.folder_of(engine))
 
     def run_in_transaction(self, key: str, request: str, act: Callable[[Session], str]) -> str:
         """Run a change and store its idempotency key and answer in one transaction; return the answer.
 
         For a repeated key return the stored answer; IdempotencyKeyConflict if the key belongs to another request.
+        StoreFull or StoreReadOnly if the store takes no changes.
         """
-        with storage_errors(), recorded(self._engine) as session:
-            before = self.find(session, key, request)
-            if before is None:
-                answer = act(session)
-                self.store(session, key, request, answer)
-                return answer
-            return before
+        schema.refuse_if_read_only(self._engine)
+        return self._reserve.retried(lambda: self._run(key, request, act))
 
     def run_once(self, key: str, request: str, act: Callable[[], str]) -> str:
         """Run an action such as an export, and store its answer; for a repeated key return the stored answer instead.
@@ -47,7 +45,16 @@ class IdempotentRequests:
         if before is not None:
             return before
         answer = act()
-        return self.run_in_transaction(key, request, lambda _: answer)
+        return self._run(key, request, lambda _: answer)  # also in a read-only store, whose tables are a copy
+
+    def _run(self, key: str, request: str, act: Callable[[Session], str]) -> str:
+        with storage_errors(), recorded(self._engine) as session:
+            before = self.find(session, key, request)
+            if before is None:
+                answer = act(session)
+                self.store(session, key, request, answer)
+                return answer
+            return before
 
     def find(self, session: Session, key: str, request: str) -> str | None:
         """Return the stored answer of a request; None for a new key, IdempotencyKeyConflict for a key in use."""

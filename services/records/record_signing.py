@@ -9,7 +9,6 @@ import logging
 import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Engine, Row, select, update
@@ -42,7 +41,7 @@ def recorded(engine: Engine) -> Iterator[Session]:
     If the block or the commit fails, the files describe the rows as before. Errors: those of the block, of the disk and
     of SQLite, which `storage_errors` converts.
     """
-    files, written = RecordFiles(Path(str(engine.url.database)).parent), list[RecordDocument]()
+    files, written = RecordFiles(schema.folder_of(engine)), list[RecordDocument]()
     with Session(schema.for_writing(engine)) as session:
         try:
             with session.begin():

@@ -33,7 +33,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from device.errors import SettingError
+from device.errors import SettingError, StoreError
 from services.records.capture import Capture
 from services.records.capture_report import report_as_json
 
@@ -361,6 +361,11 @@ def open_engine(path: Path) -> Engine:
     return engine
 
 
+def folder_of(engine: Engine) -> Path:
+    """Return the folder of the store whose tables these are."""
+    return Path(str(engine.url.database)).parent
+
+
 def _prepare(connection: Any, _entry: ConnectionPoolEntry) -> None:
     """Set up one new connection: no transaction handling by the driver, text decoding by `decoded`, PRAGMAS."""
     connection.isolation_level = None
@@ -378,6 +383,18 @@ def _begin(connection: Connection) -> None:
     """Begin a transaction; with `for_writing` take the write lock at once: an upgrade of a read lock cannot wait."""
     writing = connection.get_execution_options().get("writing", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+
+
+def refuse_changes(engine: Engine, refusal: StoreError) -> None:
+    """Let `refuse_if_read_only` raise this error: the tables are a copy that ends with the program."""
+    engine.update_execution_options(refusal=refusal)
+
+
+def refuse_if_read_only(engine: Engine) -> None:
+    """Raise the error given to `refuse_changes`, if there is one; to be called before a change is acknowledged."""
+    refusal: StoreError | None = engine.get_execution_options().get("refusal")
+    if refusal is not None:
+        raise type(refusal)(refusal.message, refusal.remedy)
 
 
 def for_writing(engine: Engine) -> Engine:

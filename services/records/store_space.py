@@ -60,6 +60,11 @@ class StoreSpace:
             total_bytes, number = session.execute(sizes).one()
         return self._usable_bytes() * number // total_bytes if total_bytes else self.captures_left() // pictures
 
+    def refuse_without_room(self) -> None:
+        """Raise StoreFull if not even one more capture fits."""
+        if self.captures_left() == 0:
+            raise StoreFull(f"{self._free_bytes(self._folder)} bytes are free, too few for a capture")
+
     def count_capture(self, length_bytes: int) -> None:
         """Count one more stored capture of that length."""
         if self._sizes is not None:

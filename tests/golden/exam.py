@@ -19,6 +19,7 @@ from device.sim.world import World
 from device.values import Calibration, Eye, Illumination
 from services.errors import ConsentDeclined
 from services.instrument.events import EventBus
+from services.records import digested_json
 from services.records.capture_target import CaptureTarget
 from tests.golden import compare
 from tests.journey.asking import live_picture, with_all_chips
@@ -150,7 +151,8 @@ class Stage:
     def add_journal(self) -> None:
         """Append the content of the journal of interrupted captures to the trace."""
         notes = sorted((self.rig.store.folder / "underway").iterdir())
-        self.trace.add(journal=[json.loads(path.read_bytes()) for path in notes])
+        entries = [digested_json.decoded(path.read_bytes()) for path in notes]  # the digest depends on the id
+        self.trace.add(journal=entries)
 
     def close(self) -> None:
         """Close from another thread, as the server does after SIGTERM; return after the exam has begun to close."""

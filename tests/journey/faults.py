@@ -174,7 +174,7 @@ def slow_capture(rig: Rig, disk: DiskStub) -> Observation:
     observations: list[Observation] = []
 
     def delay_once() -> None:
-        if rig.exam.state != "aim" and not observations:
+        if rig.exam.state == "making" and not observations:
             disk.on_query = lambda: None
             rig.clock.sleep(10)
             observations.append(active_alert(rig, "make.slow"))

@@ -11,9 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from device.errors import StoreError
+from device.clock import VirtualClock
+from device.errors import StoreError, StoreReadOnly
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
+from services.records.dose_ledger_tables import DoseLedgerStore
+from services.records.protocol import load_protocol
+from services.records.read_only_store import opened_store
+from services.records.visit_repository import VisitRepository
 from tests.project_files import ROOT
 
 OTHER_USER_ID = 65534  # has no rights on any file
@@ -83,6 +88,39 @@ def test_a_store_of_another_user_is_a_clear_error_and_stays_as_it_was(
     folder.chmod(0o700)
     with CaptureStore(folder, reserve_bytes=0) as store:
         assert store.read("mine", "raw.tiff") == FILES["raw.tiff"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+@pytest.mark.filterwarnings("ignore:This process.*fork:DeprecationWarning")  # the child starts no thread
+def test_a_store_that_may_only_be_read_is_shown_and_takes_nothing(folder: Path) -> None:
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o755)
+
+    def read() -> None:
+        with opened_store(folder, VirtualClock()) as store:
+            assert store.read("mine", "raw.tiff") == FILES["raw.tiff"]
+            with pytest.raises(StoreReadOnly, match="ermission"):
+                store.save(capture("other"), FILES)
+            with pytest.raises(StoreReadOnly):
+                store.refuse_light_in_vain()
+            ledger = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, "boot")
+            with pytest.raises(StoreReadOnly):
+                ledger.reserve(("OD",), 0.0, 1.0)
+            people = VisitRepository(store.engine, load_protocol(), VirtualClock())
+            with pytest.raises(StoreReadOnly):
+                people.begin("0123456789abcdef")
+
+    assert run_as(OTHER_USER_ID, read) == 0
+    with opened_store(folder, VirtualClock()) as store:
+        assert [one.id for one in store.captures()] == ["mine"]
+        assert store.refusal is None
+
+
+def test_an_error_that_is_not_of_the_disk_does_not_open_the_store_for_reading(folder: Path) -> None:
+    (folder / ".lock").unlink()
+    (folder / ".lock").mkdir()
+    with pytest.raises(StoreError, match="directory"), opened_store(folder, VirtualClock()):
+        pytest.fail("it opened")
 
 
 def test_two_programs_on_one_store_lose_nothing(folder: Path) -> None:

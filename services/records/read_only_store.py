@@ -1,0 +1,92 @@
+"""Opening of the store on a disk that takes no changes: full, mounted read-only, failing, or of another user.
+
+The tables and the small files are copied into memory, where they can be migrated and read; captures and calibrations
+are read from the disk. Every change is refused with the reason, and with the dose ledger all light. Exports, uploads
+and backups work; that they were made is known until the program ends.
+"""
+
+import errno
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from sqlalchemy.exc import DBAPIError
+
+from device import atomic_io
+from device.clock import Clock
+from device.errors import StoreError, StoreFull, StoreReadOnly
+from services.errors import StoreDamaged
+from services.records.capture_store import CaptureStore
+from services.records.reserve_file import NAME, ReserveFile
+from services.records.storage_errors import sqlite_name, storage_errors
+
+log = logging.getLogger(__name__)
+
+READ_FROM_DISK = ("captures", "calibrations", "torn", "damaged", "conflicts")
+NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "explorer"})
+_ERRNOS = frozenset({errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM})
+_SQLITE_NAMES = ("SQLITE_READONLY", "SQLITE_IOERR", "SQLITE_CANTOPEN", "SQLITE_PERM", "SQLITE_FULL")
+
+
+@contextmanager
+def opened_store(folder: Path, clock: Clock) -> Iterator[CaptureStore]:
+    """Open the store in a folder, and close it at exit; read-only if its disk takes no changes; a context manager.
+
+    On a full disk the reserve file is released first. Errors: those of `CaptureStore`, if the disk can be written or if
+    it cannot be read either.
+    """
+    try:
+        store = _opened(folder, clock)
+    except StoreDamaged:
+        raise
+    except StoreError as error:
+        refusal = _refusal(error)
+        if refusal is None:
+            raise
+        log.error("the store is opened for reading only: %s", refusal.message)
+        with _copy_opened(folder, clock, refusal) as copy:
+            yield copy
+        return
+    with store:
+        yield store
+
+
+def _opened(folder: Path, clock: Clock) -> CaptureStore:
+    """Open the store for reading and writing; on a full disk once more without the reserve file."""
+    with storage_errors():
+        return ReserveFile(folder).retried(lambda: CaptureStore(folder, clock=clock))
+
+
+@contextmanager
+def _copy_opened(folder: Path, clock: Clock, refusal: StoreError) -> Iterator[CaptureStore]:
+    with TemporaryDirectory(prefix="diffuscope-") as temporary:
+        place = Path(temporary)
+        with storage_errors():
+            for source in sorted(folder.iterdir()):
+                _copy(source, place / source.name)
+        with CaptureStore(place, reserve_bytes=0, free_bytes=lambda _: 0, clock=clock, refusal=refusal) as store:
+            yield store
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy a file or folder of the store, or link what is read from the disk; nothing for what is not needed."""
+    if source.name in READ_FROM_DISK:
+        target.symlink_to(source.absolute())
+    elif source.is_dir() and source.name not in NOT_COPIED:
+        shutil.copytree(source, target)
+    elif source.name not in NOT_COPIED:
+        shutil.copy(source, target)
+
+
+def _refusal(error: StoreError) -> StoreError | None:
+    """Return the error of every later change if this one means a disk that takes no changes; None for another error."""
+    cause = error.__cause__
+    if isinstance(error, StoreFull):
+        return error
+    if isinstance(cause, OSError):
+        return StoreReadOnly(error.message) if cause.errno in _ERRNOS or atomic_io.is_full(cause) else None
+    name = sqlite_name(cause.orig if isinstance(cause, DBAPIError) else cause)
+    return StoreReadOnly(error.message) if name.startswith(_SQLITE_NAMES) else None
