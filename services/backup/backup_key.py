@@ -82,7 +82,10 @@ class BackupHeader(BaseModel):
 
 
 class LastBackup(BaseModel):
-    """The last complete backup of a device: number, time, folder, folders of the store in it, and bytes written."""
+    """The last backup of a device: number, time, folder, folders of the store in it, and bytes written.
+
+    `unreadable`: folders of the store that the disk of the device did not return, and which are not in it.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -91,6 +94,7 @@ class LastBackup(BaseModel):
     folder: str
     units: int
     written_bytes: int
+    unreadable: tuple[str, ...] = ()
 
 
 class BackupKey(BaseModel):

@@ -10,11 +10,12 @@ from device.clock import Clock
 from device.errors import DiffuscopeError, StoreError
 from services.backup.backup_key import LastBackup, key_for_passphrase, read_key, write_key
 from services.backup.write_backup import write_backup
-from services.errors import Busy
+from services.errors import Busy, StoreDamaged
 from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
 
+UNREADABLE = "Everything else is in the backup. The memory card fails: call the technician, and replace it."
 PAUSE_S = 0.2  # between two looks whether the exam still computes
 
 
@@ -80,7 +81,10 @@ class BackupRunner:
         error: DiffuscopeError | None = None
         try:
             made = write_backup(self._folder, place, self._clock, self._report)
-            log.info("backup %s is complete: %s folders, %s bytes written", made.number, made.units, made.written_bytes)
+            log.info("backup %s: %s folders, %s bytes written", made.number, made.units, made.written_bytes)
+            if made.unreadable:
+                listed = ", ".join(made.unreadable[:5])
+                error = StoreDamaged(f"{len(made.unreadable)} folders are not in the backup: {listed}", UNREADABLE)
         except DiffuscopeError as problem:
             log.warning("the backup failed: %s", problem)
             error = problem

@@ -43,6 +43,10 @@ def backup(
         f"Backup {made.number} in {made.folder}: {made.units} folders, {made.written_bytes / 1e6:.1f} MB written, "
         "read back."
     )
+    for unit in made.unreadable:
+        typer.echo(f"Not in the backup, because the disk does not return it: {unit}", err=True)
+    if made.unreadable:
+        sys.exit(1)
 
 
 def restore(

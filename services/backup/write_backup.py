@@ -69,16 +69,17 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     The database is copied first: the folder of a capture is complete before its row, so no row is without its files.
     """
     database = store_contents.database_copy(store / schema.DATABASE)
-    paths, objects, written_bytes = store_contents.units(store), dict[str, str](), 0
+    paths, objects, unreadable, written_bytes = store_contents.units(store), dict[str, str](), list[str](), 0
     for done, unit in enumerate(paths):
         progress(done, len(paths))
-        name = key.name(store_contents.fingerprint(store, unit))
-        sha256 = target.object_of(name)
-        if sha256 is None:
-            encrypted = key.header.encrypted(store_contents.packed_unit(store, unit))
-            written_bytes += len(encrypted)
-            sha256 = target.add(name, encrypted)
-        objects[unit] = sha256
+        try:
+            objects[unit], unit_bytes = _object_of(store, unit, target, key)
+            written_bytes += unit_bytes
+        except FileNotFoundError:
+            raise
+        except OSError as error:  # of a failing disk, on which the other captures must still be backed up
+            log.error("%s cannot be backed up: %s", unit, error)
+            unreadable.append(unit)
     number, made_at = target.next_number(), clock.wall()
     rest = store_contents.rest_of_store(store) | {schema.DATABASE: database}
     manifest = Manifest(number=number, made_at=made_at, units=objects)
@@ -87,6 +88,16 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     target.add_backup(number, encrypted)
     progress(len(paths), len(paths))
     return LastBackup(
-        number=number, made_at=made_at, folder=str(target.folder), units=len(paths),
-        written_bytes=written_bytes + len(encrypted),
+        number=number, made_at=made_at, folder=str(target.folder), units=len(objects),
+        written_bytes=written_bytes + len(encrypted), unreadable=tuple(unreadable),
     )  # fmt: skip
+
+
+def _object_of(store: Path, unit: str, target: BackupFolder, key: BackupKey) -> tuple[str, int]:
+    """Return the object (SHA-256) of a unit, and the bytes that were written for it: 0 if the folder had it."""
+    name = key.name(store_contents.fingerprint(store, unit))
+    known = target.object_of(name)
+    if known is not None:
+        return known, 0
+    encrypted = key.header.encrypted(store_contents.packed_unit(store, unit))
+    return target.add(name, encrypted), len(encrypted)

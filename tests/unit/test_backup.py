@@ -296,6 +296,19 @@ def test_a_capture_that_is_removed_during_a_backup_is_no_loss(
     assert (reported, "test" in found.captures) == (0, False)
 
 
+def test_a_file_that_the_disk_does_not_return_costs_its_folder_only(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    """/proc/self/mem answers EIO, as a failing card does."""
+    unreadable = store / "captures/test/raw.tiff"
+    unreadable.unlink()
+    unreadable.symlink_to("/proc/self/mem")
+    made = write_backup(store, stick, CLOCK, quiet, key)
+    assert made.unreadable == ("captures/test",)
+    assert restored_from(stick, tmp_path / "new").units == made.units
+    assert len(shown(tmp_path / "new")[0].visits) == len(shown(store)[0].visits)
+
+
 def test_a_damaged_database_is_not_backed_up(store: Path, stick: Path, key: BackupKey) -> None:
     database = store / "shelf.sqlite"
     shown(store)
