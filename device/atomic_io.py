@@ -100,6 +100,14 @@ def replace_durably(source: Path, target: Path) -> None:
         fsync_folder(source.parent)
 
 
+def read_from_disk(path: Path) -> bytes:
+    """Return the content of a synced file as the disk has it, past the page cache."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    with open(descriptor, "rb") as file:
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        return file.read()
+
+
 def fsync_file(path: Path) -> None:
     """Fsync the content of a file, of which another program or function wrote all bytes."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -24,6 +24,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── RestoreRefused                the store holds records already
 │   ├── UsbDriveFull                  no space on the USB drive
 │   ├── UsbDriveUnavailable           USB drive removed or not writable
+│   ├── RecordRemoved                 file removed to make room
 │   └── RecordNotFound (LookupError)  no such capture
 ├── UploadError                       upload of a visit failed
 │   ├── UploadDisabled                no receiver configured
@@ -192,6 +193,13 @@ class UsbDriveUnavailable(StoreError):
 
     code = "stick.gone"
     default_remedy = "The USB stick cannot be written. Nothing was lost. Put it in again, and copy once more."
+
+
+class RecordRemoved(StoreError):
+    """The file of a capture was removed to make room, after its visit was exported or sent."""
+
+    code = "store.removed"
+    default_remedy = "Look at the copy that was exported or sent, or in a backup."
 
 
 class RecordNotFound(StoreError, LookupError):

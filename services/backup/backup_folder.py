@@ -150,8 +150,5 @@ def _write_and_read_back(path: Path, content: bytes) -> None:
     path.unlink(missing_ok=True)  # incomplete, or changed
     atomic_io.write_file(path, content)
     atomic_io.fsync_folder(path.parent)
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    with open(descriptor, "rb") as file:
-        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-        if file.read() != content:
-            raise BackupDamaged(f"{path} cannot be read back as it was written")
+    if atomic_io.read_from_disk(path) != content:
+        raise BackupDamaged(f"{path} cannot be read back as it was written")

@@ -60,7 +60,7 @@ def _unescaped(word: str) -> str:
 
 
 def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
-    """Copy files into a new folder of a drive; return the folder once it is durable.
+    """Copy files into a new folder of a drive; return the folder once it is durable and was read back.
 
     `drive`: mount point; `name`: name of the new folder, with a number appended if that folder exists. The folder gets
     this name after all files are written; after an error in writing them the partial copy is deleted, if the drive is
@@ -80,6 +80,9 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
             shutil.rmtree(temporary, ignore_errors=True)  # no effect on a removed drive
             raise
         atomic_io.fsync_folder(target)  # on FAT, fsync of a folder writes its own entry, fsync of its parent does not
+        changed = [name for name, content in files.items() if atomic_io.read_from_disk(target / name) != content]
+    if changed:
+        raise UsbDriveUnavailable(f"{drive} does not return what was written: {changed[0]}", "Use another USB stick.")
     return target
 
 

@@ -1,12 +1,13 @@
 """Status collector: the inputs of the health checks from instrument, capture store, upload queue and computer."""
 
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
 from device.clock import Clock
 from device.errors import StoreError
 from services.backup.backup_key import read_key
-from services.errors import BackupDamaged
+from services.errors import BackupDamaged, RecordRemoved
 from services.health.checks import StatusSnapshot
 from services.health.instrument_status import InstrumentStatus
 from services.records.capture import Capture
@@ -82,7 +83,8 @@ def _store_status(store: CaptureStore, people: VisitRepository) -> tuple[list[Ca
         newest = store.captures(MAX_PRESSES)
         store.check_writable()
         for name in newest[0].files if newest else ():
-            store.read(newest[0].id, name)
+            with suppress(RecordRemoved):
+                store.read(newest[0].id, name)
         return newest, len(store.quarantine.orphans()), store.damaged() + people.damaged(), None
     except StoreError as error:
         return [], 0, 0, error

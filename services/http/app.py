@@ -7,6 +7,7 @@ from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, FastAPI
 
+from services.delivery.removal import PictureRemoval
 from services.delivery.upload_worker import UploadWorker, archive_builder
 from services.delivery.uploader import Uploader
 from services.delivery.usb_drives import UsbDrives
@@ -22,6 +23,7 @@ from services.http.routes.captures import captures_router, press_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
 from services.http.routes.preview import preview_router
+from services.http.routes.removal import removal_routes
 from services.http.routes.status import status_router
 from services.http.routes.technician import login_router
 from services.http.routes.updates import UPLOAD_PATH
@@ -90,7 +92,7 @@ def create_app(
     app.include_router(event_router(arbiter), dependencies=[Depends(limit_clients(stream_limits))])
     app.include_router(login_router(authenticator))
     app.include_router(calibration_router(arbiter, authenticator))
-    for router in technician_routers:
+    for router in (*technician_routers, removal_routes(PictureRemoval(store, visits, clock))):
         app.include_router(router, dependencies=[Depends(login_required(authenticator))])
     add_page_routes(app)
     return Application(app, visits, lease, alerts, worker)

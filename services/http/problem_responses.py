@@ -41,6 +41,7 @@ from services.errors import (
     PinLockedOut,
     PinWrong,
     RecordNotFound,
+    RecordRemoved,
     RequestRefused,
     RestoreRefused,
     ServerFull,
@@ -58,6 +59,7 @@ from services.http.security import security_headers
 
 HTTP_STATUS: dict[type[DiffuscopeError], int] = {
     RecordNotFound: 404,
+    RecordRemoved: 410,
     Busy: 409,
     RequestRefused: 409,
     ControlLeaseHeld: 409,

@@ -9,6 +9,7 @@
     damaged/<n>/                  databases that could not be used and were rebuilt from these files (recovery.py)
     conflicts/                    states of records that another state replaced after a rollback (recovery.py)
     captures/.<id>.part/          capture being written; no row yet
+    removed/                      files that were removed to make room (removed_captures.py)
     torn/<id>/                    quarantine: captures found incomplete at an opening of the store; not listed, and
                                   kept until their space is needed (quarantine.py)
     snapshots/                    copies of the tables before each migration (snapshots.py)
@@ -36,7 +37,7 @@ from sqlalchemy.orm import Session
 from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError
-from services.errors import RecordNotFound, StoreDamaged
+from services.errors import RecordNotFound, RecordRemoved, StoreDamaged
 from services.records import blobs, capture_rows, row_validation, schema
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
@@ -47,6 +48,7 @@ from services.records.record_rows import capture_content, file_entries
 from services.records.record_signing import PAGE_ROWS, recorded, write_signature
 from services.records.recovery import Recovery, damage_of, set_aside
 from services.records.recovery_report import RecoveryReport
+from services.records.removed_captures import REMOVED_FILES, RemovedCaptures
 from services.records.reserve_file import ReserveFile
 from services.records.restoration import finish_restoration
 from services.records.row_validation import REMEDY
@@ -93,7 +95,8 @@ class CaptureStore:
             cleanup.callback(self.engine.dispose)
             self.write_ahead_log = WriteAheadLog(database, self.engine)
             self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
-            self.space = StoreSpace(folder, self.engine, self.quarantine, reserve_bytes, free_bytes)
+            self.removed = RemovedCaptures(self._captures, folder / "removed", self._lock)
+            self.space = StoreSpace(folder, self.engine, (self.removed, self.quarantine), reserve_bytes, free_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 damage = self._set_damaged_database_aside()
@@ -214,7 +217,8 @@ class CaptureStore:
     def read(self, id: str, name: str) -> bytes:
         """Return the content of one file of a capture after a SHA-256 check.
 
-        RecordNotFound for an unknown capture or file, StoreDamaged if the file is unreadable or has changed.
+        RecordNotFound for an unknown capture or file, RecordRemoved for a removed file, StoreDamaged if the file is
+        unreadable or has changed.
         """
         with self._reading() as session:
             row = _row(session, id)
@@ -225,6 +229,9 @@ class CaptureStore:
         try:
             content = blobs.read_blob(self._captures / row.id / name)
         except OSError as error:
+            if (removal := self.removed.removal(row.id)) is not None and name in REMOVED_FILES:
+                when = f"{removal.removed_at:%Y-%m-%d}"
+                raise RecordRemoved(f"{name} was removed on {when}, after its visit was {removal.reason}") from error
             raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error
         if hashlib.sha256(content).hexdigest() != files[name]:
             raise StoreDamaged(f"{name} of {id} is not what was kept: its SHA-256 differs")

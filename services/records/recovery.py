@@ -42,6 +42,7 @@ from services.records.record_signing import (
     write_signature,
 )
 from services.records.recovery_report import RecoveryReport
+from services.records.removed_captures import MARK, REMOVED_FILES
 from services.records.schema import CaptureRow, PatientRow, RecordRow
 from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
@@ -225,7 +226,10 @@ class Recovery:
     def _restore_capture(self, session: Session, document: RecordDocument) -> None:
         row = record_rows.capture_row(document.content)
         folder = self._folder / "captures" / row.id
+        is_removed = (folder / MARK).exists()
         for file in row.files:
+            if is_removed and file.name in REMOVED_FILES:
+                continue
             path = folder / file.name
             if Path(file.name).name != file.name or not path.is_file() or path.stat().st_size != file.bytes:
                 raise StoreDamaged(f"{file.name!a} of {row.id} is missing or has another length")

@@ -1,14 +1,14 @@
 """Free space of the store, counted in captures and in visits, and room for a new capture."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol
 
 from sqlalchemy import Engine, distinct, func, select
 from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import StoreFull
-from services.records.quarantine import Quarantine
 from services.records.schema import CaptureSlotRow, FileRow, VisitRow
 from services.records.storage_errors import storage_errors
 
@@ -16,21 +16,32 @@ RECENT_VISITS = 100  # visits whose mean size predicts the size of the next ones
 DEFAULT_CAPTURE_BYTES = 10_000_000  # size of the first capture: 4 megapixels of raw, compressed, and a picture
 
 
-class StoreSpace:
-    """Free space of the store in `folder`; `reserve_bytes` stay free, and quarantined captures count as free space.
+class Deletable(Protocol):
+    """Content that is kept until its space is needed."""
 
-    `free_bytes` returns the free space of a folder's file system.
+    def sizes_bytes(self) -> Mapping[str, int]:
+        """Return the size (bytes) of each item by name, in the order of deletion."""
+
+    def delete(self, name: str) -> None:
+        """Delete one item."""
+
+
+class StoreSpace:
+    """Free space of the store in `folder`; `reserve_bytes` stay free, and what `deletable` holds counts as free space.
+
+    `deletable`: removed files and quarantined captures, in the order of their deletion. `free_bytes` returns the free
+    space of a folder's file system.
     """
 
     def __init__(
         self,
         folder: Path,
         engine: Engine,
-        quarantine: Quarantine,
+        deletable: Sequence[Deletable],
         reserve_bytes: int,
         free_bytes: Callable[[Path], int],
     ) -> None:
-        self._folder, self._engine, self._quarantine = folder, engine, quarantine
+        self._folder, self._engine, self._deletable = folder, engine, deletable
         self._reserve_bytes, self._free_bytes = reserve_bytes, free_bytes
         self._sizes: tuple[int, int] | None = None  # bytes and captures; cached, because each status request needs them
 
@@ -71,17 +82,18 @@ class StoreSpace:
             self._sizes = self._sizes[0] + length_bytes, self._sizes[1] + 1
 
     def make_room(self, need_bytes: int) -> None:
-        """Delete quarantined captures, oldest first, until `need_bytes` and the reserve fit.
+        """Delete removed files, then quarantined captures, oldest first, until `need_bytes` and the reserve fit.
 
         StoreFull if they still do not.
         """
-        quarantined = iter(self._quarantine.sizes_bytes())
+        deletable = ((place, name) for place in self._deletable for name in place.sizes_bytes())
         while not atomic_io.has_room(need_bytes, free := self._free_bytes(self._folder), self._reserve_bytes):
-            if (name := next(quarantined, None)) is None:
+            if (oldest := next(deletable, None)) is None:
                 required = f"{need_bytes} and a reserve of {self._reserve_bytes} are needed"
                 raise StoreFull(f"{free} bytes are free; {required}")
-            self._quarantine.delete(name)
+            place, name = oldest
+            place.delete(name)
 
     def _usable_bytes(self) -> int:
-        free_bytes = self._free_bytes(self._folder) + sum(self._quarantine.sizes_bytes().values())
-        return max(0, free_bytes - self._reserve_bytes)
+        deletable_bytes = sum(sum(place.sizes_bytes().values()) for place in self._deletable)
+        return max(0, self._free_bytes(self._folder) + deletable_bytes - self._reserve_bytes)

@@ -206,3 +206,11 @@ def test_a_passphrase_is_set_before_the_first_backup(technician_page: Page) -> N
     section.locator("#back-up").tap()
     expect(section.get_by_role("note")).to_contain_text("stick")
     assert layout_faults(technician_page, "#back-up") == []
+
+
+def test_there_is_nothing_to_remove_before_a_visit_was_exported(technician_page: Page) -> None:
+    open_section(technician_page, "space")
+    section = technician_page.locator("stored-pictures")
+    expect(section.get_by_role("status")).to_have_text("There is nothing to remove.")
+    expect(section.get_by_role("button")).to_have_count(0)
+    assert layout_faults(technician_page, "stored-pictures p") == []

@@ -36,6 +36,7 @@ from services.errors import PinWrong, ReceiverUnreachable
 from services.http.authentication import PinAuthenticator
 from services.instrument.accuracy_explorer import AccuracyExplorer
 from services.lab.frontier import measure_scene
+from services.records import digested_json
 from services.records.capture_journal import CaptureJournal, InterruptedCapture
 from services.records.capture_report import report_as_json
 from services.records.capture_store import CaptureStore
@@ -291,7 +292,7 @@ def contents(calibration: dict[str, bytes]) -> dict[str, object]:
 def written_again(folder: Path, place: Path) -> dict[str, bool]:
     """Return for each file that is a function of its content whether the present code writes the same bytes.
 
-    The manifest of a calibration is compared by its content.
+    The manifest of a calibration and the journal, which had no digest, are compared by their content.
     """
     clock = VirtualClock(LATER)
     archive, again = Archive(folder / "calibrations"), Archive(place / "again")
@@ -307,10 +308,10 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
         lost = CaptureJournal(store).interrupted[0]
         note = store.folder / "underway" / f"{lost.id}.json"
-        before = note.read_bytes()
+        before = json.loads(note.read_bytes())
         note.unlink()
         CaptureJournal(store).begin(lost, "0" * 16)
-        journal = note.read_bytes() == before
+        journal = digested_json.decoded(note.read_bytes()) == before
     return {
         "calibration": contents(again.files(id)) == contents(archive.files(id)),
         "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),

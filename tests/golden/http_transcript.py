@@ -189,8 +189,13 @@ def _backups(log: Transcript) -> None:
     log.ask(passphrase, json={"passphrase": "four plain words here"})
     log.ask(f"POST {at}", json={"folder": "/etc"})
     log.ask(f"POST {at}", json={"folder": str(log.instrument.stick)})
+    removal = "/api/technician/removal"
+    for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
+        log.ask(operation)
     log.ask("POST /api/technician/lock")
     log.ask(f"GET {at}", note="nobody is logged in")
+    for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
+        log.ask(operation, note="nobody is logged in")
 
 
 def _diary(log: Transcript) -> None:

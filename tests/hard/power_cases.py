@@ -17,12 +17,13 @@ from device.calibration.archive import Archive
 from device.clock import SystemClock, VirtualClock
 from device.errors import CalibrationMissing
 from device.values import Report
-from services.errors import StoreDamaged
+from services.errors import RecordRemoved, StoreDamaged
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import load_protocol
 from services.records.recovery import rebuild_database
+from services.records.removed_captures import Removal
 from services.records.snapshots import Snapshots
 from services.records.visit_repository import VisitRepository
 from tests.earlier import RAW, Release, store_of_version
@@ -236,6 +237,30 @@ def judge_rebuilt(folder: Path, acknowledged: list[str]) -> str:
     return outcome
 
 
+def remove_and_undo(folder: Path, acknowledge: Callable[[str], None]) -> None:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        store.removed.remove(["before"], Removal("sent", datetime(2026, 3, 1, tzinfo=UTC)))
+        acknowledge("removed")
+        store.removed.undo()
+        acknowledge("back")
+
+
+def judge_removed(folder: Path, acknowledged: list[str]) -> str:
+    """Each file is there or known as removed, and all come back."""
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        assert [one.id for one in store.captures()] == ["before"]
+        missing = set[str]()
+        for name, content in FILES.items():
+            try:
+                assert store.read("before", name) == content
+            except RecordRemoved:
+                missing.add(name)
+        assert not missing or acknowledged != ["removed", "back"]
+        store.removed.undo()
+        assert {name: store.read("before", name) for name in FILES} == FILES
+    return "removed" if missing else "whole"
+
+
 def half_kept(folder: Path) -> None:
     shelf_with_one(folder)
     (folder / "captures" / ".half.part").mkdir()
@@ -350,6 +375,9 @@ CASES = {
     "a slot is committed": Case(with_choice, commit, judge_choice, frozenset("AB"), ("chooser",)),
     "tables are brought forward": Case(earlier_shelf, migrate, judge_migration, OLD_NEW),
     "a damaged database is rebuilt": Case(with_damaged_database, rebuild, judge_rebuilt, frozenset({"old"})),
+    "pictures are removed and brought back": Case(
+        shelf_with_one, remove_and_undo, judge_removed, frozenset({"whole", "removed"})
+    ),
     "a torn capture is moved aside": Case(half_kept, opened, judge_swept, OLD_NEW),
     "a snapshot is put back": Case(
         with_snapshot, restore_snapshot, judge_restored_snapshot, frozenset({"old", "refused", "new"})

@@ -1,6 +1,6 @@
 // User actions by tap or key: one object of handlers that templates and keyboard share.
 
-import { captureFileUrl, getFolders, requestControl } from "./api.js";
+import { captureFileUrl, fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, saveSetting, set, currentShot } from "./state.js";
 import { displayNumber, applyKey } from "./numbers.js";
@@ -114,9 +114,10 @@ const pictureActions = {
     set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });
   },
 
-  pictureFault({ detail }) {
+  async pictureFault({ detail }) {
     if (detail.mark === "quick") return; // the final picture is still to come
-    raiseAlert({ code: "picture", message: t("fault.picture"), remedy: t("fault.picture.remedy"), from: "press" });
+    const why = (await fileStatus(detail.url)) === REMOVED ? "fault.removed" : "fault.picture";
+    raiseAlert({ code: "picture", message: t(why), remedy: t(`${why}.remedy`), from: "press" });
   },
 
   zoomed: ({ detail }) => set({ zoom: detail }),

@@ -250,6 +250,8 @@ export const ENGLISH = {
   "fault.unknown.remedy": "Wait a moment and try again. If it happens again, call the technician.",
   "fault.picture": "The picture could not be opened.",
   "fault.picture.remedy": "It is kept. Open it again.",
+  "fault.removed": "The picture was removed after a copy was made or sent.",
+  "fault.removed.remedy": "Look at that copy, or call the technician.",
   "fault.test": "This is a test picture. It belongs to no person.",
   "fault.elsewhere": "This picture is of another person.",
   "swept": {

@@ -235,6 +235,8 @@ export const WORDS = {
   "fault.elsewhere": "यह तस्वीर किसी और व्यक्ति की है।",
   "fault.picture": "तस्वीर नहीं खुली।",
   "fault.picture.remedy": "वह सुरक्षित है। फिर से खोलें।",
+  "fault.removed": "कॉपी या भेजने के बाद तस्वीर हटाई गई।",
+  "fault.removed.remedy": "वह कॉपी देखें, या तकनीशियन को बुलाएँ।",
   "state.camera.missing": "कैमरा उत्तर नहीं देता। उपकरण बंद करके चालू करें।",
   "state.camera.stalled": "लाइव तस्वीर रुक गई। वह लौटेगी।",
   "state.light.fault": "एक बत्ती खराब है। तस्वीरें अच्छी नहीं होंगी।",

@@ -5,6 +5,7 @@ import "./accuracy_time.js";
 import "./backup.js";
 import "./health.js";
 import "./software_update.js";
+import "./stored_pictures.js";
 import { html } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
@@ -14,6 +15,7 @@ const SECTIONS = {
   explorer: html`<accuracy-time class="column"></accuracy-time>`,
   diary: html`<instrument-diary class="column"></instrument-diary>`,
   backup: html`<instrument-backup class="column"></instrument-backup>`,
+  space: html`<stored-pictures class="column"></stored-pictures>`,
   update: html`<software-update class="column"></software-update>`,
 };
 

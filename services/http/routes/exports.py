@@ -1,5 +1,7 @@
 """Endpoints of the exports of visits: USB drives, ZIP download, copy on a drive."""
 
+from pathlib import Path
+
 from fastapi import APIRouter
 
 from services.delivery.usb_drives import UsbDrives, copy_to_drive
@@ -8,6 +10,8 @@ from services.http.media import ZipResponse, file_responses
 from services.http.schemas.common import FolderName
 from services.http.schemas.exports import UsbDrive, UsbDriveList, VisitExport
 from services.records.capture_store import CaptureStore
+from services.records.export_records import ExportRecords
+from services.records.visit import Visit
 from services.records.visit_repository import VisitRepository
 
 
@@ -41,11 +45,18 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
         full.
         """
         visit = repository.get(id)
-
-        def copy() -> str:
-            files = export_files(store, visit, repository.undo_until(visit))
-            return str(copy_to_drive(drives.mounted_folder(order.folder), folder_name(visit), files))
-
-        return FolderName(folder=repository.requests.run_once(order.key, f"export {id} {order.folder}", copy))
+        key, request = order.key, f"export {id} {order.folder}"
+        copied = repository.requests.run_once(
+            key, request, lambda: _copied(store, repository, visit, drives.mounted_folder(order.folder))
+        )
+        return FolderName(folder=copied)
 
     return router
+
+
+def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:
+    """Copy a visit to a drive and record the export of a finished one; return the path of the new folder."""
+    folder = copy_to_drive(drive, folder_name(visit), export_files(store, visit, repository.undo_until(visit)))
+    if visit.finished_at is not None and store.refusal is None:
+        ExportRecords(store.folder).write(visit.id, visit.finished_at, repository.clock.wall())
+    return str(folder)
