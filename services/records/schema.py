@@ -237,6 +237,9 @@ class VisitRow(RecordColumns, Base):
     )
 
 
+VISIT_ROWID = literal_column("visits.rowid", Integer)  # grows with each begun visit, independently of the clock
+
+
 class AnswerRow(Base):
     """One answer of a visit to the form field `name`; `value` is JSON, `set_at` the UTC time of the answer."""
 

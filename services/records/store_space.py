@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import StoreFull
-from services.records.schema import CaptureSlotRow, FileRow, VisitRow
+from services.records.schema import VISIT_ROWID, CaptureSlotRow, FileRow, VisitRow
 from services.records.storage_errors import storage_errors
 
 RECENT_VISITS = 100  # visits whose mean size predicts the size of the next ones
@@ -61,7 +61,7 @@ class StoreSpace:
 
         Without captures in them: `captures_left` divided by `pictures`, the number of captures per visit.
         """
-        lately = select(VisitRow.id).where(VisitRow.finished_at.is_not(None)).order_by(VisitRow.begun_at.desc())
+        lately = select(VisitRow.id).where(VisitRow.finished_at.is_not(None)).order_by(VISIT_ROWID.desc())
         sizes = (
             select(func.coalesce(func.sum(FileRow.bytes), 0), func.count(distinct(CaptureSlotRow.visit)))
             .join(CaptureSlotRow, CaptureSlotRow.capture == FileRow.capture_id)

@@ -22,6 +22,7 @@ from services.records.record_signing import refuse_changed
 from services.records.row_validation import REMEDY, reading_record, without_damaged
 from services.records.schema import (
     CAPTURE_ROWID,
+    VISIT_ROWID,
     AnswerRow,
     CaptureRow,
     CaptureSlotRow,
@@ -61,9 +62,10 @@ def consent(session: Session, id: str) -> tuple[str, str | None]:
 def find_rows(session: Session, limit: int, day: str | None, open: bool | None, digits: str | None) -> list[VisitRow]:
     """Return the newest `limit` visit rows, newest first, that match all given filters; a row without an id is omitted.
 
+    The order is the order of storage (row number), independent of the clock.
     `day`: date of the visit; `open`: True for unfinished, False for finished; `digits`: part of the patient's number.
     """
-    query = select(VisitRow).order_by(VisitRow.begun_at.desc(), VisitRow.id.desc()).limit(limit)
+    query = select(VisitRow).order_by(VISIT_ROWID.desc()).limit(limit)
     if day is not None:
         query = query.where(VisitRow.day == day)
     if open is not None:
