@@ -58,7 +58,10 @@ def write_backup(
             except FileNotFoundError as error:  # a capture was removed; the objects that were written stay
                 log.info("the backup begins again: %s was removed", error.filename)
                 continue
-            write_key(store, key.model_copy(update={"last": last}))
+            try:
+                write_key(store, key.model_copy(update={"last": last}))
+            except OSError as error:  # the card of the device is full: the backup is complete all the same
+                log.warning("backup %s is complete, but is not recorded on this device: %s", last.number, error)
             return last
     raise StoreError("captures were removed during the backup", "Repeat it when no pictures are taken.")
 

@@ -9,7 +9,7 @@ import errno
 import logging
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,6 +25,7 @@ from services.records.storage_errors import sqlite_name, storage_errors
 
 log = logging.getLogger(__name__)
 
+MEMORY = Path("/dev/shm")  # the folder of temporary files may be on the disk that refuses
 READ_FROM_DISK = ("captures", "calibrations", "torn", "damaged", "conflicts")
 NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "explorer"})
 _ERRNOS = frozenset({errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM})
@@ -62,13 +63,14 @@ def _opened(folder: Path, clock: Clock) -> CaptureStore:
 
 @contextmanager
 def _copy_opened(folder: Path, clock: Clock, refusal: StoreError) -> Iterator[CaptureStore]:
-    with TemporaryDirectory(prefix="diffuscope-") as temporary:
-        place = Path(temporary)
+    with ExitStack() as undo:
         with storage_errors():
+            in_memory = MEMORY if MEMORY.is_dir() else None
+            place = Path(undo.enter_context(TemporaryDirectory(prefix="diffuscope-", dir=in_memory)))
             for source in sorted(folder.iterdir()):
                 _copy(source, place / source.name)
-        with CaptureStore(place, reserve_bytes=0, free_bytes=lambda _: 0, clock=clock, refusal=refusal) as store:
-            yield store
+        store = CaptureStore(place, reserve_bytes=0, free_bytes=lambda _: 0, clock=clock, refusal=refusal)
+        yield undo.enter_context(store)
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -5,13 +5,17 @@ an exposure, the answers of a visit and its end still have to be written: the fi
 opening of the store once there is room.
 """
 
+import logging
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from device import atomic_io
 from device.errors import StoreFull
+
+log = logging.getLogger(__name__)
 
 NAME = "reserve.bin"
 LENGTH_BYTES = 8_000_000
@@ -25,9 +29,21 @@ class ReserveFile:
         self._path = folder / NAME
 
     def allocate_if_room(self, reserve_bytes: int, free_bytes: int) -> None:
-        """Write the file if it is missing and fits beside `reserve_bytes`; none in a store that reserves nothing."""
-        if reserve_bytes and not self._path.exists() and atomic_io.has_room(LENGTH_BYTES, free_bytes, reserve_bytes):
+        """Write the file if it is missing or too short and fits beside `reserve_bytes`; none if nothing is reserved.
+
+        A refusal of the disk is only logged: the store works without the file.
+        """
+        if not reserve_bytes or self._is_whole() or not atomic_io.has_room(LENGTH_BYTES, free_bytes, reserve_bytes):
+            return
+        try:
             self._allocate()
+        except OSError as error:
+            log.warning("no space is reserved for the last writes: %s", error)
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
+
+    def _is_whole(self) -> bool:
+        return self._path.exists() and self._path.stat().st_size == LENGTH_BYTES
 
     def _allocate(self) -> None:
         descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -35,6 +51,8 @@ class ReserveFile:
             os.posix_fallocate(descriptor, 0, LENGTH_BYTES)  # a file of zeros might need no space
         finally:
             os.close(descriptor)
+        atomic_io.fsync_file(self._path)
+        atomic_io.fsync_folder(self._path.parent)
 
     def release(self) -> bool:
         """Remove the file; return whether there was one. OSError if the disk refuses."""

@@ -27,6 +27,17 @@ def test_the_file_has_all_of_its_blocks(tmp_path: Path) -> None:
     assert (tmp_path / NAME).stat().st_blocks * 512 >= LENGTH_BYTES
 
 
+def test_a_short_file_is_allocated_again(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_bytes(b"short")
+    ReserveFile(tmp_path).allocate_if_room(1, 10**9)
+    assert (tmp_path / NAME).stat().st_size == LENGTH_BYTES
+
+
+def test_a_disk_that_refuses_the_file_does_not_prevent_the_opening(tmp_path: Path) -> None:
+    (tmp_path / NAME).mkdir()
+    CaptureStore(tmp_path).close()
+
+
 def test_a_write_on_a_full_disk_is_repeated_without_the_reserve(tmp_path: Path) -> None:
     disk, reserve = FullDisk(tmp_path), ReserveFile(tmp_path)
     reserve.allocate_if_room(1, 10**9)
