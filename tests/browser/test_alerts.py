@@ -95,13 +95,13 @@ def test_one_blocking_alert_and_two_chips_by_priority(open_page: Open, make_real
     page = aiming(open_page, real)
     chips = page.locator(".notices li")
     expect(page.locator("[data-code='cal.old']")).to_have_count(1)
-    with alert(real, page, "heat.warm"), alert(real, page, "store.full"):
+    with alert(real, page, "heat.warm"), alert(real, page, "batt.empty"):
         expect(page.locator("[data-code='cal.old']")).to_have_count(1)
-        with alert(real, page, "batt.low"), alert(real, page, "light.fault"):
+        with alert(real, page, "store.low"), alert(real, page, "light.fault"):
             expect(page.locator(".state-bar")).to_have_count(1)
             expect(page.locator(".state-bar")).to_contain_text("One light is not working.")
-            assert [chip.get_attribute("data-code") for chip in chips.all()] == ["batt.low", "heat.warm"]
-        expect(page.locator(".state-bar")).to_contain_text("Nothing was lost.")
+            assert [chip.get_attribute("data-code") for chip in chips.all()] == ["store.low", "heat.warm"]
+        expect(page.locator(".state-bar")).to_contain_text("Battery is empty.")
 
 
 def test_status_problem_is_shown_until_it_ends(open_page: Open, real: Real) -> None:
