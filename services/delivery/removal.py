@@ -15,16 +15,16 @@ from services.records.visit_repository import VisitRepository
 MOST_VISITS = 100_000  # more than a card holds
 
 
-def reason_to_remove(visit: Visit, unsent: Collection[str], exported_state: datetime | None) -> Reason | None:
+def reason_to_remove(visit: Visit, sent: Collection[str], exported_state: datetime | None) -> Reason | None:
     """Return why the pictures of a visit may be removed; None if they may not.
 
-    The visit is finished, and its present state was confirmed by the receiver (its id is not in `unsent`), or copied to
+    The visit is finished, and its present state was confirmed by the receiver (its id is in `sent`), or copied to
     a USB drive and read back (`exported_state` is its `finished_at`). A downloaded ZIP file cannot be verified and does
     not count. Neither copy has the raw frames: only a backup has.
     """
     if visit.finished_at is None:
         return None
-    if visit.id not in unsent:
+    if visit.id in sent:
         return "sent"
     return "exported" if exported_state == visit.finished_at else None
 
@@ -49,11 +49,11 @@ class PictureRemoval:
 
     def removable(self) -> Removable:
         """Return what may be removed now. StoreError if the database cannot be read."""
-        unsent = {one.visit for one in self._queue.queued()}
+        sent = self._queue.sent_visits()
         found: dict[Reason, list[str]] = {"exported": [], "sent": []}
         days, size_bytes = list[str](), 0
         for visit in self._visits.visits(MOST_VISITS, open=False):
-            reason = reason_to_remove(visit, unsent, self._exports.exported_state(visit.id))
+            reason = reason_to_remove(visit, sent, self._exports.exported_state(visit.id))
             ids = [one.capture for slot in visit.slots.values() for one in slot.captures]
             sizes = {id: size for id in ids if (size := self._store.removed.removable_bytes(id))}
             if reason is not None and sizes:

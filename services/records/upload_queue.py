@@ -123,6 +123,11 @@ class UploadQueue:
         with storage_errors(), Session(self.engine) as session:
             return session.scalar(query.where(VisitRow.day == day, VisitRow.sent == VisitRow.finished_at)) or 0
 
+    def sent_visits(self) -> set[str]:
+        """Return the ids of the visits whose last finished state the receiver has confirmed."""
+        with storage_errors(), Session(self.engine) as session:
+            return set(session.scalars(select(VisitRow.id).where(VisitRow.sent == VisitRow.finished_at)))
+
     def record_failure(self, which: Sequence[QueuedVisit], error: DiffuscopeError) -> None:
         """Record one failed attempt with this error for each of these visits.
 

@@ -99,7 +99,7 @@ def test_the_program_starts_for_reading_on_a_disk_that_takes_no_changes(
     (tmp_path / "disk").mkdir()
     prefix = own_disk(tmp_path / "disk")
     if prefix is None:
-        pytest.skip("no permission to mount")
+        pytest.skip("no permission to mount")  # a user who may not mount has no disk to fill; CI runs as root
     with running(prepared, prepared / "data", ()) as client:
         before = seen(client)
     script = f'{DISK} {{ {CASES[case]}; }} && shift 2 && exec "$@"'

@@ -39,14 +39,14 @@ def visit(finished_at: datetime | None) -> Visit:
 
 
 @pytest.mark.parametrize(
-    ("finished_at", "unsent", "exported_state", "reason"),
-    [(NOON, (), None, "sent"), (NOON, ("v",), NOON, "exported"), (NOON, ("v",), None, None), (None, (), NOON, None),
-     (NOON, ("v",), NOON - timedelta(seconds=1), None)],
+    ("finished_at", "sent", "exported_state", "reason"),
+    [(NOON, ("v",), None, "sent"), (NOON, (), NOON, "exported"), (NOON, (), None, None), (None, ("v",), NOON, None),
+     (NOON, (), NOON - timedelta(seconds=1), None)],
 )  # fmt: skip
 def test_only_a_confirmed_copy_of_the_present_state_permits_a_removal(
-    finished_at: datetime | None, unsent: tuple[str, ...], exported_state: datetime | None, reason: str | None
+    finished_at: datetime | None, sent: tuple[str, ...], exported_state: datetime | None, reason: str | None
 ) -> None:
-    assert reason_to_remove(visit(finished_at), unsent, exported_state) == reason
+    assert reason_to_remove(visit(finished_at), sent, exported_state) == reason
 
 
 def test_removed_files_are_named_as_removed_and_come_back_bit_for_bit(store: CaptureStore) -> None:
