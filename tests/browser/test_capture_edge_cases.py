@@ -187,6 +187,13 @@ def test_could_not_for_last_slot_offers_finish(open_page: Open, real: Real) -> N
     expect(page.locator(".outcome .verdict")).to_contain_text("not possible")
 
 
+LOADED_AFTER_FINISH = r"""() => {
+  const answers = performance.getEntriesByType("resource");
+  const finish = answers.findLast(({ name }) => name.endsWith("/finish"));
+  return answers.some(({ name, startTime }) => /visits\/[^/]+$/.test(name) && startTime >= finish?.responseEnd);
+}"""
+
+
 def finished(open_page: Open, real: Real, size: tuple[int, int] = (1280, 800)) -> Page:
     """Open a finished visit with one picture."""
     page = aiming(open_page, real, size)
@@ -232,6 +239,8 @@ def test_visit_of_earlier_day_cannot_be_reopened(open_page: Open, real: Real) ->
 def test_error_alert_is_cleared_on_screen_change(open_page: Open, real: Real, complaints: Complaints) -> None:
     complaints.expect("409")
     page = finished(open_page, real)
+    # The outcome screen loads the finished visit once more; after the jump it would take the button away.
+    page.wait_for_function(LOADED_AFTER_FINISH)
     real.clock.advance(DAY_S)
     tap(page, "#reopen")
     expect(page.locator(".state-bar")).to_contain_text("was finished on an earlier day")
