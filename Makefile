@@ -33,6 +33,8 @@ FAULTS := tests/hard tests/physics tests/property
 NOT_HERE := not bench and not rig and not systemd and not paper and not site
 # Many tests wait for a clock, a process or a browser: three workers keep two cores busy.
 WORKERS := -n 3 --dist loadfile
+# A test of the page waits for the page's debounce, for fades and for the browser's start.
+PAGE_WORKERS := -n 4 --dist loadfile
 
 # A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
 # the summary names it, because it is then the test or the page that has to be mended.
@@ -45,7 +47,7 @@ test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad fram
 	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
-	@$(BIN)/python -m pytest $(WORKERS) tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
+	@$(BIN)/python -m pytest $(PAGE_WORKERS) tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics

@@ -23,7 +23,8 @@ from services.backup import command as backup_command
 from services.lab import calibration_archive
 from services.lab.datasets import open_dataset
 from services.lab.peers import ENVIRONMENT, installed_peer
-from services.lab.reconstruct_each import reconstruct_each, refuse_several
+from services.lab.reconstruct_burst import reconstruct_burst
+from services.lab.reconstruct_each import reconstruct_each
 from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions
 from services.records.command import app as snapshots
@@ -107,7 +108,7 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
 
 @app.command()
 def reconstruct(  # size: each option of the command is one declared parameter
-    raw: Annotated[list[Path], typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; with --each several.")],
+    raw: Annotated[list[Path], typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; several are one burst.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
     psf: Annotated[
         list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
@@ -154,8 +155,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     if each:
         failed = reconstruct_each(raw, options, output, report, typer.echo, lambda line: typer.echo(line, err=True))
         raise typer.Exit(1 if failed else 0)
-    refuse_several(raw)
-    made = reconstruct_file(options)
+    made = reconstruct_file(options) if len(raw) == 1 else reconstruct_burst(raw, options)
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
     typer.echo(f"{output}: {made.summary}")

@@ -51,15 +51,6 @@ def reconstruct_each(
     return failed
 
 
-def refuse_several(raws: Sequence[Path]) -> None:
-    """Raise SettingError for more than one raw: without --each one picture is made of one raw."""
-    if len(raws) > 1:
-        raise SettingError(
-            f"{len(raws)} raws were given, and one picture is made of one raw",
-            "Give --each and -o FOLDER/ for a picture of each.",
-        )
-
-
 def _reconstruct_one(
     reconstruct: FileReconstructor, raw: Path, place: Path, reports: Path | None
 ) -> FileReconstruction:

@@ -20,6 +20,7 @@ from device.config.image_files import write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.assessment.psf_consistency import PsfConsistency
+from device.recon.burst import ONLY_FRAME, FrameUse
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
@@ -58,12 +59,14 @@ class FileReport(Report):
     `solved` is (rows, cols) in samples of the solved frame, `given` the options that replaced a choice of the program
     (`settings` of the method among them), `psf_channels` the number of PSFs for the channels of the raw (1: one PSF for
     all), `bayer` the pattern of a mosaic. The other figures of several PSFs are those of the brightest channel.
+    `frames` says what became of each raw of a burst.
     """
 
     solved: Shape = (0, 0)
     given: dict[str, float | str | dict[str, float]] = field(default_factory=dict)
     psf_channels: int = 1
     bayer: str | None = None
+    frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
 
 
 @dataclass(frozen=True)
@@ -207,9 +210,9 @@ class _Plan:
             made.append(solver(frame, simulated=solver.calibration.simulated, deadline=shared))
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
         picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
-        report = FileReport(
-            **vars(main) | {"seconds": _summed(made), "warnings": _united(made)},
-            solved=_solved_size(solvers[0], main), given=_given(options), psf_channels=len(made), bayer=loaded.bayer,
+        report = replace(
+            file_report(main, solvers[0], options), seconds=_summed(made), warnings=_united(made),
+            psf_channels=len(made), bayer=loaded.bayer,
         )  # fmt: skip
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
 
@@ -232,6 +235,11 @@ class _Plan:
         if self._options.sweep is not None:
             _draw_sweep(self._options.sweep, loaded.name, calibration, scores)
         return index
+
+
+def file_report(report: Report, solver: Reconstructor, options: ReconstructOptions) -> FileReport:
+    """Return the report of a solver with what was set and the size on which it solved the frame."""
+    return FileReport(**vars(report), solved=_solved_size(solver, report), given=_given(options))
 
 
 def _share_s(deadline: Deadline, channels_left: int) -> float:

@@ -111,15 +111,16 @@ def is_simulated(source: Source) -> bool:
     return is_marked_simulated(source) if isinstance(source, Path) else isinstance(source, SimulatedCounts)
 
 
-def load_raw(source: Source, pattern: Bayer | None = None) -> LoadedRaw:
-    """Return the raw frame of a file or array; FrameError for one that cannot be solved.
+def load_raw(source: Source, pattern: Bayer | None = None, checked: bool = True) -> LoadedRaw:
+    """Return the raw frame of a file or array; FrameError for one that cannot be read or, if `checked`, be solved.
 
     `pattern` None: the pattern that a DNG states, else no mosaic.
     """
     name = name_of(source, "the raw")
     file = _read(source, name)
     raw = as_raw(only_frame(file.frames, name), name)
-    _refuse_without_signal(raw, name)
+    if checked:
+        refuse_without_signal(raw, name)
     pattern = pattern or (file.bayer if raw.pixels.ndim == 2 else None)
     rows, cols = raw.pixels.shape[:2]
     simulated = is_simulated(source)
@@ -139,7 +140,7 @@ def _read(source: Source, name: str) -> ImageFile:
     return read_image_file(source) if isinstance(source, Path) else ImageFile(frames_of(np.asarray(source), name))
 
 
-def _refuse_without_signal(raw: Raw, name: str) -> None:
+def refuse_without_signal(raw: Raw, name: str) -> None:
     """Raise FrameError for a frame without usable values, with too many saturated pixels, or with equal values only."""
     unusable = float(raw.bad.mean())
     if unusable > MOST_BAD:

@@ -19,6 +19,7 @@ FILE = Path(__file__).parent / "site" / "report.schema.json"
 
 SECONDS: Mapping[str, str] = {
     "expose": "Lit and dark exposure; captures only.",
+    "join": "Picture of each raw of a burst, their registration, and the joined frame; bursts only.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
@@ -112,6 +113,21 @@ FILES: Mapping[str, JsonValue] = {
     ),
     "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
     "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
+    "frames": _typed(
+        "array", "What became of each raw of a burst, in the order in which they were given; one entry for one raw.",
+        items={"type": "object", "properties": {
+            "index": _typed("integer", "Place of the raw in the burst, from 0."),
+            "used": _typed("boolean", "True if the picture has the light of this raw."),
+            "shift_px": _typed(
+                ["array", "null"],
+                "Rows and columns: what is at (r, c) of the reference, the first used raw, stands at (r, c) plus this "
+                "in the raw, in pixels of the raw. Null if the raw was not registered.",
+                items={"type": "number"}, minItems=2, maxItems=2,
+            ),
+            "weight": _number("Share of the raw in the joined frame, 0 to 1."),
+            "reason": _text("Reason why the raw is not used; null if it is."),
+        }},
+    ),
 }  # fmt: skip
 CAPTURE: Mapping[str, JsonValue] = {
     "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
@@ -186,7 +202,7 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels and bayer, and the instrument the others. "
+            "given, psf_channels, bayer and frames, and the instrument the others. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",

@@ -1,0 +1,261 @@
+"""Burst: several frames of one moving retina, joined to one frame of more light before the deconvolution.
+
+The illuminated field and its shading stand still on the sensor while the retina moves. Of each frame a smooth picture,
+blurred by the PSF, is therefore subtracted; the residuals are moved back by the registered shift and averaged with
+weights in proportion to their light, and the smooth part of the reference is added. NUMERICS.md 9 has the derivation
+and the figures: N frames gain nearly what N times the light in one frame does.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import isfinite
+
+import numpy as np
+from scipy import ndimage
+
+from device.clock import Clock
+from device.errors import FrameError
+from device.recon.assessment.image_quality import NO_SIGNAL
+from device.recon.estimation.registration import Detail, Registrar, Registration, Shift
+from device.recon.model.fft_plans import Planner
+from device.recon.model.grid import Grid
+from device.recon.model.kernels import Pixels
+from device.recon.model.preprocessing import Preprocessor
+from device.recon.model.resampling import moved_back, to_sensor
+from device.recon.reconstructor import Reconstructor, default_schedule, plane
+from device.values import Calibration, Image
+
+SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
+LEAST_SD = 6.0  # a match by chance: the highest of some 10,000 independent shifts lies at 4 sd
+LEAST_OF_TYPICAL = 0.75  # of the median correlation of the matching frames: half a lid reaches 0.35, a saccade 0.98
+LEAST_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
+LIT_SHARE, LIT_SIGMA_PX = 0.3, 6.0  # of an unknown field
+MOST_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class FrameUse:
+    """What became of one frame of a burst.
+
+    What is at (r, c) of the reference, the first used frame, stands at (r, c) + `shift_px` (rows, cols) in this frame,
+    in pixels of the sensor; None if the frame was not registered. `weight` is its share of the joined frame, 0 to 1.
+    `reason` says why it was not used.
+    """
+
+    index: int
+    used: bool
+    shift_px: Shift | None
+    weight: float
+    reason: str | None = None
+
+
+ONLY_FRAME = FrameUse(0, True, (0.0, 0.0), 1.0)  # a picture of one frame
+
+
+@dataclass(frozen=True)
+class JoinedFrame:
+    """A burst as one frame: linear DN above dark, (rows, cols) float32, NaN where too few frames saw the pixel.
+
+    `calibration` holds for it: its gain is that of the sum of the light. `frames` has one entry per frame.
+    """
+
+    counts: Image
+    calibration: Calibration
+    frames: tuple[FrameUse, ...]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A frame above dark in DN and its good pixels on the sensor, its picture on the grid, and its mean in DN."""
+
+    light: Image
+    good: Image
+    picture: Image
+    mean_dn: float
+
+
+class BurstJoiner:
+    """Joining of bursts of one calibration and sensor shape with PSF `index`; planned at construction.
+
+    Not thread-safe.
+    """
+
+    def __init__(
+        self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock, index: int = 0
+    ) -> None:
+        recipe = default_schedule(calibration, shape, index)[1]
+        self._calibration, self._shape = calibration, shape
+        self._single = Reconstructor(
+            calibration, shape, planner, clock, (recipe,), psf_index=index, refract=False, timed=False
+        )
+        self._stage = self._single.stages[0]
+        self._whole = replace(self._stage.grid, radius_samples=float("inf"))  # light falls beyond the field, too
+
+    def __call__(
+        self, frames: Sequence[Pixels], unusable: Mapping[int, str] | None = None, dark: Pixels | None = None
+    ) -> JoinedFrame:
+        """Join frames (rows, cols) in counts; `dark` is their dark frame (None: the calibration's).
+
+        `unusable` holds the reason of each frame that is known to be unusable, by index. A frame that does not show
+        what most of the others show, that has no light or too many missing pixels is left out, with its reason. With
+        one frame left the result is that frame. FrameError if none can be used.
+        """
+        seen: dict[int, _Seen] = {}
+        reasons = dict(unusable or {})
+        for k, frame in enumerate(frames):
+            if k in reasons:
+                continue
+            try:
+                seen[k] = self._see(plane(frame, 0), dark)
+            except FrameError as error:
+                reasons[k] = error.message
+        if not seen:
+            raise FrameError(f"no frame of the burst can be used; the first: {reasons[0]}", "Take the burst again.")
+        grid = self._stage.grid
+        field = self._field([one.picture for one in seen.values()])
+        registrar = Registrar(field[grid.shown], grid.n)
+        flats = {k: registrar.flat(one.picture[grid.shown]) for k, one in seen.items()}
+        shifts, left_out = register_group(registrar, flats)
+        reasons |= left_out
+        uses = [FrameUse(k, k not in reasons, shifts.get(k), 0.0, reasons.get(k)) for k in range(len(frames))]
+        smooth = {k: self._smooth(seen[k], field) for k in shifts}
+        return self._join(seen, smooth, uses)
+
+    def _see(self, counts: Pixels, dark: Pixels | None) -> _Seen:
+        """Return the parts of a frame; FrameError without light or with too many missing pixels."""
+        report = self._single(counts, dark).report
+        if NO_SIGNAL in report.warnings:
+            raise FrameError("the frame holds no signal above the black level")
+        full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
+        linear = full(counts, dark, self._single.defects(counts, dark))
+        return _Seen(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn)
+
+    def _field(self, pictures: Sequence[Image]) -> Image:
+        """Return the lit field on the grid of the pictures, 0 to 1; found in their mean if it is not calibrated."""
+        if isfinite(self._stage.grid.radius_samples):
+            return self._stage.model.mask
+        return lit_field(np.mean(pictures, axis=0, dtype=np.float32), self._stage.grid)
+
+    def _smooth(self, seen: _Seen, field: Image) -> Image:
+        """Return the smooth part of a frame on the sensor in DN: its picture without detail, blurred by the PSF."""
+        stage, sigma = self._stage, SMOOTH_PX / self._stage.grid.n
+        near = np.maximum(ndimage.gaussian_filter(field, sigma), 0.05)
+        picture = ndimage.gaussian_filter(seen.picture * field, sigma) / near * field
+        blurred = to_sensor(stage.model.blur(picture.astype(np.float32)), self._whole)
+        return blurred * np.float32(_fitted_scale(seen.light, blurred, seen.good))
+
+    def _join(self, seen: dict[int, _Seen], smooth: dict[int, Image], uses: Sequence[FrameUse]) -> JoinedFrame:
+        used = [one.index for one in uses if one.used]
+        total_dn = sum(seen[k].mean_dn for k in used)
+        weights = {k: seen[k].mean_dn / total_dn for k in used}
+        reference = seen[used[0]]
+        residual, weight = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.float32)
+        for k in used:
+            shift = uses[k].shift_px
+            assert shift is not None
+            one = seen[k]
+            part, good = moved_back((one.light - smooth[k]) * one.good, one.good, shift)
+            good *= np.float32(weights[k])
+            part *= good
+            residual += part * np.float32(reference.mean_dn / one.mean_dn)
+            weight += good
+        with np.errstate(invalid="ignore", divide="ignore"):
+            joined = np.where(weight >= LEAST_WEIGHT, residual / weight + smooth[used[0]], np.float32(np.nan))
+        light = total_dn / reference.mean_dn
+        frames = tuple(replace(one, weight=weights.get(one.index, 0.0)) for one in uses)
+        return JoinedFrame(joined, joined_calibration(self._calibration, light, len(used)), frames)
+
+
+def lit_field(picture: Image, grid: Grid) -> Image:
+    """Return the lit field in a picture whose field is unknown, on its grid, 0 or 1: its largest bright area.
+
+    Bright is LIT_SHARE of the level that a tenth of the window exceeds; holes, such as a dark macula, are filled.
+    """
+    level = ndimage.gaussian_filter(picture, LIT_SIGMA_PX / grid.n)
+    bright = np.zeros(grid.shape, bool)
+    bright[grid.slices] = (level > LIT_SHARE * np.quantile(level[grid.slices], 0.9))[grid.slices]
+    areas, count = ndimage.label(bright)
+    if count == 0:
+        return np.ones(grid.shape, np.float32)
+    largest = 1 + int(np.argmax(ndimage.sum_labels(bright, areas, range(1, count + 1))))
+    return np.asarray(ndimage.binary_fill_holes(areas == largest), np.float32)
+
+
+def joined_calibration(calibration: Calibration, light: float, count: int) -> Calibration:
+    """Return the calibration of a joined frame of `count` frames with `light` times the light of the reference.
+
+    Averaged counts hold `light` times the electrons per count; the read noise adds up in electrons.
+    """
+    sensor = calibration.sensor
+    gain, read_e = sensor.gain_e_per_dn, sensor.read_noise_e
+    joined = replace(
+        sensor, black_dn=0.0, white_dn=float("inf"), bend_per_dn=0.0,
+        gain_e_per_dn=None if gain is None else gain * light,
+        read_noise_e=None if read_e is None else read_e * count**0.5,
+    )  # fmt: skip
+    return replace(calibration, sensor=joined, dark_dn=None, flat=None, bad=None)
+
+
+def register_group(registrar: Registrar, flats: dict[int, Image]) -> tuple[dict[int, Shift], dict[int, str]]:
+    """Return the shift of each matching frame from the first of them, and the reason of each other frame.
+
+    `flats` are flat pictures (`Registrar.flat`) by index. The centre is the frame that correlates best with all others;
+    a frame matches if its correlation with the centre is near that of most frames. Where no two frames match, nothing
+    says which of them shows the retina, and the first one is kept.
+    """
+    indices = list(flats)
+    found = _pairs(registrar, {k: registrar.detail(flat) for k, flat in flats.items()})
+    centre = max(indices, key=lambda i: sum(found[i, k].correlation for k in indices if k != i))
+    level = {k: found[centre, k].correlation for k in indices if k != centre}
+    least = _least_correlation([found[centre, k] for k in level])
+    used = [k for k in indices if k == centre or level[k] >= least]
+    if len(used) == 1:
+        return {indices[0]: (0.0, 0.0)}, dict.fromkeys(indices[1:], "no two frames show the same retina")
+    shifts = {k: (0.0, 0.0) if k == centre else found[centre, k].shift_px for k in used}
+    shifts = _refined(registrar, {k: flats[k] for k in used}, shifts)
+    first = shifts[used[0]]
+    reasons = {
+        k: f"does not show what the other frames show (correlation {level[k]:.2f}, at least {least:.2f})"
+        for k in indices
+        if k not in used
+    }
+    return {k: (shift[0] - first[0], shift[1] - first[1]) for k, shift in shifts.items()}, reasons
+
+
+def _pairs(registrar: Registrar, details: dict[int, Detail]) -> dict[tuple[int, int], Registration]:
+    """Return the registration of each picture (second index) to each other one (first index)."""
+    found = {}
+    for i, k in combinations(details, 2):
+        found[i, k] = one = registrar.register(details[i], details[k])
+        found[k, i] = replace(one, shift_px=(-one.shift_px[0], -one.shift_px[1]))
+    return found
+
+
+def _least_correlation(found: Sequence[Registration]) -> float:
+    """Return the least correlation of a matching frame: above chance, and near the median of the better half."""
+    if not found:
+        return 0.0
+    sd = float(np.median([one.sd for one in found]))
+    better = sorted(one.correlation for one in found)[len(found) // 2 :]
+    return max(LEAST_SD * sd, LEAST_OF_TYPICAL * float(np.median(better)) - 2 * sd)
+
+
+def _refined(registrar: Registrar, flats: dict[int, Image], shifts: dict[int, Shift]) -> dict[int, Shift]:
+    """Return the shifts after registering each picture, moved back, to the mean of the others.
+
+    The mean has less noise than one picture, and moved pictures are windowed on the same part of the retina: the window
+    does not pull the shift towards 0.
+    """
+    details = {k: registrar.detail(flat, shifts[k]) for k, flat in flats.items()}
+    refined = {}
+    for k, detail in details.items():
+        rest = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail).shift_px
+        refined[k] = shifts[k][0] + rest[0], shifts[k][1] + rest[1]
+    return refined
+
+
+def _fitted_scale(light: Image, smooth: Image, good: Image) -> float:
+    """Return the factor of `smooth` that fits the frame by least squares over its good pixels."""
+    energy = float(np.vdot(smooth * good, smooth))
+    return float(np.vdot(smooth * good, light)) / energy if energy > 0 else 0.0

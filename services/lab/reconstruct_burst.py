@@ -1,0 +1,138 @@
+"""`diffuscope reconstruct RAW RAW ...`: one picture of a burst, several frames of one eye in one light."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from device.clock import Deadline, SystemClock
+from device.config.image_files import Raw
+from device.errors import FrameError, SettingError
+from device.recon.burst import MOST_FRAMES, BurstJoiner, FrameUse
+from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.model.fft_plans import Planner
+from device.recon.model.kernels import Pixels
+from services.lab.reconstruct_file import (
+    FileReconstruction,
+    file_report,
+    plan_reconstructor,
+    refuse_invalid,
+    write_picture,
+)
+from services.lab.reconstruct_inputs import (
+    LoadedRaw,
+    ReconstructOptions,
+    Source,
+    load_calibrations,
+    load_psfs,
+    load_raw,
+    refuse_without_signal,
+)
+
+
+def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> FileReconstruction:
+    """Reconstruct one picture from the raws of a burst, on the grid of the first used one, and write it.
+
+    `options` holds all other options (`raw` is ignored). The report's `frames` says what became of each raw. FrameError
+    for raws of different shapes or levels, or if none can be used; SettingError for invalid options.
+    """
+    if len(raws) == 1:
+        raise SettingError("a burst has at least two raws", "Give the raw alone to reconstruct a single frame.")
+    if len(raws) > MOST_FRAMES:
+        raise SettingError(f"{len(raws)} raws are more than a burst holds", f"Give at most {MOST_FRAMES} raws.")
+    options = replace(options, raw=raws[0])
+    refuse_invalid(options)
+    if options.sweep is not None:
+        raise SettingError("a sweep is drawn for one raw", "Leave --sweep out, or give one raw.")
+    loaded = [load_raw(raw, options.bayer, checked=False) for raw in raws]
+    solved = solve_burst(loaded, options, Planner(options.plans))
+    if options.output is not None:
+        write_picture(options.output, solved.picture, solved.simulated)
+    return solved
+
+
+def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
+    """Return the picture of the loaded raws of a burst; FrameError if none can be used, or for colour raws."""
+    unusable = _unusable(loaded)
+    if len(unusable) == len(loaded):
+        raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take the burst again.")
+    usable = [one for k, one in enumerate(loaded) if k not in unusable]
+    common, clock = _common(usable), SystemClock()
+    psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
+    calibration = load_calibrations(options, common, psfs)[0]
+    index = 0
+    if len(calibration.psfs) > 1:
+        index, _ = most_likely_psf(calibration, common.raw.pixels, planner)
+    joiner = BurstJoiner(calibration, common.solved_shape, planner, clock, index)
+    begin_s = clock.now_s()
+    joined = joiner([_without_bad(one.raw) for one in loaded], unusable)
+    join_s = clock.now_s() - begin_s
+    solver = plan_reconstructor(options, joined.calibration, common.solved_shape, planner, index)
+    deadline = None if options.budget_s is None else Deadline.after(clock, max(options.budget_s - join_s, 1e-6))
+    made = solver(joined.counts, simulated=any(one.simulated for one in loaded), deadline=deadline)
+    notes = tuple(dict.fromkeys(note for one in loaded for note in one.notes))
+    report = replace(
+        file_report(made.report, solver, options),
+        seconds={"join": join_s} | made.report.seconds, frames=joined.frames,
+        warnings=(*made.report.warnings, *_rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
+    )  # fmt: skip
+    return FileReconstruction(made.picture, report, made.simulated or calibration.simulated)
+
+
+def _unusable(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
+    """Return the reason of each raw that holds no usable signal, by its place in the burst."""
+    reasons = {}
+    for k, one in enumerate(loaded):
+        try:
+            refuse_without_signal(one.raw, one.name)
+        except FrameError as error:
+            reasons[k] = error.message
+    return reasons
+
+
+def _common(usable: Sequence[LoadedRaw]) -> LoadedRaw:
+    """Return the first usable raw with the levels of all; the bits of a file follow from its brightest pixel.
+
+    FrameError for raws of different shapes, colour patterns or levels, SettingError for colour raws.
+    """
+    first = usable[0]
+    if first.channels != 1:
+        raise SettingError(
+            "the raws of a burst have one channel, and these have three",
+            "Give the raws of each colour with its PSF: --channel NAME RAW PSF.",
+        )
+    for one in usable[1:]:
+        if (one.shape, one.channels) != (first.shape, first.channels):
+            raise FrameError(
+                f"{one.name} has {_size(one)}, {first.name} {_size(first)}",
+                "Give the raws of one burst, in one and the same camera mode.",
+            )
+        if _storage(one) != _storage(first):
+            raise FrameError(
+                f"{one.name} is stored in another way than {first.name}: other levels, or other types of numbers",
+                "Give the raws of one burst, saved in one format.",
+            )
+    white_dn = max(one.raw.white_dn for one in usable)
+    return replace(first, raw=replace(first.raw, white_dn=white_dn, bad=np.zeros(first.solved_shape, np.bool_)))
+
+
+def _storage(raw: LoadedRaw) -> tuple[object, ...]:
+    return raw.raw.shift, raw.raw.pixels.dtype, raw.black_dn
+
+
+def _without_bad(raw: Raw) -> Pixels:
+    """Return the counts, with NaN for bad pixels if there are any."""
+    if not raw.bad.any():
+        return raw.pixels
+    return np.where(raw.bad, np.float32(np.nan), raw.pixels.astype(np.float32))
+
+
+def _rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
+    """Return a note for each raw that is not used."""
+    return tuple(
+        f"{one.name} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used
+    )
+
+
+def _size(raw: LoadedRaw) -> str:
+    return f"{raw.shape[0]} x {raw.shape[1]} pixels" + (" in three channels" if raw.channels == 3 else "")

@@ -1,0 +1,61 @@
+"""`diffuscope reconstruct RAW RAW ...`: one picture of a burst, with what became of each raw."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.journey.wrong_inputs import Answer, call
+from tests.moving_retina import DRIFT_PX, PSF, RETINA, SHAPE, field, frame, seen
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a burst of three frames, a closed lid, a smaller frame, a frame of NaN, and the PSF."""
+    folder = tmp_path_factory.mktemp("burst")
+    for k, moved in enumerate(DRIFT_PX[:3]):
+        np.save(folder / f"{k}.npy", frame(seen(RETINA, moved), 5000, k))
+    np.save(folder / "lid.npy", frame(0.4 * field(), 5000, 8))
+    np.save(folder / "small.npy", frame(seen(RETINA, (0, 0)), 5000, 1)[8:-8])
+    np.save(folder / "nan.npy", np.full(SHAPE, np.nan, np.float32))
+    centred = np.zeros(SHAPE, np.float32)
+    centred[140:221, 200:281] = PSF.pixels
+    np.save(folder / "psf.npy", (centred / centred.max() * 60000).astype(np.uint16))
+    return folder
+
+
+def reconstruct(folder: Path, *names: str) -> list[str]:
+    out = ["-o", str(folder / "out.npy"), "--report", str(folder / "report.json")]
+    return ["reconstruct", *(str(folder / name) for name in names), "--psf", str(folder / "psf.npy"), *out]
+
+
+def refusal(answer: Answer) -> str:
+    assert answer.code == 2, answer.err
+    return answer.err
+
+
+def test_a_burst_gives_one_picture_and_its_report_names_every_frame(folder: Path) -> None:
+    done = call(reconstruct(folder, "0.npy", "1.npy", "lid.npy", "2.npy"))
+    assert done.code == 0, done.err
+    assert "lid.npy was left out" in done.err
+    report = json.loads((folder / "report.json").read_text())
+    assert [one["used"] for one in report["frames"]] == [True, True, False, True]
+    assert report["frames"][0]["shift_px"] == [0, 0]
+    assert report["frames"][1]["shift_px"] == pytest.approx(DRIFT_PX[1], abs=0.3)
+    assert report["frames"][3]["shift_px"] == pytest.approx(DRIFT_PX[2], abs=0.3)
+    assert np.load(folder / "out.npy").shape == SHAPE
+    alone = call(reconstruct(folder, "0.npy"))
+    assert alone.code == 0
+    (only,) = json.loads((folder / "report.json").read_text())["frames"]
+    assert only == {"index": 0, "used": True, "shift_px": [0.0, 0.0], "weight": 1.0, "reason": None}
+
+
+def test_a_frame_without_values_is_left_out_and_a_smaller_one_is_refused(folder: Path) -> None:
+    done = call(reconstruct(folder, "nan.npy", "0.npy", "1.npy"))
+    assert done.code == 0, done.err
+    report = json.loads((folder / "report.json").read_text())
+    assert [one["used"] for one in report["frames"]] == [False, True, True]
+    assert "not numbers" in report["frames"][0]["reason"]
+    assert "344 x 480 pixels" in refusal(call(reconstruct(folder, "0.npy", "small.npy")))
+    assert "no frame of the burst can be used" in refusal(call(reconstruct(folder, "nan.npy", "nan.npy")))

@@ -1,0 +1,60 @@
+"""Frames of a moving retina behind a field that stands still; they share no operator with the solver."""
+
+import numpy as np
+from scipy import fft, ndimage
+
+from device.recon.model.grid import disc
+from device.values import Calibration, Counts, Geometry, Image, Psf, Sensor
+
+SHAPE = (360, 480)
+FIELD_PX = 300
+GAIN_E, READ_E, BLACK_DN = 7.3, 2.5, 64.0
+DRIFT_PX = [(0.0, 0.0), (1.7, -2.4), (-3.2, 0.6), (4.1, 3.3)]
+
+
+def texture(seed: int, size: int) -> Image:
+    """Return a random picture with the power law of fundus photographs, mean 1, about 0.15 rms."""
+    noise = np.random.default_rng(seed).normal(size=(size, size))
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None])
+    picture = fft.irfft2(fft.rfft2(noise) / np.maximum(frequency, 1 / size) ** 1.3, (size, size))
+    return np.asarray(np.clip(1 + 0.15 * picture / picture.std(), 0.2, 2), np.float32)
+
+
+RETINA, OTHER_RETINA = texture(1, 480), texture(2, 480)
+
+
+def field() -> Image:
+    return disc(SHAPE, ((SHAPE[0] - 1) / 2, (SHAPE[1] - 1) / 2), FIELD_PX / 2)
+
+
+def seen(retina: Image, moved_px: tuple[float, float]) -> Image:
+    """Return the retina in the field: what is at (r, c) for no movement is at (r, c) + `moved_px`."""
+    moved = ndimage.shift(retina, moved_px, order=3, mode="nearest")
+    top, left = (retina.shape[0] - SHAPE[0]) // 2, (retina.shape[1] - SHAPE[1]) // 2
+    return np.asarray(moved[top : top + SHAPE[0], left : left + SHAPE[1]] * field(), np.float32)
+
+
+def caustic() -> Image:
+    """Return a PSF of bright lines, as behind a diffuser: the level lines of a smooth random surface."""
+    surface = ndimage.gaussian_filter(np.random.default_rng(5).normal(size=(81, 81)), 4)
+    lines = np.exp(-((surface / surface.std() / 0.12) ** 2))
+    return np.asarray(lines * disc((81, 81), (40, 40), 36), np.float32)
+
+
+PSF = Psf(caustic())
+
+
+def frame(image: Image, peak_e: float, seed: int) -> Counts:
+    """Return the counts of an exposure whose brightest pixel holds `peak_e` electrons."""
+    size = [fft.next_fast_len(n + 90, real=True) for n in SHAPE]
+    blurred = fft.irfft2(fft.rfft2(image, size) * fft.rfft2(PSF.pixels, size), size)
+    light = np.maximum(blurred[40 : 40 + SHAPE[0], 40 : 40 + SHAPE[1]], 0)
+    random = np.random.default_rng(seed)
+    electrons = random.poisson(light * peak_e / light.max()) + random.normal(0, READ_E, SHAPE)
+    return np.clip(np.round(electrons / GAIN_E + BLACK_DN), 0, 4095).astype(np.uint16)
+
+
+def burst_calibration() -> Calibration:
+    """Return the calibration of these frames: PSF, levels, gain, geometry and field are known."""
+    geometry = Geometry(2.4, 8000, 1.0)
+    return Calibration((PSF,), Sensor(BLACK_DN, GAIN_E, READ_E, 4095.0), geometry, FIELD_PX / geometry.px_per_deg)
