@@ -73,15 +73,15 @@ class BackupFolder:
         return sha256
 
     def forget_damaged(self, progress: Callable[[int, int], None]) -> list[str]:
-        """Read every object and return those (SHA-256) that have changed; `object_of` then treats them as missing.
+        """Read every object and return the damaged ones (SHA-256); `object_of` then treats them as missing.
 
         `progress` gets the number of objects read, and of all.
         """
         damaged = []
         for done, (name, (sha256, _)) in enumerate(list(self._known.items()), 1):
-            with drive_errors(self.folder):
-                content = blobs.read_blob(self._objects / f"{sha256}.age")
-            if hashlib.sha256(content).hexdigest() != sha256:
+            try:
+                read_object(self.folder, sha256)
+            except BackupDamaged:
                 damaged.append(sha256)
                 del self._known[name]
             progress(done, len(self._known) + len(damaged))
@@ -127,6 +127,38 @@ def backup_numbers(folder: Path) -> list[int]:
 def backup_path(folder: Path, number: int) -> Path:
     """Return the file of a backup in a folder of backups."""
     return folder / "backups" / f"{number:06}.age"
+
+
+def read_object(folder: Path, sha256: str) -> bytes:
+    """Return an encrypted object; BackupDamaged if it is missing, unreadable or changed, while the stick is there."""
+    path = folder / "objects" / f"{sha256}.age"
+    content = read_backup_file(folder, path)
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise BackupDamaged(f"{path.name} has changed")
+    return content
+
+
+def read_backup_file(folder: Path, path: Path) -> bytes:
+    """Return the content of a file in a folder of backups.
+
+    BackupDamaged if it is missing or cannot be read (a bad sector) and the header of the folder still can;
+    UsbDriveUnavailable if that cannot be read either: the stick was pulled out.
+    """
+    try:
+        return blobs.read_blob(path)
+    except OSError as error:
+        if not any(_is_on_disk(folder / name) for name in HEADER_FILES):
+            raise UsbDriveUnavailable(f"{folder} refused: {error.strerror or error}") from error
+        raise BackupDamaged(f"{path.name} cannot be read: {error.strerror or error}") from error
+
+
+def _is_on_disk(path: Path) -> bool:
+    """Return whether the disk, and not the page cache, still returns a file."""
+    try:
+        atomic_io.read_from_disk(path)
+    except OSError:
+        return False
+    return True
 
 
 def find_folder(place: Path) -> Path:

@@ -1,8 +1,9 @@
-"""Key of a device's backups: who can decrypt them, and a secret that gives what was backed up names without meaning.
+"""Key of a device's backups: who can decrypt them, and a secret for the HMAC that names the contents in the index.
 
 `backup.json` in the folder of the store (mode 600) and, without the secret, in the folder of the backups. Encryption is
 age's (X25519, https://age-encryption.org/v1): the device knows the public keys only, so a lost device decrypts no
-backup. With a passphrase, a new secret key is encrypted with it (scrypt) and stored beside the backups.
+backup. With a passphrase, a new secret key is encrypted with it (scrypt) and stored beside the backups and in the
+device's own file.
 """
 
 import base64

@@ -30,7 +30,8 @@ def backup(
 ) -> None:
     """Back up everything that is stored, encrypted, also while the instrument runs; later backups add what is new.
 
-    The first backup asks for a passphrase, or takes --recipient; restoring needs it.
+    The first backup asks for a passphrase, or takes --recipient. A restoration needs the passphrase, or the secret key
+    of one recipient. With --new-key, --recipient or --passphrase-file a new, complete series of backups begins.
     """
     from services.backup.backup_key import read_key  # deferred: imports SQLAlchemy
     from services.backup.write_backup import write_backup
@@ -70,7 +71,7 @@ def restore(
         typer.echo(f"Backup {one} is damaged; an older one is restored.", err=True)
     for unit in found.damaged_units:
         typer.echo(f"Damaged in the backup, not restored: {unit}", err=True)
-    CaptureStore(data).close()  # migrates the tables and restores what their files have newer
+    CaptureStore(data).close()  # migrates the tables; where a record file is newer than its row, restores the row
     results = check_store(data, lambda line: typer.echo(f"{line} ...", err=True))
     typer.echo(table(results))
     typer.echo(f"Backup {found.number} of {found.made_at:%Y-%m-%d %H:%M} UTC is restored in {data}.")

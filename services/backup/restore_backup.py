@@ -1,6 +1,5 @@
 """Restoration of a backup on a device that has no records yet: all that is whole, and the names of what is not."""
 
-import hashlib
 import logging
 import sqlite3
 from collections.abc import Callable
@@ -12,13 +11,12 @@ from pathlib import Path
 from device import atomic_io
 from device.errors import StoreFull
 from services.backup import store_contents
-from services.backup.backup_folder import backup_numbers, backup_path
+from services.backup.backup_folder import backup_numbers, backup_path, read_backup_file, read_object
 from services.backup.backup_key import SecretKey, read_header
 from services.backup.write_backup import MANIFEST, Manifest
-from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, BackupKeyWrong, RestoreRefused
-from services.records import blobs, schema
-from services.records.restoration import begin_restoration, commit_restoration
+from services.records import schema
+from services.records.restoration import begin_restoration, commit_restoration, finish_restoration
 from services.records.snapshots import carry_dose, refuse_in_use
 from services.records.storage_errors import storage_errors
 
@@ -30,7 +28,10 @@ RECORD_FOLDERS = ("captures", "patients", "visits", "torn")
 
 @dataclass(frozen=True)
 class Restored:
-    """What was restored: number and time of the backup, units, damaged units, and numbers of damaged newer backups."""
+    """What was restored: number and time of the backup, and the numbers of newer backups that are damaged.
+
+    `units` counts the folders in the backup, `damaged_units` names those of them that were not restored.
+    """
 
     number: int
     made_at: datetime
@@ -49,10 +50,11 @@ def restore_backup(
 ) -> Restored:
     """Restore the newest readable backup in a folder of backups, or that with `number`, into an unused store.
 
-    Every unit is checked against its SHA-256 and age's authentication; a damaged one is left out and named. A dose that
-    the device has counted is never lowered. Until the last step nothing in the store changes; a power cut later is
-    completed by the next opening. Errors: RestoreRefused (the store has records), BackupKeyWrong, BackupDamaged (no
-    backup can be read), UsbDriveUnavailable, StoreFull, StoreError (the instrument is running, or the disk refuses).
+    Every unit is checked against its SHA-256 and age's authentication; one that is missing, unreadable or changed is
+    left out and named. A dose that the device has counted is never lowered. Until the last step nothing in the store
+    changes; what a power cut interrupts after it, the next opening or restoration completes. Errors: RestoreRefused
+    (the store has records), BackupKeyWrong, BackupDamaged (no backup can be read), UsbDriveUnavailable, StoreFull,
+    StoreError (the instrument is running, or the disk refuses).
     """
     if key.public_key not in read_header(folder).recipients:
         raise BackupKeyWrong("the key is not that of these backups")
@@ -60,6 +62,7 @@ def restore_backup(
         atomic_io.make_folder(store)
         refuse_in_use(store / schema.DATABASE)
         with atomic_io.file_lock(store / ".lock"):
+            finish_restoration(store)  # of a restoration that was committed before a power cut
             _refuse_used(store)
             manifest, rest, damaged_backups = _newest_readable(folder, key, number)
             _refuse_without_room(folder, manifest, len(rest), free_bytes(store))
@@ -69,7 +72,7 @@ def restore_backup(
             for done, (unit, sha256) in enumerate(manifest.units.items()):
                 progress(done, len(manifest.units))
                 try:
-                    _write_files(part, _decrypted_object(folder, sha256, key))
+                    _write_files(part, _decrypted(Path(unit), read_object(folder, sha256), key))
                 except BackupDamaged as error:
                     log.error("%s is not restored: %s", unit, error.message)
                     damaged.append(unit)
@@ -104,7 +107,8 @@ def _newest_readable(folder: Path, key: SecretKey, number: int | None) -> tuple[
     damaged: list[int] = []
     for one in wanted:
         try:
-            archive = _decrypted(backup_path(folder, one), key)
+            path = backup_path(folder, one)
+            archive = _decrypted(path, read_backup_file(folder, path), key)
             return _manifest(archive), archive, tuple(damaged)
         except BackupDamaged as error:
             log.error("backup %s cannot be used: %s", one, error.message)
@@ -119,21 +123,9 @@ def _manifest(archive: bytes) -> Manifest:
     return Manifest.model_validate_json(content)
 
 
-def _decrypted_object(folder: Path, sha256: str, key: SecretKey) -> bytes:
-    path = folder / "objects" / f"{sha256}.age"
-    if not path.exists():
-        raise BackupDamaged(f"{path.name} is missing")
-    with drive_errors(folder):
-        if hashlib.sha256(blobs.read_blob(path)).hexdigest() != sha256:
-            raise BackupDamaged(f"{path.name} has changed")
-    return _decrypted(path, key)
-
-
-def _decrypted(path: Path, key: SecretKey) -> bytes:
-    with drive_errors(path.parent):
-        content = blobs.read_blob(path)
+def _decrypted(path: Path, encrypted: bytes, key: SecretKey) -> bytes:
     try:
-        return key.decrypted(content)
+        return key.decrypted(encrypted)
     except BackupDamaged as error:
         raise BackupDamaged(f"{path.name}: {error.message}") from error
 

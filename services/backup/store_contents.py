@@ -1,8 +1,8 @@
 """What a backup holds of a store: one unit for each folder of a capture, and the rest as one archive.
 
-A unit is a folder that is written once: `captures/<id>`, and every other second-level folder. The rest is the database,
-as SQLite's backup API copies it beside a running instrument, the records of patients and visits, the dose ledger, the
-journal, and small files. Not backed up: copies and measurements that the store makes again (NOT_BACKED_UP).
+A unit is a second-level folder, such as `captures/<id>`, whose files rarely change. The rest is the database, as
+SQLite's backup API copies it beside a running instrument, the records of patients and visits, the dose ledger, the
+journal, and small files. Not backed up: NOT_BACKED_UP.
 """
 
 import hashlib
@@ -103,6 +103,6 @@ def _is_kept(path: Path) -> bool:
 
 
 def _files_below(folder: Path) -> list[Path]:
-    """Return all files of a folder, sorted; FileNotFoundError without the folder."""
+    """Return all files of a folder, sorted, without parts of writes and locks; FileNotFoundError without the folder."""
     folder.stat()
-    return sorted(path for path in folder.rglob("*") if path.is_file())
+    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))

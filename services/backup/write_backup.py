@@ -70,7 +70,9 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
     """Write one backup; FileNotFoundError if a file of the store was removed meanwhile.
 
     The database is copied first: the folder of a capture is complete before its row, so no row is without its files.
+    The time of a backup is that of its beginning: a capture that is taken while it runs may not be in it.
     """
+    made_at = clock.wall()
     database = store_contents.database_copy(store / schema.DATABASE)
     paths, objects, unreadable, written_bytes = store_contents.units(store), dict[str, str](), list[str](), 0
     for done, unit in enumerate(paths):
@@ -83,8 +85,8 @@ def _written(store: Path, target: BackupFolder, key: BackupKey, clock: Clock, pr
         except OSError as error:  # of a failing disk, on which the other captures must still be backed up
             log.error("%s cannot be backed up: %s", unit, error)
             unreadable.append(unit)
-    number, made_at = target.next_number(), clock.wall()
-    rest = store_contents.rest_of_store(store) | {schema.DATABASE: database}
+    number = target.next_number()
+    rest = store_contents.rest_of_store(store) | {schema.DATABASE: database}  # the copy, not the file in use
     manifest = Manifest(number=number, made_at=made_at, units=objects)
     content = store_contents.packed({MANIFEST: manifest.model_dump_json().encode(), **rest})
     encrypted = key.header.encrypted(content)

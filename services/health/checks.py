@@ -49,7 +49,7 @@ class StatusSnapshot:
     minus the time budget; `torn_bytes`: size of each quarantined capture; `orphans`: number of complete capture folders
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
-    restored; `backup_at`: time of the last backup; `unsaved_since`: time of the first capture that is in no backup.
+    restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that.
     """
 
     state: str

@@ -47,7 +47,7 @@ def visits_per_battery(charge_ratio: float, least_ratio: float) -> int:
 
 
 def is_backup_due(now: datetime, unsaved_since: datetime | None) -> bool:
-    """Return whether the first capture that is in no backup, if there is one, is older than MAX_UNSAVED_DAYS."""
+    """Return whether the first capture since the last backup began, if there is one, is older than MAX_UNSAVED_DAYS."""
     return unsaved_since is not None and now - unsaved_since > timedelta(days=MAX_UNSAVED_DAYS)
 
 

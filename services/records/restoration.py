@@ -24,7 +24,7 @@ def begin_restoration(store: Path) -> Path:
 
 
 def commit_restoration(store: Path) -> None:
-    """Declare the restored files complete, all of them durable; the caller has the lock of the store."""
+    """Commit the durable restored files, and move them into place; the caller has the lock of the store."""
     atomic_io.replace_durably(store / PART, store / READY)
     finish_restoration(store)
 
@@ -33,7 +33,7 @@ def finish_restoration(store: Path) -> None:
     """Move committed restored files into their places; no-op without them. OSError if the disk refuses.
 
     The logs of a replaced database are moved before it: SQLite would apply them to the restored one. The database is
-    the last: without it an opening rebuilds what a restored store can rebuild.
+    moved last, so that it never lists files that are not in place yet.
     """
     ready = store / READY
     if not ready.is_dir():

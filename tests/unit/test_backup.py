@@ -93,7 +93,7 @@ def test_every_file_of_the_store_is_restored_bit_for_bit(
     restored_from(stick, tmp_path / "new")
 
     def files(folder: Path) -> dict[str, tuple[bytes, int]]:
-        paths = (path for path in folder.rglob("*") if path.is_file())
+        paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
         found = {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mode) for path in paths}
         return {name: one for name, one in found.items() if not name.startswith(("shelf.sqlite", ".lock", "snapshots"))}
 
@@ -207,6 +207,52 @@ def test_a_damaged_object_is_named_and_the_rest_is_restored(
     assert restored_from(stick, tmp_path / "mended").damaged_units == ()
 
 
+def unreadable(path: Path) -> None:
+    """Replace a file by one whose reading fails with EIO, as a bad sector does."""
+    path.unlink()
+    path.symlink_to("/proc/self/mem")
+
+
+def test_a_bad_sector_costs_one_object_or_one_backup(store: Path, stick: Path, tmp_path: Path, key: BackupKey) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    write_backup(store, stick, CLOCK, quiet)
+    unreadable(max(stick.rglob("backups/*.age")))
+    unreadable(min(stick.rglob("objects/*.age")))
+    result = restored_from(stick, tmp_path / "new")
+    assert (result.number, result.damaged_backups, len(result.damaged_units)) == (1, (2,), 1)
+    write_backup(store, stick, CLOCK, quiet, verify=True)
+    assert restored_from(stick, tmp_path / "mended").damaged_units == ()
+
+
+def test_a_stick_that_is_pulled_out_during_a_restoration_changes_nothing(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+
+    def pulled(done: int, _: int) -> None:
+        if done == 2:
+            stick.rename(tmp_path / "in a pocket")
+
+    new = tmp_path / "new"
+    with pytest.raises(UsbDriveUnavailable):
+        restore_backup(find_folder(stick), SECRET, new, pulled)
+    restored_from(tmp_path / "in a pocket", new)  # still unused
+    assert shown(new) == (expected(store), 0)
+
+
+def test_a_repeated_restoration_completes_the_one_that_a_power_cut_ended(
+    store: Path, stick: Path, tmp_path: Path, key: BackupKey
+) -> None:
+    write_backup(store, stick, CLOCK, quiet, key)
+    new = tmp_path / "new"
+    restored_from(stick, new)
+    (new / ".restored").mkdir()
+    (new / "captures").rename(new / ".restored/captures")  # committed, and not moved into its place
+    with pytest.raises(RestoreRefused):
+        restored_from(stick, new)
+    assert shown(new) == (expected(store), 0)
+
+
 def test_an_older_backup_is_used_if_the_newest_is_damaged(
     store: Path, stick: Path, tmp_path: Path, key: BackupKey
 ) -> None:
@@ -299,10 +345,7 @@ def test_a_capture_that_is_removed_during_a_backup_is_no_loss(
 def test_a_file_that_the_disk_does_not_return_costs_its_folder_only(
     store: Path, stick: Path, tmp_path: Path, key: BackupKey
 ) -> None:
-    """/proc/self/mem answers EIO, as a failing card does."""
-    unreadable = store / "captures/test/raw.tiff"
-    unreadable.unlink()
-    unreadable.symlink_to("/proc/self/mem")
+    unreadable(store / "captures/test/raw.tiff")
     made = write_backup(store, stick, CLOCK, quiet, key)
     assert made.unreadable == ("captures/test",)
     assert restored_from(stick, tmp_path / "new").units == made.units
