@@ -68,19 +68,25 @@ def restore_backup(
             _refuse_without_room(folder, manifest, len(rest), free_bytes(store))
             part = begin_restoration(store)
             _write_files(part, rest)
-            damaged: list[str] = []
-            for done, (unit, sha256) in enumerate(manifest.units.items()):
-                progress(done, len(manifest.units))
-                try:
-                    _write_files(part, _decrypted(Path(unit), read_object(folder, sha256), key))
-                except BackupDamaged as error:
-                    log.error("%s is not restored: %s", unit, error.message)
-                    damaged.append(unit)
+            damaged = _write_units(part, folder, manifest, key, progress)
             carry_dose(store / schema.DATABASE, part / schema.DATABASE)
             _sync_folders(part)
             commit_restoration(store)
     progress(len(manifest.units), len(manifest.units))
-    return Restored(manifest.number, manifest.made_at, len(manifest.units), tuple(damaged), damaged_backups)
+    return Restored(manifest.number, manifest.made_at, len(manifest.units), damaged, damaged_backups)
+
+
+def _write_units(part: Path, folder: Path, manifest: Manifest, key: SecretKey, progress: Progress) -> tuple[str, ...]:
+    """Write every unit of a backup that is whole to `part`; return those that are damaged."""
+    damaged = []
+    for done, (unit, sha256) in enumerate(manifest.units.items()):
+        progress(done, len(manifest.units))
+        try:
+            _write_files(part, _decrypted(Path(unit), read_object(folder, sha256), key))
+        except BackupDamaged as error:
+            log.error("%s is not restored: %s", unit, error.message)
+            damaged.append(unit)
+    return tuple(damaged)
 
 
 def _refuse_used(store: Path) -> None:
