@@ -21,9 +21,11 @@ from device.values import Colour
 from services import resources
 from services.backup import command as backup_command
 from services.lab import calibration_archive
+from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
 from services.lab.peers import ENVIRONMENT, installed_peer
 from services.lab.reconstruct_burst import reconstruct_burst
+from services.lab.reconstruct_colour import reconstruct_colours
 from services.lab.reconstruct_each import reconstruct_each
 from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions
@@ -106,12 +108,18 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
     return load_head(head or SIM_HEAD)
 
 
-@app.command()
+@app.command(cls=ReconstructCommand)
 def reconstruct(  # size: each option of the command is one declared parameter
-    raw: Annotated[list[Path], typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; several are one burst.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
+    raw: Annotated[
+        list[Path] | None, typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; several are one burst.")
+    ] = None,
     psf: Annotated[
         list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
+    ] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME RAW PSF", help="One colour: red, green, blue or amber; again for each frame."),
     ] = None,
     calibration: Annotated[
         str | None,
@@ -131,7 +139,10 @@ def reconstruct(  # size: each option of the command is one declared parameter
     bayer: Annotated[
         str | None, typer.Option(metavar="RGGB", help="The raw is a mosaic: rggb, bggr, grbg or gbrg.")
     ] = None,
-    dark: Annotated[Path | None, typer.Option(help="Dark frame of the same exposure.")] = None,
+    dark: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[NAME=]FILE", help="Dark frame of the same exposure; with NAME that of one channel."),
+    ] = None,
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
     head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
@@ -146,16 +157,25 @@ def reconstruct(  # size: each option of the command is one declared parameter
     ] = None,
     each: Annotated[bool, typer.Option("--each", help="Make one picture of each raw, in the folder of -o.")] = False,
 ) -> None:
-    """Turn one raw frame into a picture, without a head and without a page; with --each every frame of a recording."""
+    """Turn one raw frame or a burst into a picture, without a head and without a page.
+
+    With --each one picture of every frame of a recording; with --channel one colour picture.
+    """
+    channels, raws = parse_channels(channel or []), raw or []
+    common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
-        raw[0], tuple(psf or ()), None if each else output, method, budget_s, dark, flat, head, field_deg, even,
-        resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds, parse_settings(setting or ()),
-        parse_bayer(bayer),
+        raws[0] if raws else Path(), tuple(psf or ()), None if each else output, method, budget_s, common_dark, flat,
+        head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
+        parse_settings(setting or ()), parse_bayer(bayer),
     )  # fmt: skip
+    refuse_mixed(raws, channels, darks, each)
     if each:
-        failed = reconstruct_each(raw, options, output, report, typer.echo, lambda line: typer.echo(line, err=True))
+        failed = reconstruct_each(raws, options, output, report, typer.echo, _progress)
         raise typer.Exit(1 if failed else 0)
-    made = reconstruct_file(options) if len(raw) == 1 else reconstruct_burst(raw, options)
+    if channels:
+        made = reconstruct_colours(channels, options, darks)
+    else:
+        made = reconstruct_file(options) if len(raws) == 1 else reconstruct_burst(raws, options)
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
     typer.echo(f"{output}: {made.summary}")

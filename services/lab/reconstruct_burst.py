@@ -36,19 +36,21 @@ def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> Fi
     `options` holds all other options (`raw` is ignored). The report's `frames` says what became of each raw. FrameError
     for raws of different shapes or levels, or if none can be used; SettingError for invalid options.
     """
-    if len(raws) == 1:
-        raise SettingError("a burst has at least two raws", "Give the raw alone to reconstruct a single frame.")
-    if len(raws) > MOST_FRAMES:
-        raise SettingError(f"{len(raws)} raws are more than a burst holds", f"Give at most {MOST_FRAMES} raws.")
     options = replace(options, raw=raws[0])
-    refuse_invalid(options)
-    if options.sweep is not None:
-        raise SettingError("a sweep is drawn for one raw", "Leave --sweep out, or give one raw.")
-    loaded = [load_raw(raw, options.bayer, checked=False) for raw in raws]
-    solved = solve_burst(loaded, options, Planner(options.plans))
+    solved = solve_burst(load_burst(raws, options), options, Planner(options.plans))
     if options.output is not None:
         write_picture(options.output, solved.picture, solved.simulated)
     return solved
+
+
+def load_burst(raws: Sequence[Source], options: ReconstructOptions) -> list[LoadedRaw]:
+    """Return the raws of a burst as they are stored; SettingError for options that a burst does not have."""
+    if not 1 < len(raws) <= MOST_FRAMES:
+        raise SettingError(f"{len(raws)} raws are no burst", f"Give 2 to {MOST_FRAMES} raws of one eye in one light.")
+    refuse_invalid(options)
+    if options.sweep is not None:
+        raise SettingError("a sweep is drawn for one raw", "Leave --sweep out, or give one raw.")
+    return [load_raw(raw, options.bayer, checked=False) for raw in raws]
 
 
 def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planner: Planner) -> FileReconstruction:

@@ -21,6 +21,7 @@ from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.assessment.psf_consistency import PsfConsistency
 from device.recon.burst import ONLY_FRAME, FrameUse
+from device.recon.colour import ChannelUse
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
@@ -59,7 +60,7 @@ class FileReport(Report):
     `solved` is (rows, cols) in samples of the solved frame, `given` the options that replaced a choice of the program
     (`settings` of the method among them), `psf_channels` the number of PSFs for the channels of the raw (1: one PSF for
     all), `bayer` the pattern of a mosaic. The other figures of several PSFs are those of the brightest channel.
-    `frames` says what became of each raw of a burst.
+    `frames` says what became of each raw of a burst, `channels` of each colour of light.
     """
 
     solved: Shape = (0, 0)
@@ -67,6 +68,7 @@ class FileReport(Report):
     psf_channels: int = 1
     bayer: str | None = None
     frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
+    channels: tuple[ChannelUse, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -211,7 +213,7 @@ class _Plan:
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
         picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
         report = replace(
-            file_report(main, solvers[0], options), seconds=_summed(made), warnings=_united(made),
+            file_report(main, solvers[0], options), seconds=summed_seconds(made), warnings=_united(made),
             psf_channels=len(made), bayer=loaded.bayer,
         )  # fmt: skip
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
@@ -251,7 +253,8 @@ def _brightest(pixels: Pixels) -> int:
     return int(np.argmax(pixels.mean(axis=(0, 1), dtype=np.float64)))
 
 
-def _summed(made: Iterable[Reconstruction]) -> dict[str, float]:
+def summed_seconds(made: Iterable[Reconstruction]) -> dict[str, float]:
+    """Return the durations of each stage, in s, summed over several reconstructions."""
     seconds: dict[str, float] = {}
     for one in made:
         for stage, duration_s in one.report.seconds.items():

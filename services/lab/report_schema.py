@@ -128,6 +128,19 @@ FILES: Mapping[str, JsonValue] = {
             "reason": _text("Reason why the raw is not used; null if it is."),
         }},
     ),
+    "channels": _typed(
+        "array", "Colours of light of a colour picture, in the order in which they were given; empty for a grey one.",
+        items={"type": "object", "properties": {
+            "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
+            "shift_px": _typed(
+                ["array", "null"],
+                "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at (r, c) plus "
+                "this in this channel, in pixels of the raw. Null for a predicted channel.",
+                items={"type": "number"}, minItems=2, maxItems=2,
+            ),
+            "predicted": _typed("boolean", "True if the channel was computed from the others, not measured."),
+        }},
+    ),
 }  # fmt: skip
 CAPTURE: Mapping[str, JsonValue] = {
     "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
@@ -202,7 +215,7 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels, bayer and frames, and the instrument the others. "
+            "given, psf_channels, bayer, frames and channels, and the instrument the others. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",

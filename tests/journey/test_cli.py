@@ -19,7 +19,7 @@ from tests.journey.conftest import Diffuscope
 
 REPORT_KEYS = {  # the public interface
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
-    "noise_dn", "residual", "quality", "warnings", "solved", "given", "psf_channels", "bayer", "frames",
+    "noise_dn", "residual", "quality", "warnings", "solved", "given", "psf_channels", "bayer", "frames", "channels",
 }  # fmt: skip
 
 

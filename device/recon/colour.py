@@ -1,0 +1,142 @@
+"""Colour: pictures of one eye in several colours of light, brought to one grid and joined to one picture.
+
+The colours are taken one after the other, and the eye moves in between. Each channel has its own PSF and is solved by
+itself; the others are registered to green and moved to its grid. Edges are where green has them, so red and blue are
+then filtered with green as the guide. A blue that was not taken can be predicted from red and green: at blue light the
+hazard is ten times that of green. NUMERICS.md 10.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+
+from device.recon.estimation.registration import Registrar, Registration, Shift
+from device.recon.model.resampling import moved_back
+from device.values import Image
+
+ChannelName = Literal["red", "green", "blue", "amber"]
+CHANNELS: tuple[ChannelName, ...] = ("red", "green", "blue", "amber")
+FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
+BAND_PER_PX = (0.01, 0.12)
+GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
+LEAST_SD = 6.0  # as in `burst`
+
+# Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over four
+# photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3).
+BLUE_FROM_RED_GREEN = (-0.133, 0.274, 0.862)
+BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green of these photographs, 0.42 to 0.72
+MOST_OF_MEAN = 3.0  # of red and green: the photographs hold nothing brighter
+
+
+@dataclass(frozen=True)
+class ChannelUse:
+    """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
+
+    What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one.
+    """
+
+    name: ChannelName
+    shift_px: Shift | None
+    predicted: bool = False
+
+
+@dataclass(frozen=True)
+class ColourPicture:
+    """Linear picture (rows, cols, 3) in red, green and blue on the grid of the reference, and its channels.
+
+    `doubtful` names the channels whose registration is no better than chance; they were not moved.
+    """
+
+    picture: Image
+    channels: tuple[ChannelUse, ...]
+    doubtful: tuple[ChannelName, ...]
+
+
+def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) -> ColourPicture:
+    """Join linear pictures (rows, cols) of one eye in several colours to one picture in red, green and blue.
+
+    `field` is the lit field, (rows, cols) in 0..1; `n` the pixels per sample at which the pictures were solved. The
+    reference is green, else the first. Amber stands for a missing red. A missing blue is predicted from red and green,
+    any other missing channel, and blue without red or green, repeats the nearest one.
+    """
+    reference: ChannelName = "green" if "green" in pictures else next(iter(pictures))
+    shifts, doubtful = register_colours(pictures, reference, field, n)
+    on_grid = {name: moved_back(picture, np.ones_like(picture), shifts[name])[0] for name, picture in pictures.items()}
+    guided = {
+        name: picture if name == reference else guided_filter(picture, on_grid[reference], field)
+        for name, picture in on_grid.items()
+    }
+    uses = [ChannelUse(name, shifts[name]) for name in pictures]
+    if "blue" not in guided:
+        uses.append(ChannelUse("blue", None, predicted=True))
+    red = guided.get("red", guided.get("amber", guided[reference]))
+    green = guided.get("green", red)
+    blue = guided["blue"] if "blue" in guided else predicted_blue(red, green, field)
+    return ColourPicture(np.stack([red, green, blue], axis=2).astype(np.float32), tuple(uses), doubtful)
+
+
+def register_colours(
+    pictures: Mapping[ChannelName, Image], reference: ChannelName, field: Image, n: int
+) -> tuple[dict[ChannelName, Shift], tuple[ChannelName, ...]]:
+    """Return the shift of each channel from the reference in pixels, and the channels that match no better than chance.
+
+    The shift is found twice: the second time on the moved picture, windowed on the same part of the retina.
+    """
+    registrar = Registrar(block_mean(field, n), n, FLATTEN_PX, BAND_PER_PX)
+    flats = {name: registrar.flat(block_mean(picture, n)) for name, picture in pictures.items()}
+    target = registrar.detail(flats[reference])
+    shifts: dict[ChannelName, Shift] = {}
+    doubtful: list[ChannelName] = []
+    for name, flat in flats.items():
+        found = Registration((0.0, 0.0), 1.0, 0.0)
+        if name != reference:
+            found = registrar.register(target, registrar.detail(flat))
+        if found.correlation < LEAST_SD * found.sd:
+            doubtful.append(name)
+            found = Registration((0.0, 0.0), 0.0, 0.0)
+        elif name != reference:
+            rest = registrar.register(target, registrar.detail(flat, found.shift_px)).shift_px
+            found = Registration((found.shift_px[0] + rest[0], found.shift_px[1] + rest[1]), 1.0, 0.0)
+        shifts[name] = found.shift_px
+    return shifts, tuple(doubtful)
+
+
+def guided_filter(picture: Image, guide: Image, field: Image) -> Image:
+    """Return the picture as a local linear function of the guide (He, Sun and Tang, IEEE TPAMI 35, 1397, 2013).
+
+    All (rows, cols); windows are GUIDE_PX wide and see only the field. Outside the field the picture is unchanged.
+    """
+    inside = (field > 0.5).astype(np.float32)
+    weight = np.maximum(ndimage.uniform_filter(inside, GUIDE_PX), 0.05)
+
+    def mean(image: Image) -> Image:
+        return np.asarray(ndimage.uniform_filter(image * inside, GUIDE_PX) / weight, np.float32)
+
+    eps = max(GUIDE_EPS * float(guide[inside > 0].var()) if inside.any() else 0.0, 1e-20)  # an even guide has none
+    mean_guide, mean_picture = mean(guide), mean(picture)
+    slope = (mean(guide * picture) - mean_guide * mean_picture) / (mean(guide**2) - mean_guide**2 + eps)
+    filtered = mean(slope) * guide + mean(mean_picture - slope * mean_guide)
+    return np.where(inside > 0, filtered, picture).astype(np.float32)
+
+
+def predicted_blue(red: Image, green: Image, field: Image) -> Image:
+    """Return a blue channel predicted from red and green (rows, cols), in the units of green.
+
+    It is no measurement: its level follows the photographs of the fit, and what only blue light shows is missing.
+    """
+    inside = field > 0.5
+    means = [float(one[inside].mean()) if inside.any() else float(one.mean()) for one in (red, green)]
+    r, g = (np.clip(one / max(mean, 1e-30), 0, MOST_OF_MEAN) for one, mean in zip((red, green), means, strict=True))
+    offset, of_red, of_green = BLUE_FROM_RED_GREEN
+    blue = offset + of_red * r + of_green * g
+    return np.asarray(np.maximum(blue, 0) * BLUE_OVER_GREEN * means[1] * field, np.float32)
+
+
+def block_mean(image: Image, n: int) -> Image:
+    """Return the means of n x n pixels; rows and columns beyond the last whole block are left out."""
+    rows, cols = (size // n for size in image.shape)
+    means: Image = image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float32)
+    return means

@@ -1,0 +1,78 @@
+"""Options of `diffuscope reconstruct` that take a channel: `--channel NAME RAW PSF`, and `--dark NAME=FILE`."""
+
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from typer.core import TyperCommand
+
+from device.errors import SettingError
+from device.recon.colour import CHANNELS
+from services.lab.reconstruct_colour import ChannelSource
+
+SEPARATOR = "\0"  # no path holds it
+CHANNEL_REMEDY = "Give --channel NAME RAW PSF, as in --channel green raw.npy psf.npy."
+
+
+class ReconstructCommand(TyperCommand):
+    """Command with the repeatable option `--channel NAME RAW PSF`: typer declares no lists of several values."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the three values of each `--channel` to one, then parse as every command does."""
+        return super().parse_args(ctx, _joined(args))
+
+
+def _joined(args: Sequence[str]) -> list[str]:
+    words, joined = iter(args), []
+    for word in words:
+        joined.append(word)
+        if word == "--channel":
+            joined.append(SEPARATOR.join(islice(words, 3)))
+    return joined
+
+
+def parse_channels(words: Sequence[str]) -> list[ChannelSource]:
+    """Return the values of `--channel`, in their order; SettingError for an unknown name or a missing file."""
+    found = []
+    for word in words:
+        values = word.split(SEPARATOR)
+        if len(values) != 3:
+            raise SettingError("a channel has a name, a raw and a PSF", CHANNEL_REMEDY)
+        name, raw, psf = values
+        if name not in CHANNELS:
+            raise SettingError(f"'{name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
+        found.append(ChannelSource(name, Path(raw), Path(psf)))
+    return found
+
+
+def parse_darks(words: Sequence[str]) -> tuple[Path | None, dict[str, Path]]:
+    """Return the dark frame of all frames, and those of single channels (`NAME=FILE`), by channel.
+
+    SettingError for two dark frames of the same frames.
+    """
+    common: Path | None = None
+    single: dict[str, Path] = {}
+    for word in words:
+        name, equals, file = word.partition("=")
+        if equals and name in CHANNELS:
+            if name in single:
+                raise SettingError(f"two dark frames are given for {name}", "Give one.")
+            single[name] = Path(file)
+        elif common is not None:
+            raise SettingError("two dark frames are given", "Give one, or --dark NAME=FILE for a channel.")
+        else:
+            common = Path(word)
+    return common, single
+
+
+def refuse_mixed(
+    raws: Sequence[Path], channels: Sequence[ChannelSource], darks: Mapping[str, Path], each: bool
+) -> None:
+    """Raise SettingError for raws together with channels, for neither, or for channels with --each."""
+    if channels and (raws or each):
+        raise SettingError("channels cannot be mixed with other raws or --each", "Give every raw with --channel.")
+    if not channels and not raws:
+        raise SettingError("no raw is given", "Give a raw frame, or --channel NAME RAW PSF.")
+    if darks and not channels:
+        raise SettingError("a dark frame is given for a channel, and no channel", "Give --dark FILE without a name.")

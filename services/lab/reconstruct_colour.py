@@ -1,0 +1,148 @@
+"""`diffuscope reconstruct --channel NAME RAW PSF ...`: one colour picture of frames in several colours of light."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from device.errors import FrameError, SettingError
+from device.recon.burst import FrameUse, lit_field
+from device.recon.colour import CHANNELS, ChannelName, ColourPicture, join_colours
+from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.grid import Grid
+from device.values import Image
+from services.lab.reconstruct_burst import load_burst, solve_burst
+from services.lab.reconstruct_file import (
+    FileReconstruction,
+    FileReconstructor,
+    field_mask,
+    refuse_output,
+    summed_seconds,
+    write_picture,
+)
+from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_calibration, load_raw, name_of
+
+
+@dataclass(frozen=True)
+class ChannelSource:
+    """Raw and PSF of one frame in one colour of light; files or arrays."""
+
+    name: ChannelName
+    raw: Source
+    psf: Source
+
+
+def reconstruct_colours(
+    sources: Sequence[ChannelSource], options: ReconstructOptions, darks: Mapping[str, Source] | None = None
+) -> FileReconstruction:
+    """Reconstruct one picture (rows, cols, 3) in red, green and blue, and write it.
+
+    A channel that is given more than once is a burst. The picture is on the grid of the first green frame, without
+    green of the first frame. `options` holds all other options (`raw` and `psfs` are ignored), `darks` the dark frames
+    of single channels. SettingError for options that do not fit, FrameError for frames of different shapes.
+    """
+    channels = _by_name(sources)
+    if options.output is not None:
+        refuse_output(options.output)
+    if options.calibration is not None or options.psfs or options.bayer is not None:
+        raise SettingError("each channel has a PSF of its own", "Leave --psf, --calibration and --bayer out.")
+    for name in darks or {}:
+        if name not in channels:
+            raise SettingError(f"a dark frame is given for {name}, which is no channel", "Give the channel, too.")
+    planner = Planner(options.plans)
+    made = {
+        name: _channel(given, replace(options, dark=(darks or {}).get(name, options.dark)), planner)
+        for name, given in channels.items()
+    }
+    shapes = {one.picture.shape for one in made.values()}
+    if len(shapes) > 1:
+        listed = ", ".join(f"{name} {one.picture.shape[0]} x {one.picture.shape[1]}" for name, one in made.items())
+        raise FrameError(f"the channels have different sizes: {listed} pixels", "Give frames of one camera mode.")
+    return _joined(channels, made, options)
+
+
+def _by_name(sources: Sequence[ChannelSource]) -> dict[ChannelName, list[ChannelSource]]:
+    """Return the sources of each channel, in the order in which they were given; SettingError for an unknown name."""
+    channels: dict[ChannelName, list[ChannelSource]] = {}
+    for one in sources:
+        if one.name not in CHANNELS:
+            raise SettingError(f"'{one.name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
+        channels.setdefault(one.name, []).append(one)
+    if not channels:
+        raise SettingError("a colour picture needs a channel", "Give --channel NAME RAW PSF.")
+    for name, given in channels.items():
+        if any(not _same(one.psf, given[0].psf) for one in given[1:]):
+            raise SettingError(f"{name} has several PSFs", "Give every raw of a colour with the PSF of that colour.")
+    return channels
+
+
+def _same(one: Source, other: Source) -> bool:
+    if isinstance(one, Path) or isinstance(other, Path):
+        return one is other or (isinstance(one, Path) and isinstance(other, Path) and one.resolve() == other.resolve())
+    return np.array_equal(one, other)
+
+
+def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
+    """Reconstruct the frames of one channel: one frame, or a burst."""
+    raws = [one.raw for one in given]
+    options = replace(options, raw=raws[0], psfs=(given[0].psf,), output=None, report=None, even=False)
+    try:
+        if len(raws) > 1:
+            return solve_burst(load_burst(raws, options), options, planner)
+        made = FileReconstructor(options)(raws[0])
+    except FrameError as error:
+        raise FrameError(f"{given[0].name}: {error.message}", error.remedy) from error
+    if made.picture.ndim == 3:
+        raise SettingError(
+            f"{name_of(raws[0], 'the raw')} has three channels", "Give a raw of one channel for each colour."
+        )
+    return made
+
+
+def _joined(
+    channels: Mapping[ChannelName, list[ChannelSource]], made: Mapping[ChannelName, FileReconstruction],
+    options: ReconstructOptions,
+) -> FileReconstruction:  # fmt: skip
+    """Register the channels, join them, write the picture and return it with its report."""
+    reference: ChannelName = "green" if "green" in made else next(iter(made))
+    main = made[reference]
+    pictures = {name: one.picture for name, one in made.items()}
+    lit = _field(channels[reference][0], main.picture, options)
+    joined = join_colours(pictures, lit, main.report.bin)
+    report = replace(
+        main.report, seconds=summed_seconds(made.values()), channels=joined.channels, frames=_frames(made),
+        warnings=_warnings(made, joined), psf_channels=len(made),
+    )  # fmt: skip
+    solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))
+    if options.output is not None:
+        write_picture(options.output, solved.picture, solved.simulated)
+    return solved
+
+
+def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -> Image:
+    """Return the lit field on the picture's pixels, 0 to 1: of the head, else the lit area of the picture."""
+    calibration = load_calibration(replace(options, raw=source.raw, psfs=(source.psf,)), load_raw(source.raw).raw)
+    shape = picture.shape[0], picture.shape[1]
+    if np.isfinite(field_radius_px(calibration)):
+        return field_mask(calibration, shape)
+    return lit_field(picture, Grid.periodic(shape, 1, float("inf")))
+
+
+def _frames(made: Mapping[ChannelName, FileReconstruction]) -> tuple[FrameUse, ...]:
+    """Return the frames of all channels, one channel after the other, with their places in the whole list."""
+    uses = [use for one in made.values() for use in one.report.frames]
+    return tuple(replace(use, index=k) for k, use in enumerate(uses))
+
+
+def _warnings(made: Mapping[ChannelName, FileReconstruction], joined: ColourPicture) -> tuple[str, ...]:
+    """Return the warnings of all channels, what is predicted, and what could not be registered."""
+    words = [f"{name}: {warning}" for name, one in made.items() for warning in one.report.warnings]
+    predicted = [one.name for one in joined.channels if one.predicted]
+    words += [f"{name} is predicted from the other colours, not measured." for name in predicted]
+    words += [
+        f"{name} could not be registered: no shift matches better than chance. It is shown where it was taken."
+        for name in joined.doubtful
+    ]
+    return tuple(dict.fromkeys(words))

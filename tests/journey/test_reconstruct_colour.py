@@ -1,0 +1,77 @@
+"""`diffuscope reconstruct --channel NAME RAW PSF ...`: one colour picture, with what became of each channel."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.journey.wrong_inputs import Answer, call
+from tests.moving_retina import PSF, RETINA, SHAPE, frame, seen
+
+SHIFTS_PX = {"red": (2.0, -3.0), "green": (0.0, 0.0), "green2": (1.5, 1.0)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a red frame, two green ones, a smaller one, a dark frame, and the PSF."""
+    folder = tmp_path_factory.mktemp("colour")
+    for number, (name, moved) in enumerate(SHIFTS_PX.items()):
+        np.save(folder / f"{name}.npy", frame(seen(RETINA, moved), 8000, number))
+    np.save(folder / "small.npy", frame(seen(RETINA, (0, 0)), 5000, 1)[8:-8])
+    np.save(folder / "dark.npy", np.full(SHAPE, 64, np.uint16))
+    centred = np.zeros(SHAPE, np.float32)
+    centred[140:221, 200:281] = PSF.pixels
+    np.save(folder / "psf.npy", (centred / centred.max() * 60000).astype(np.uint16))
+    return folder
+
+
+def reconstruct(folder: Path, *channels: str, out: str = "out.npy") -> list[str]:
+    """Return the words of the command for channels such as `red=red.npy`."""
+    words = ["reconstruct", "-o", str(folder / out), "--report", str(folder / "report.json")]
+    for one in channels:
+        name, _, file = one.partition("=")
+        words += ["--channel", name, str(folder / file), str(folder / "psf.npy")]
+    return words
+
+
+def refusal(answer: Answer) -> str:
+    assert answer.code == 2, answer.err
+    return answer.err
+
+
+def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: Path) -> None:
+    words = reconstruct(folder, "red=red.npy", "green=green.npy", "green=green2.npy")
+    done = call([*words, "--dark", f"red={folder / 'dark.npy'}"])
+    assert done.code == 0, done.err
+    assert "blue is predicted" in done.err
+    report = json.loads((folder / "report.json").read_text())
+    assert [(one["name"], one["predicted"]) for one in report["channels"]] == [
+        ("red", False), ("green", False), ("blue", True),
+    ]  # fmt: skip
+    assert report["channels"][0]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)
+    assert report["channels"][2]["shift_px"] is None
+    assert [one["index"] for one in report["frames"]] == [0, 1, 2]
+    assert np.load(folder / "out.npy").shape == (*SHAPE, 3)
+    assert call(reconstruct(folder, "red=red.npy", "green=green.npy", out="out.png")).code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--channel", "violet", "a.npy", "b.npy"], "Choose from red, green, blue, amber."),
+        (["--channel", "green", "a.npy"], "Give --channel NAME RAW PSF"),
+        (["a.npy", "--channel", "green", "a.npy", "b.npy"], "Give every raw with --channel."),
+        (["a.npy", "--psf", "b.npy", "--dark", "red=c.npy"], "Give --dark FILE without a name."),
+        (["--channel", "green", "a.npy", "b.npy", "--dark", "red=c.npy"], "which is no channel"),
+        (["--channel", "green", "a.npy", "b.npy", "--psf", "b.npy"], "a PSF of its own"),
+        ([], "no raw is given"),
+    ],
+)
+def test_wrong_channels_are_refused_with_the_remedy(folder: Path, words: list[str], message: str) -> None:
+    assert message in refusal(call(["reconstruct", "-o", str(folder / "x.npy"), *words]))
+
+
+def test_channels_of_different_size_or_without_a_file_are_refused(folder: Path) -> None:
+    assert "344 x 480" in refusal(call(reconstruct(folder, "red=small.npy", "green=green.npy")))
+    assert "missing.npy" in refusal(call(reconstruct(folder, "red=missing.npy", "green=green.npy")))

@@ -1,0 +1,66 @@
+"""Colour pictures: registration to green, the guided filter, and a blue that was not taken."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from device.recon.colour import ChannelName, guided_filter, join_colours, predicted_blue
+from device.values import Image
+from tests.moving_retina import OTHER_RETINA, RETINA, field, seen
+
+RED = np.asarray(0.6 + 0.4 * RETINA, np.float32)  # less contrast than green, as in a fundus
+LIT = field()
+INSIDE = ndimage.binary_erosion(LIT > 0.5, iterations=24)  # away from the edge, which moves with each channel
+
+
+def correlation(one: Image, other: Image) -> float:
+    return float(np.corrcoef(one[INSIDE], other[INSIDE])[0, 1])
+
+
+def test_channels_are_moved_to_the_grid_of_green_and_their_shifts_reported() -> None:
+    pictures: dict[ChannelName, Image] = {
+        "red": seen(RED, (3.4, -5.2)), "green": seen(RETINA, (0, 0)), "blue": seen(RETINA, (-60, 2)),
+    }  # fmt: skip
+    joined = join_colours(pictures, LIT, 2)
+    shifts = {one.name: one.shift_px for one in joined.channels}
+    assert shifts["green"] == (0, 0)
+    assert shifts["red"] == pytest.approx((3.4, -5.2), abs=0.3)
+    assert shifts["blue"] == pytest.approx((-60, 2), abs=0.6)  # two fifths of the field are in both frames
+    assert (joined.doubtful, [one.predicted for one in joined.channels]) == ((), [False] * 3)
+    assert correlation(joined.picture[..., 0], pictures["green"]) > 0.98
+    assert joined.picture.shape == (*LIT.shape, 3)
+
+
+def test_a_channel_of_another_retina_is_not_moved_and_named() -> None:
+    blank = np.asarray(LIT * np.random.default_rng(3).normal(1, 0.1, LIT.shape), np.float32)
+    joined = join_colours({"green": seen(RETINA, (0, 0)), "red": blank}, LIT, 2)
+    assert joined.doubtful == ("red",)
+    assert joined.channels[1].shift_px == (0, 0)
+    assert joined.doubtful != join_colours({"green": seen(RETINA, (0, 0)), "red": seen(RED, (1, 1))}, LIT, 2).doubtful
+
+
+def test_a_missing_blue_is_predicted_and_marked_and_amber_stands_for_red() -> None:
+    green, amber = seen(RETINA, (0, 0)), seen(RED, (2, 2))
+    joined = join_colours({"amber": amber, "green": green}, LIT, 2)
+    assert [(one.name, one.predicted, one.shift_px is None) for one in joined.channels] == [
+        ("amber", False, False), ("green", False, False), ("blue", True, True),
+    ]  # fmt: skip
+    assert correlation(joined.picture[..., 0], seen(RED, (0, 0))) > 0.98
+    blue = joined.picture[..., 2]
+    assert blue[LIT == 0].max() == 0
+    assert 0.4 < blue[INSIDE].mean() / green[INSIDE].mean() < 0.75  # the photographs of the fit
+
+
+def test_a_predicted_blue_does_not_depend_on_the_exposures() -> None:
+    red, green = seen(RED, (0, 0)), seen(RETINA, (0, 0))
+    assert predicted_blue(7 * red, 3 * green, LIT) == pytest.approx(3 * predicted_blue(red, green, LIT), rel=1e-4)
+
+
+def test_the_guided_filter_removes_noise_and_keeps_what_green_shows() -> None:
+    green, red = seen(RETINA, (0, 0)), seen(RED, (0, 0))
+    noisy = np.asarray(red + LIT * np.random.default_rng(4).normal(0, 0.05, LIT.shape), np.float32)
+    filtered = guided_filter(noisy, green, LIT)
+    before, after = (np.sqrt(((one - red)[INSIDE] ** 2).mean()) for one in (noisy, filtered))
+    assert after < before / 4  # 289 pixels to a window, of which a line and an offset are fitted
+    alone = guided_filter(seen(OTHER_RETINA, (0, 0)), np.ones_like(green), LIT)
+    assert np.isfinite(alone).all()
