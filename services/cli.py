@@ -23,6 +23,7 @@ from services.backup import command as backup_command
 from services.lab import calibration_archive
 from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
+from services.lab.montage_files import montage_files, placed_lines
 from services.lab.peers import ENVIRONMENT, installed_peer
 from services.lab.reconstruct_burst import reconstruct_burst
 from services.lab.reconstruct_colour import reconstruct_colours
@@ -181,6 +182,20 @@ def reconstruct(  # size: each option of the command is one declared parameter
     typer.echo(f"{output}: {made.summary}")
     for warning in made.report.warnings:
         typer.echo(f"note: {warning}", err=True)
+
+
+@app.command()
+def montage(
+    picture: Annotated[list[Path], typer.Argument(help="Pictures of one eye in several gaze directions.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
+    report: Annotated[Path | None, typer.Option(help="Where to write the place of each picture as JSON.")] = None,
+) -> None:
+    """Join pictures of one eye to one larger picture, on the plane of the first; others are left out with a reason."""
+    joined = montage_files(picture, output, report, _progress)
+    rows, cols = joined.picture.shape[:2]
+    typer.echo(f"{output}: {sum(one.used for one in joined.placed)} of {len(picture)} pictures, {rows} x {cols} pixels")
+    for line in placed_lines(joined, picture):
+        _progress(line)
 
 
 def _progress(line: str) -> None:

@@ -1,5 +1,7 @@
 """Frames of a moving retina behind a field that stands still; they share no operator with the solver."""
 
+from math import cos, radians, sin
+
 import numpy as np
 from scipy import fft, ndimage
 
@@ -58,3 +60,19 @@ def burst_calibration() -> Calibration:
     """Return the calibration of these frames: PSF, levels, gain, geometry and field are known."""
     geometry = Geometry(2.4, 8000, 1.0)
     return Calibration((PSF,), Sensor(BLACK_DN, GAIN_E, READ_E, 4095.0), geometry, FIELD_PX / geometry.px_per_deg)
+
+
+GAZE_SIZE, GAZE_FIELD_PX = 256, 200
+WIDE_RETINA = np.asarray(ndimage.zoom(RETINA, 1.5, order=3), np.float32)
+NOISE = 0.02  # of the mean: that of a reconstruction at 15,000 electrons
+
+
+def gaze(retina: Image, shift_px: tuple[float, float], turn_deg: float = 0.0, seed: int = 0) -> Image:
+    """Return a picture in which what is at p stands at R(p + shift), both from the centre."""
+    c, s = cos(radians(turn_deg)), sin(radians(turn_deg))
+    back = np.array([[c, s], [-s, c]])  # p = R^-1 q - shift
+    middle, source = (GAZE_SIZE - 1) / 2, (np.array(retina.shape) - 1) / 2
+    offset = source - np.array(shift_px) - back @ np.array([middle, middle])
+    seen = ndimage.affine_transform(retina, back, offset, (GAZE_SIZE, GAZE_SIZE), order=3)
+    seen = seen + NOISE * np.random.default_rng(seed).normal(size=seen.shape)
+    return np.asarray(seen * disc((GAZE_SIZE, GAZE_SIZE), (middle, middle), GAZE_FIELD_PX / 2), np.float32)

@@ -44,6 +44,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff -o {0}/x.npy --budget-s 0",
     "reconstruct {0}/scene/raw.tiff -o {0}/x.npy", "reconstruct {0}/none.tiff --psf {0}/scene/psf.tiff -o {0}/x.npy",
     "reconstruct {0}/scene/raw.tiff --psf {0}/none.tiff -o {0}/x.npy", "reconstruct",
+    "reconstruct --channel violet {0}/scene/raw.tiff {0}/scene/psf.tiff -o {0}/x.npy", "montage {0}/none.tiff -o {0}/x.npy",
     "run --head {0}/none.toml", "run --port 0", "run --head {0}/head.toml --replay {0}",
     "run --head {0}/head.toml --send {0}/none.toml", "run --head {0}/head.toml --protocol {0}/none.toml",
     "health --at http://127.0.0.1:9", "health --at http://127.0.0.1:9 --json", "health --at nonsense",

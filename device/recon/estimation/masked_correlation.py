@@ -1,0 +1,183 @@
+"""Masked normalised correlation: shift and rotation between two pictures that show parts of one retina.
+
+The lit fields of two gaze directions overlap in a lens only, and a plain correlation follows the shape of the fields.
+The normalised correlation over the pixels that are lit in both pictures, for every shift at once, is a quotient of
+correlations of pictures and masks (D. Padfield, IEEE Transactions on Image Processing 21, 2706, 2012). NUMERICS.md 11.
+"""
+
+from dataclasses import dataclass, replace
+from math import cos, degrees, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from device.values import Image
+
+FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of the smoothing against noise
+MOST_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
+LEAST_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
+SECOND_SAMPLES = 8  # distance from the peak at which another one begins
+ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search; 2 degrees off still gives half the peak
+REFINEMENTS = 8  # of shift and rotation; they converge in three or four
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Match:
+    """Best shift and rotation of a picture against a reference, in samples and degrees.
+
+    What is at p in the reference stands at R(p + shift) in the picture, both from the centre; R turns by `rotation_deg`
+    counter-clockwise as displayed. `peak` is the normalised correlation, -1 to 1, `second` the highest one elsewhere,
+    `overlap` the common part of both fields as a share of the smaller one.
+    """
+
+    shift: tuple[float, float]
+    rotation_deg: float
+    peak: float
+    second: float
+    overlap: float
+
+
+@dataclass(frozen=True)
+class FlatPicture:
+    """Picture divided by its local mean, minus 1, and its field (0 or 1), both (rows, cols) float32."""
+
+    detail: Image
+    field: Image
+
+
+def flatten(picture: Image, field: Image) -> FlatPicture:
+    """Return a linear picture (rows, cols) without its shading; `field` (0 to 1) is where it is lit."""
+    inside = np.asarray(ndimage.binary_erosion(field > 0.5, iterations=4), np.float32)
+    weight = np.maximum(ndimage.gaussian_filter(inside, FLATTEN_SAMPLES), 0.05)
+    local = ndimage.gaussian_filter(picture * inside, FLATTEN_SAMPLES) / weight
+    level = float((picture * inside).sum() / max(inside.sum(), 1))
+    detail = (picture / np.maximum(local, max(0.05 * level, 1e-30)) - 1) * inside
+    detail = np.clip(ndimage.gaussian_filter(detail, SHARPEN_SAMPLES) * inside, -MOST_CONTRAST, MOST_CONTRAST)
+    return FlatPicture(np.asarray(detail, np.float32), inside)
+
+
+class MaskedCorrelator:
+    """Search for other pictures in one reference; the spectra of the reference are computed once."""
+
+    def __init__(self, reference: FlatPicture) -> None:
+        self._reference = reference
+        self._shape = tuple(fft.next_fast_len(2 * size, real=True) for size in reference.field.shape)
+        self._area = float(reference.field.sum())
+        self._spectra = self._of(reference)
+
+    def find(self, picture: FlatPicture) -> Match:
+        """Return the best match over all shifts and rotations within ANGLES_DEG."""
+        found = max((self._at(picture, angle) for angle in ANGLES_DEG), key=lambda one: one.peak)
+        turn_deg = refined(self._reference, picture, found).rotation_deg
+        found = self._at(picture, turn_deg)  # with the rotation taken out, peak and shift are those of the whole field
+        better = refined(self._reference, picture, found)
+        return better if better.peak > found.peak else found
+
+    def _at(self, picture: FlatPicture, rotation_deg: float) -> Match:
+        """Return the best shift of a picture that was turned by `rotation_deg`."""
+        back = turned(picture, -rotation_deg)
+        correlation, overlap = self._surface(self._of(back), float(back.field.sum()))
+        row, col = np.unravel_index(int(correlation.argmax()), correlation.shape)
+        peak = float(correlation[row, col])
+        at = int(row), int(col)
+        place = self._top(correlation, at, 0), self._top(correlation, at, 1)
+        return Match(place, rotation_deg, peak, _second(correlation, int(row), int(col)), float(overlap[row, col]))
+
+    def _of(self, picture: FlatPicture) -> tuple[NDArray[np.complex128], ...]:
+        """Return the spectra of detail, field and squared detail."""
+        detail, field = picture.detail.astype(np.float64), picture.field.astype(np.float64)
+        return tuple(fft.rfft2(one, self._shape) for one in (detail, field, detail * detail))
+
+    def _surface(self, moved: tuple[NDArray[np.complex128], ...], area: float) -> tuple[Floats, Floats]:
+        """Return correlation (-1 where the overlap is too small) and overlap for every shift, cyclic."""
+        (a, field_a, a2), (b, field_b, b2) = self._spectra, moved
+
+        def correlate(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> Floats:
+            return np.asarray(fft.irfft2(np.conj(one) * other, self._shape))
+
+        count = correlate(field_a, field_b)
+        share = count / max(min(self._area, area), 1.0)
+        count = np.maximum(count, 1.0)
+        sum_a, sum_b = correlate(a, field_b), correlate(field_a, b)
+        covariance = correlate(a, b) - sum_a * sum_b / count
+        variance_a = correlate(a2, field_b) - sum_a**2 / count
+        variance_b = correlate(field_a, b2) - sum_b**2 / count
+        scale = np.sqrt(np.maximum(variance_a, 1e-12) * np.maximum(variance_b, 1e-12))
+        return np.where(share > LEAST_OVERLAP, covariance / scale, -1.0), share
+
+    def _top(self, surface: Floats, place: tuple[int, int], axis: int) -> float:
+        """Return the shift along an axis at the top of the parabola through the peak and its neighbours."""
+        size = surface.shape[axis]
+        values = []
+        for step in (-1, 0, 1):
+            at = list(place)
+            at[axis] = (at[axis] + step) % size
+            values.append(float(surface[at[0], at[1]]))
+        curve = values[0] - 2 * values[1] + values[2]
+        off = 0.5 * (values[0] - values[2]) / curve if curve < 0 else 0.0
+        whole = place[axis] if place[axis] < size / 2 else place[axis] - size
+        return whole + float(np.clip(off, -0.5, 0.5))
+
+
+def refined(reference: FlatPicture, picture: FlatPicture, start: Match) -> Match:
+    """Return a match with shift and rotation improved by Gauss-Newton steps on the normalised difference.
+
+    The start must be nearer than the width of a vessel (inverse compositional form of the correlation coefficient: G.
+    Evangelidis and E. Psarakis, IEEE TPAMI 30, 1858, 2008).
+    """
+    middle = (np.array(reference.field.shape) - 1) / 2
+    rows, cols = np.indices(reference.field.shape, dtype=np.float64) - middle[:, None, None]
+    shift: Floats = np.array(start.shift)
+    turn_rad, best = radians(start.rotation_deg), start
+    for _ in range(REFINEMENTS):
+        turn = rotation_matrix(degrees(turn_rad))
+        offset = middle + turn @ (shift - middle)
+        field = ndimage.affine_transform(picture.field, turn, offset, order=1) > 0.99
+        both = (reference.field > 0) & field
+        if both.sum() < LEAST_OVERLAP * reference.field.sum():
+            return best
+        moved: Image = ndimage.affine_transform(picture.detail, turn, offset, order=3)
+        down, right = np.asarray(np.gradient(moved, axis=0)), np.asarray(np.gradient(moved, axis=1))
+        twist = right * (rows + shift[0]) - down * (cols + shift[1])
+        a, b = (_normalised(one[both]) for one in (reference.detail, moved))
+        correlation = float(a @ b)
+        if correlation > best.peak or best is start:
+            place = float(shift[0]), float(shift[1])
+            best = replace(best, shift=place, rotation_deg=degrees(turn_rad), peak=correlation)
+        scale = np.linalg.norm(moved[both] - moved[both].mean())
+        slopes = np.stack([one[both] for one in (down, right, twist)], axis=1) / max(float(scale), 1e-30)
+        step = np.linalg.lstsq(slopes - slopes.mean(axis=0), a - b, rcond=None)[0]
+        shift, turn_rad = shift + np.clip(step[:2], -2, 2), turn_rad + float(np.clip(step[2], -0.03, 0.03))
+    return best
+
+
+def _normalised(values: Image) -> Floats:
+    """Return values with mean 0 and norm 1."""
+    centred = values.astype(np.float64) - values.mean(dtype=np.float64)
+    return np.asarray(centred / max(float(np.linalg.norm(centred)), 1e-30))
+
+
+def turned(picture: FlatPicture, rotation_deg: float) -> FlatPicture:
+    """Return a picture turned about its centre, counter-clockwise as displayed."""
+    if rotation_deg == 0:
+        return picture
+    detail = ndimage.rotate(picture.detail, rotation_deg, reshape=False, order=1)
+    field = ndimage.rotate(picture.field, rotation_deg, reshape=False, order=1) > 0.99
+    return FlatPicture(np.asarray(detail * field, np.float32), np.asarray(field, np.float32))
+
+
+def rotation_matrix(rotation_deg: float) -> Floats:
+    """Return the matrix on (rows down, cols right) that turns counter-clockwise as displayed."""
+    c, s = cos(radians(rotation_deg)), sin(radians(rotation_deg))
+    return np.array([[c, -s], [s, c]])
+
+
+def _second(surface: Floats, row: int, col: int) -> float:
+    """Return the highest correlation farther than SECOND_SAMPLES from the peak."""
+    far = surface.copy()
+    reach = np.arange(-SECOND_SAMPLES, SECOND_SAMPLES + 1)
+    far[np.ix_((row + reach) % surface.shape[0], (col + reach) % surface.shape[1])] = -1
+    return float(far.max())

@@ -1,0 +1,68 @@
+"""`diffuscope montage PICTURE ... -o OUT`: pictures of several gaze directions joined to one."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from device.config.image_files import is_marked_simulated, only_frame, read_image_file
+from device.errors import FrameError, SettingError
+from device.recon.montage import Montage, make_montage
+from device.values import Image
+from services.lab.reconstruct_file import refuse_output, require_writable, write_or_raise, write_picture
+
+
+def montage_files(
+    pictures: Sequence[Path], output: Path, report: Path | None, progress: Callable[[str], None]
+) -> Montage:
+    """Join picture files (.npy, .tiff or .png), write the montage and its report, and return it.
+
+    `progress` gets a line for each picture that is placed.
+    FrameError for a file that is no picture, or for pictures of different sizes; SettingError for an output that cannot
+    be written or would replace a picture.
+    """
+    refuse_output(output)
+    if report is not None:
+        require_writable(report)
+    inputs = {path.resolve() for path in pictures}
+    for path in (output, report):
+        if path is not None and path.resolve() in inputs:
+            raise SettingError(f"{path} is an input and would be overwritten", "Choose another name for the result.")
+    joined = make_montage(
+        [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed")
+    )
+    write_picture(output, joined.picture, any(is_marked_simulated(path) for path in pictures))
+    if report is not None:
+        text = json.dumps({"placed": [asdict(one) for one in joined.placed], "origin_px": joined.origin_px}, indent=1)
+        write_or_raise(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
+    return joined
+
+
+def read_picture(path: Path) -> Image:
+    """Return a picture file as float32, (rows, cols) or (rows, cols, 3); FrameError for values that are not numbers."""
+    name = str(path)
+    pixels = np.asarray(only_frame(read_image_file(path).frames, name), np.float32)
+    if not np.isfinite(pixels).all():
+        raise FrameError(f"{name} holds values that are not numbers", "Reconstruct the picture again.")
+    if not pixels.max() > 0:
+        raise FrameError(f"{name} is black", "Leave it out.")
+    return pixels
+
+
+def placed_lines(joined: Montage, pictures: Sequence[Path]) -> list[str]:
+    """Return a line for each picture: its place, or why it has none."""
+    lines = []
+    for path, one in zip(pictures, joined.placed, strict=True):
+        if one.shift_px is None or one.rotation_deg is None:
+            lines.append(f"{path}: not used: {one.reason}")
+        elif one.peak is None:
+            lines.append(f"{path}: the reference")
+        else:
+            down, right = one.shift_px
+            lines.append(
+                f"{path}: shift {down:+.1f}, {right:+.1f} px, rotation {one.rotation_deg:+.2f} deg, "
+                f"correlation {one.peak:.2f}, overlap {one.overlap:.0%}"
+            )
+    return lines

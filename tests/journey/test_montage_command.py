@@ -1,0 +1,37 @@
+"""`diffuscope montage`: the picture, its report, and wrong inputs."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from tests.journey.wrong_inputs import call
+from tests.moving_retina import WIDE_RETINA, gaze
+
+
+def test_two_pictures_are_joined_and_their_places_reported(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", gaze(WIDE_RETINA, (0, 0)))
+    np.save(tmp_path / "b.npy", gaze(WIDE_RETINA, (60, -20), 0, 1))
+    words = ["montage", str(tmp_path / "a.npy"), str(tmp_path / "b.npy")]
+    done = call([*words, "-o", str(tmp_path / "out.tiff"), "--report", str(tmp_path / "r.json")])
+    assert done.code == 0, done.err
+    assert "2 of 2 pictures" in done.out
+    first, second = json.loads((tmp_path / "r.json").read_text())["placed"]
+    assert set(first) == {"index", "used", "shift_px", "rotation_deg", "peak", "overlap", "reason"}
+    assert (first["shift_px"], first["rotation_deg"], first["used"]) == ([0, 0], 0, True)
+    assert np.allclose(second["shift_px"], (60, -20), atol=0.6)  # as in the unit test
+    assert call([*words, "-o", str(tmp_path / "out.png")]).code == 0
+
+
+def test_wrong_inputs_are_refused_with_the_remedy(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", gaze(WIDE_RETINA, (0, 0)))
+    np.save(tmp_path / "black.npy", np.zeros((256, 256), np.float32))
+    a, out = str(tmp_path / "a.npy"), str(tmp_path / "out.npy")
+    for words, message in (
+        ([a, str(tmp_path / "black.npy"), "-o", out], "black.npy is black"),
+        ([a, str(tmp_path / "none.npy"), "-o", out], "none.npy"),
+        ([a, "-o", a], "would be overwritten"),
+        ([a, "-o", str(tmp_path / "out.jpg")], "Choose one of these."),
+    ):
+        done = call(["montage", *words])
+        assert (done.code, message in done.err) == (2, True), done.err

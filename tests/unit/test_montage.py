@@ -1,0 +1,87 @@
+"""Montage: shift and rotation between gaze directions, chains of pictures, and pictures that are refused."""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from device.errors import FrameError
+from device.recon.estimation.masked_correlation import Match
+from device.recon.montage import make_montage, refusal
+from tests.moving_retina import GAZE_FIELD_PX, GAZE_SIZE, OTHER_RETINA, WIDE_RETINA, gaze
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 3.0, -4.5])
+@pytest.mark.parametrize("shift_px", [(30.0, 10.0), (-20.5, 84.3), (110.0, -40.0)])  # overlaps of 0.8, 0.46 and 0.3
+def test_shift_and_rotation_are_found(shift_px: tuple[float, float], turn_deg: float) -> None:
+    joined = make_montage([gaze(WIDE_RETINA, (0, 0)), gaze(WIDE_RETINA, shift_px, turn_deg, 1)])
+    found = joined.placed[1]
+    assert found.used, found.reason
+    assert found.shift_px == pytest.approx(shift_px, abs=0.6)  # what a montage may be off by (half a vessel)
+    assert found.rotation_deg == pytest.approx(turn_deg, abs=0.3)
+    assert found.peak is not None
+    assert found.peak > 0.8
+    distance = np.hypot(*shift_px) / GAZE_FIELD_PX
+    overlap = 2 / np.pi * (np.arccos(distance) - distance * np.sqrt(1 - distance**2))
+    assert found.overlap == pytest.approx(overlap, abs=0.05)
+
+
+def test_the_montage_shows_the_retina_of_all_pictures_on_the_plane_of_the_first() -> None:
+    pictures = [gaze(WIDE_RETINA, (0, 0)), 2 * gaze(WIDE_RETINA, (10, 80), 2.0, 1)]  # twice the exposure
+    joined = make_montage(pictures)
+    rows, cols = joined.picture.shape
+    down, right = joined.origin_px
+    middle = (np.array(WIDE_RETINA.shape) - 1) / 2 - (GAZE_SIZE - 1) / 2 + np.array([down, right])
+    truth = ndimage.affine_transform(WIDE_RETINA, np.eye(2), middle, (rows, cols), order=3)
+    lit = ndimage.binary_erosion(joined.picture > 0.2, iterations=6)
+    assert lit.sum() > 1.3 * np.pi * (GAZE_FIELD_PX / 2) ** 2  # more than one field
+    assert np.corrcoef(joined.picture[lit], truth[lit])[0, 1] > 0.95
+    assert joined.picture[lit].mean() == pytest.approx(truth[lit].mean(), rel=0.05)  # the exposure of the first
+
+
+def test_a_picture_is_placed_by_another_one_than_the_first() -> None:
+    steps = [(0.0, 0.0), (75.0, 20.0), (150.0, 40.0)]
+    placed = make_montage([gaze(WIDE_RETINA, step, 0, k) for k, step in enumerate(steps)]).placed
+    assert all(one.used for one in placed)
+    assert placed[2].shift_px == pytest.approx(steps[2], abs=1.2)  # twice the error of one step
+
+
+def test_another_eye_and_a_small_overlap_stay_apart_with_the_reason() -> None:
+    first = gaze(WIDE_RETINA, (0, 0))
+    far = gaze(WIDE_RETINA, (150, 40), 0, 1)  # an overlap of 0.12
+    other = gaze(np.asarray(ndimage.zoom(OTHER_RETINA, 1.5, order=3), np.float32), (0, 0), 0, 2)
+    joined = make_montage([first, far, other])
+    assert [one.used for one in joined.placed] == [True, False, False]
+    assert all(one.reason and one.shift_px is None for one in joined.placed[1:])
+    assert joined.picture.shape == first.shape
+
+
+def test_a_montage_of_one_is_that_picture() -> None:
+    first = gaze(WIDE_RETINA, (0, 0))
+    joined = make_montage([first])
+    assert joined.origin_px == (0, 0)
+    inside = joined.picture > 0
+    assert joined.picture[inside] == pytest.approx(first[inside], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("match", "words"),
+    [
+        (Match((0, 0), 0, 0.45, 0.1, 0.6), "no picture shows the same part"),
+        (Match((0, 0), 0, 0.55, 0.1, 0.25), "no picture shows the same part"),
+        (Match((0, 0), 0, 0.7, 0.6, 0.6), "ambiguous"),
+        (Match((0, 0), 0, 0.9, 0.2, 0.15), "too small"),
+        (Match((0, 0), 0, 0.7, 0.3, 0.27), None),
+    ],
+)
+def test_the_rule_of_acceptance(match: Match, words: str | None) -> None:
+    assert words in (refusal(match) or "") if words else refusal(match) is None
+
+
+def test_pictures_that_cannot_be_joined_are_refused() -> None:
+    first = gaze(WIDE_RETINA, (0, 0))
+    with pytest.raises(FrameError, match="different sizes"):
+        make_montage([first, first[2:]])
+    with pytest.raises(FrameError, match="not numbers"):
+        make_montage([first, np.full_like(first, np.nan)])
+    with pytest.raises(FrameError, match="black"):
+        make_montage([first, np.zeros_like(first)])
