@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from math import exp, floor, log
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -16,20 +16,40 @@ from device.optics.illumination import LED, LEDS, TRANSMISSION_TO_EYE, photon_bu
 from device.values import Colour, Illumination
 
 LIMITS = Path(__file__).with_name("limits.toml")
+MOST_UNCHECKED_SHARE = 0.5  # of a limit that was not compared with the purchased standard
 LED_POWER_UNCERTAINTY = 2.0  # uncertainty factor of the LEDs' power (device/optics/illumination.py)
 
 
 class _Source(Table):
-    """Source of a number: edition and clause of the standard; `checked`: compared with the purchased standard."""
+    """Source of a number: edition, clause and formula of the standard.
+
+    `checked`: compared with the purchased standard, by `checked_by`, against the copy `checked_against`.
+    """
 
     edition: str = Field(min_length=1)
     clause: str = Field(min_length=1)
+    formula: str = Field(min_length=1)
     checked: bool
+    checked_by: str = ""
+    checked_against: str = ""
+
+    @model_validator(mode="after")
+    def _names_who_checked(self) -> Self:
+        named = (bool(self.checked_by), bool(self.checked_against))
+        if named != (self.checked, self.checked):
+            raise ValueError("checked needs checked_by and checked_against, and they need checked")
+        return self
 
 
 class _Rate(_Source):
     limit: float = Field(gt=0)
     share: float = Field(gt=0, le=1)
+
+    @model_validator(mode="after")
+    def _uses_half_of_what_is_unchecked(self) -> Self:
+        if not self.checked and self.share > MOST_UNCHECKED_SHARE:
+            raise ValueError(f"the share of an unchecked limit is at most {MOST_UNCHECKED_SHARE}")
+        return self
 
 
 class _Micro(_Rate):
@@ -83,6 +103,12 @@ class Limits(Table):
     waist_irradiance: _Watts
     photochemical_weight: Weight
     thermal_weight: Weight
+
+    @property
+    def unchecked(self) -> tuple[str, ...]:
+        """Return the names of the limits and weights that were not compared with the purchased standard."""
+        sources = {name: getattr(self, name) for name in type(self).model_fields}
+        return tuple(name for name, source in sources.items() if not source.checked)
 
     @property
     def photochemical_w_per_cm2(self) -> float:

@@ -49,7 +49,8 @@ class StatusSnapshot:
     minus the time budget; `torn_bytes`: size of each quarantined capture; `orphans`: number of complete capture folders
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
-    restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that.
+    restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
+    `unchecked_limits`: names of the light limits that were not compared with the purchased standard.
     """
 
     state: str
@@ -75,6 +76,7 @@ class StatusSnapshot:
     recovery: RecoveryReport = field(default_factory=RecoveryReport)
     backup_at: datetime | None = None
     unsaved_since: datetime | None = None
+    unchecked_limits: tuple[str, ...] = ()
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -242,6 +244,19 @@ def backup(facts: StatusSnapshot) -> Check:
 BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
 
 
+def light_limits(facts: StatusSnapshot) -> Check:
+    """Check that the light limits were compared with the purchased standard; ok but not known if not.
+
+    At most half of a limit that was not compared is used (`MOST_UNCHECKED_SHARE` in device/light_safety/hazard.py).
+    """
+    limit = "each compared with the standard"
+    if not facts.unchecked_limits:
+        return Check("light_limits", True, "compared with the standard", limit, "")
+    many = _count(len(facts.unchecked_limits), "number", "numbers")
+    value = f"{many} not compared with the purchased standard, so at most half of a limit is used"
+    return Check("light_limits", True, value, limit, "", known=False)
+
+
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
@@ -250,6 +265,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
+    light_limits,
 )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from device.clock import Clock
 from device.errors import StoreError
+from device.light_safety.hazard import light_limits
 from services.backup.backup_key import read_key
 from services.errors import BackupDamaged, RecordRemoved
 from services.health.checks import StatusSnapshot
@@ -54,6 +55,7 @@ def collect_status(
         recovery=store.recovery,
         backup_at=backup_at,
         unsaved_since=unsaved_since,
+        unchecked_limits=light_limits().unchecked,
     )
 
 

@@ -217,8 +217,8 @@ def test_light_above_the_irradiance_limit_is_refused_and_not_counted(lamp: Lamp,
         pytest.fail("it shone")
     assert lamp.illumination is None
     assert guarded.ledger.spent_j_per_cm2("OD") == 0.0
-    with guarded.on(Illumination("green", 0.2)):
-        assert lamp.illumination == Illumination("green", 0.2)
+    with guarded.on(Illumination("green", 0.1)):
+        assert lamp.illumination == Illumination("green", 0.1)
 
 
 def test_light_without_a_visit_has_a_lower_limit(guarded: GuardedLight, lamp: Lamp, clock: VirtualClock) -> None:
