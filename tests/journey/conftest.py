@@ -238,6 +238,34 @@ def old_rig(lasting_rig: Rig) -> Iterator[Rig]:
     assert not lasting_rig.died.is_set()
 
 
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    """The folder of a mounted USB drive, whose name has a blank."""
+    folder = tmp_path / "media" / "USB STICK"
+    folder.mkdir(parents=True)
+    escaped = str(folder).replace(" ", "\\040")  # as the kernel writes a blank
+    (tmp_path / "mounts").write_text(f"proc /proc proc rw 0 0\n/dev/sda1 {escaped} vfat rw 0 0\n")
+    return folder
+
+
+@pytest.fixture
+def drives(tmp_path: Path, stick: Path) -> UsbDrives:
+    """The USB drives of an instrument: one, `stick`."""
+    return UsbDrives((tmp_path / "media",), tmp_path / "mounts")
+
+
+def technician_requests(rig: Rig, path: str) -> Callable[..., httpx.Response]:
+    """Set the PIN, and return a function for requests below `path`, with a login for each, because it expires."""
+    rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
+
+    def request(method: str, below: str = "", **more: Any) -> httpx.Response:
+        entered = rig.request("POST", "/api/technician/unlock", json={"pin": "2580"})
+        cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
+        return rig.request(method, f"{path}{below}", headers=cookie, **more)
+
+    return request
+
+
 def until(holds: Callable[[], bool], patience_s: float = 15.0) -> None:
     """Wait in real time for a condition set by another thread."""
     end = time.monotonic() + patience_s

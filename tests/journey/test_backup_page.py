@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from services.backup.backup_folder import find_folder
@@ -17,9 +16,8 @@ from services.delivery.usb_drives import UsbDrives
 from services.http.app import create_app
 from services.http.routes.backup import backup_routes
 from services.records.capture_store import CaptureStore
-from tests.journey.conftest import Rig, until
+from tests.journey.conftest import Rig, technician_requests, until
 from tests.journey.faults import post_capture
-from tests.journey.test_visit_export import write_mounts
 
 PASSPHRASE = "four plain words here"
 DAY_S = 86_400.0
@@ -27,20 +25,11 @@ Ask = Callable[..., Any]
 
 
 @pytest.fixture
-def stick(tmp_path: Path) -> Path:
-    folder = tmp_path / "media" / "USB STICK"
-    folder.mkdir(parents=True)
-    write_mounts(tmp_path / "mounts", folder)
-    return folder
-
-
-@pytest.fixture
-def rig(build: Callable[..., Rig], tmp_path: Path, stick: Path) -> Iterator[Rig]:
+def rig(build: Callable[..., Rig], tmp_path: Path, drives: UsbDrives) -> Iterator[Rig]:
     with ExitStack() as undo:
         rig = build(tmp_path, undo)
         runner = BackupRunner(rig.store.folder, lambda: rig.arbiter.is_idle, rig.clock)
         undo.callback(runner.close)
-        drives = UsbDrives((tmp_path / "media",), tmp_path / "mounts")
         routers = (backup_routes(runner, rig.store, drives, rig.clock),)
         rig.application = create_app(rig.arbiter, rig.authenticator, technician_routers=routers)
         yield rig
@@ -48,15 +37,7 @@ def rig(build: Callable[..., Rig], tmp_path: Path, stick: Path) -> Iterator[Rig]
 
 @pytest.fixture
 def ask(rig: Rig) -> Ask:
-    """Requests of a technician who logs in for each, because the login expires."""
-    rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
-
-    def request(method: str, path: str = "", **more: Any) -> httpx.Response:
-        entered = rig.request("POST", "/api/technician/unlock", json={"pin": "2580"})
-        cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
-        return rig.request(method, f"/api/technician/backup{path}", headers=cookie, **more)
-
-    return request
+    return technician_requests(rig, "/api/technician/backup")
 
 
 def ended(ask: Ask) -> dict[str, Any]:

@@ -13,37 +13,25 @@ from services.delivery.usb_drives import UsbDrives
 from services.health.event_log import EventLog
 from services.http.app import create_app
 from services.http.routes.event_log import event_log_routes
-from tests.journey.conftest import Rig
-from tests.journey.test_visit_export import write_mounts
+from tests.journey.conftest import Rig, technician_requests
 
 log = logging.getLogger("services.instrument.test")
 
 
 @pytest.fixture
-def stick(tmp_path: Path) -> Path:
-    folder = tmp_path / "media" / "USB STICK"
-    folder.mkdir(parents=True)
-    write_mounts(tmp_path / "mounts", folder)
-    return folder
-
-
-@pytest.fixture
-def rig(build: Callable[..., Rig], tmp_path: Path, stick: Path) -> Iterator[Rig]:
+def rig(build: Callable[..., Rig], tmp_path: Path, drives: UsbDrives) -> Iterator[Rig]:
     with ExitStack() as undo:
         rig = build(tmp_path, undo, wait=False)
         event_log = EventLog(tmp_path / "diary")
         undo.callback(event_log.close)
-        routers = (event_log_routes(event_log, UsbDrives((tmp_path / "media",), tmp_path / "mounts"), rig.clock),)
+        routers = (event_log_routes(event_log, drives, rig.clock),)
         rig.application = create_app(rig.arbiter, rig.authenticator, technician_routers=routers)
         yield rig
 
 
 @pytest.fixture
 def ask(rig: Rig) -> Callable[..., Any]:
-    """Requests with the technician's login cookie."""
-    entered = rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
-    cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
-    return lambda method, path, **more: rig.request(method, f"/api/technician/diary{path}", headers=cookie, **more)
+    return technician_requests(rig, "/api/technician/diary")
 
 
 def test_event_log_is_downloaded_as_text(ask: Callable[..., Any]) -> None:

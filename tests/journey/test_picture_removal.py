@@ -11,34 +11,22 @@ import pytest
 
 from services.delivery.usb_drives import UsbDrives
 from services.http.app import create_app
-from tests.journey.conftest import Rig
-from tests.journey.test_visit_export import write_mounts
+from tests.journey.conftest import Rig, technician_requests
 
 KEYS = (f"{number:016x}" for number in count(1))
 
 
 @pytest.fixture
-def stick(tmp_path: Path) -> Path:
-    folder = tmp_path / "media" / "STICK"
-    folder.mkdir(parents=True)
-    write_mounts(tmp_path / "mounts", folder)
-    return folder
-
-
-@pytest.fixture
-def rig(build: Callable[..., Rig], tmp_path: Path, stick: Path) -> Iterator[Rig]:
+def rig(build: Callable[..., Rig], tmp_path: Path, drives: UsbDrives) -> Iterator[Rig]:
     with ExitStack() as undo:
         rig = build(tmp_path, undo)
-        drives = UsbDrives((tmp_path / "media",), tmp_path / "mounts")
         rig.application = create_app(rig.arbiter, rig.authenticator, usb_drives=drives)
         yield rig
 
 
 @pytest.fixture
 def ask(rig: Rig) -> Callable[..., httpx.Response]:
-    entered = rig.request("POST", "/api/technician/pin", json={"pin": "2580"})
-    cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
-    return lambda method, path="": rig.request(method, f"/api/technician/removal{path}", headers=cookie)
+    return technician_requests(rig, "/api/technician/removal")
 
 
 def finished_visit(rig: Rig) -> tuple[str, str]:

@@ -23,26 +23,10 @@ keys = (f"{number:016x}" for number in count(1))
 FILES = {"R-centre-1.png": b"p" * 5000, "visit.json": b"{}"}
 
 
-def write_mounts(table: Path, *folders: Path) -> None:
-    """Write a mount table as the kernel does, with its escapes of blanks."""
-    lines = [f"/dev/sda1 {str(folder).replace(' ', chr(92) + '040')} vfat rw 0 0\n" for folder in folders]
-    table.write_text("proc /proc proc rw 0 0\n" + "".join(lines))
-
-
 @pytest.fixture
-def stick(tmp_path: Path) -> Path:
-    folder = tmp_path / "media" / "USB STICK"
-    folder.mkdir(parents=True)
-    return folder
-
-
-@pytest.fixture
-def visit(rig: Any, tmp_path: Path, stick: Path) -> Any:
+def visit(rig: Any, drives: UsbDrives) -> Any:
     """Return a visit with a retake and identifying fields, on an instrument with one USB drive."""
-    write_mounts(tmp_path / "mounts", stick)
-    rig.application = create_app(
-        rig.arbiter, rig.authenticator, usb_drives=UsbDrives((tmp_path / "media",), tmp_path / "mounts")
-    )
+    rig.application = create_app(rig.arbiter, rig.authenticator, usb_drives=drives)
     begun = rig.request("POST", "/api/visits", json={"key": next(keys)}).json()
     at = f"/api/visits/{begun['id']}"
     fields = {"consent": "agreed", "name": "Meena K.", "village": "Nowhere", "phone": "12345", "age": 54}
