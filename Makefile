@@ -36,18 +36,16 @@ WORKERS := -n 3 --dist loadfile
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
 PAGE_WORKERS := -n 4 --dist loadfile
 
-# A browser, a server and a solver share the cores with whatever else runs: a browser test that fails gets one more try, and
-# the summary names it, because it is then the test or the page that has to be mended.
+# The page's tests come first: they take longest of all files, and wait while the others compute.
 test: .venv/ready browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
-	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
-	@$(BIN)/python -m pytest $(JOURNEYS) --reruns 1 -rR
 
 test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
 	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
-	@$(BIN)/python -m pytest $(PAGE_WORKERS) tests/browser $(addprefix --ignore=,$(JOURNEYS)) --reruns 1 -rR
+	@$(BIN)/python -m pytest $(PAGE_WORKERS) -rR tests/browser $(addprefix --ignore=,$(JOURNEYS))
 
 test-paper: .venv/ready ## Run the paper's experiments again, and show of every scene that nothing seen is left out.
 	@$(BIN)/python -m pytest -n auto -m paper tests/physics

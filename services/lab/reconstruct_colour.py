@@ -60,7 +60,7 @@ def reconstruct_colours(
     if len(shapes) > 1:
         listed = ", ".join(f"{name} {one.picture.shape[0]} x {one.picture.shape[1]}" for name, one in made.items())
         raise FrameError(f"the channels have different sizes: {listed} pixels", "Give frames of one camera mode.")
-    return _joined(channels, made, options)
+    return _joined(sources, channels, made, options)
 
 
 def _by_name(sources: Sequence[ChannelSource]) -> dict[ChannelName, list[ChannelSource]]:
@@ -102,8 +102,8 @@ def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planne
 
 
 def _joined(
-    channels: Mapping[ChannelName, list[ChannelSource]], made: Mapping[ChannelName, FileReconstruction],
-    options: ReconstructOptions,
+    sources: Sequence[ChannelSource], channels: Mapping[ChannelName, list[ChannelSource]],
+    made: Mapping[ChannelName, FileReconstruction], options: ReconstructOptions,
 ) -> FileReconstruction:  # fmt: skip
     """Register the channels, join them, write the picture and return it with its report."""
     reference: ChannelName = "green" if "green" in made else next(iter(made))
@@ -112,7 +112,7 @@ def _joined(
     lit = _field(channels[reference][0], main.picture, options)
     joined = join_colours(pictures, lit, main.report.bin)
     report = replace(
-        main.report, seconds=summed_seconds(made.values()), channels=joined.channels, frames=_frames(made),
+        main.report, seconds=summed_seconds(made.values()), channels=joined.channels, frames=_frames(channels, made, sources),
         warnings=_warnings(made, joined), psf_channels=len(made),
     )  # fmt: skip
     solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))
@@ -130,10 +130,18 @@ def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -
     return lit_field(picture, Grid.periodic(shape, 1, float("inf")))
 
 
-def _frames(made: Mapping[ChannelName, FileReconstruction]) -> tuple[FrameUse, ...]:
-    """Return the frames of all channels, one channel after the other, with their places in the whole list."""
-    uses = [use for one in made.values() for use in one.report.frames]
-    return tuple(replace(use, index=k) for k, use in enumerate(uses))
+def _frames(
+    channels: Mapping[ChannelName, list[ChannelSource]], made: Mapping[ChannelName, FileReconstruction],
+    sources: Sequence[ChannelSource],
+) -> tuple[FrameUse, ...]:  # fmt: skip
+    """Return what became of every raw, in the order in which they were given."""
+    place = {id(one): k for k, one in enumerate(sources)}
+    uses = [
+        replace(use, index=place[id(source)])
+        for name, given in channels.items()
+        for source, use in zip(given, made[name].report.frames, strict=True)
+    ]
+    return tuple(sorted(uses, key=lambda use: use.index))
 
 
 def _warnings(made: Mapping[ChannelName, FileReconstruction], joined: ColourPicture) -> tuple[str, ...]:

@@ -41,17 +41,18 @@ def refusal(answer: Answer) -> str:
 
 
 def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: Path) -> None:
-    words = reconstruct(folder, "red=red.npy", "green=green.npy", "green=green2.npy")
+    words = reconstruct(folder, "green=green.npy", "red=red.npy", "green=green2.npy")
     done = call([*words, "--dark", f"red={folder / 'dark.npy'}"])
     assert done.code == 0, done.err
     assert "blue is predicted" in done.err
     report = json.loads((folder / "report.json").read_text())
     assert [(one["name"], one["predicted"]) for one in report["channels"]] == [
-        ("red", False), ("green", False), ("blue", True),
+        ("green", False), ("red", False), ("blue", True),
     ]  # fmt: skip
-    assert report["channels"][0]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)
+    assert report["channels"][1]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)
     assert report["channels"][2]["shift_px"] is None
     assert [one["index"] for one in report["frames"]] == [0, 1, 2]
+    assert report["frames"][2]["shift_px"] == pytest.approx(SHIFTS_PX["green2"], abs=0.3)
     assert np.load(folder / "out.npy").shape == (*SHAPE, 3)
     assert call(reconstruct(folder, "red=red.npy", "green=green.npy", out="out.png")).code == 0
 
