@@ -112,7 +112,8 @@ def _joined(
     lit = _field(channels[reference][0], main.picture, options)
     joined = join_colours(pictures, lit, main.report.bin)
     report = replace(
-        main.report, seconds=summed_seconds(made.values()), channels=joined.channels, frames=_frames(channels, made, sources),
+        main.report, seconds=summed_seconds(made.values()), channels=joined.channels,
+        frames=_frames(channels, made, sources),
         warnings=_warnings(made, joined), psf_channels=len(made),
     )  # fmt: skip
     solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))

@@ -120,7 +120,7 @@ FILES: Mapping[str, JsonValue] = {
             "used": _typed("boolean", "True if the picture has the light of this raw."),
             "shift_px": _typed(
                 ["array", "null"],
-                "Rows and columns: what is at (r, c) of the reference, the first used raw (of the same channel), stands "
+                "Rows and columns: what is at (r, c) of the reference, the first used raw of the channel, stands "
                 "at (r, c) plus this in the raw, in pixels of the raw. Null if the raw was not registered.",
                 items={"type": "number"}, minItems=2, maxItems=2,
             ),
