@@ -26,8 +26,8 @@ from services.records.dose_ledger_tables import DoseLedgerStore
 
 MAX_ON_S, DAY_S = 30.0, 86400.0
 # Bright enough that a few exposures reach the limit; a weight of 1, so that the model needs no table.
-TRUE_W_PER_CM2 = {"red": 20e-6, "green": 100e-6, "blue": 219e-6}
-BEAMS = {"red": Beam(0.440, 20e-6, 1e-6), "green": Beam(0.440, 100e-6, 1e-6), "blue": Beam(0.440, 219e-6, 1e-6)}
+TRUE_W_PER_CM2 = {"red": 20e-6, "green": 100e-6, "blue": 109e-6}
+BEAMS = {"red": Beam(0.440, 20e-6, 1e-6), "green": Beam(0.440, 100e-6, 1e-6), "blue": Beam(0.440, 109e-6, 1e-6)}
 STOP_J_PER_CM2, STOP_WITHOUT_VISIT_J_PER_CM2 = 0.02, 0.012
 LIMITS = light_limits()
 DOSE = LIMITS.photochemical_dose

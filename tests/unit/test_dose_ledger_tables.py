@@ -150,20 +150,20 @@ def test_an_exposure_above_the_limit_itself_is_refused_as_such(store: CaptureSto
 
 def test_at_the_limit_the_lamp_stays_dark_for_that_eye_only(store: CaptureStore, clock: VirtualClock) -> None:
     lamp, ledger = Lamp(), open_ledger(store, clock)
-    guarded = guard(lamp, clock, ledger, 219e-6)
+    guarded = guard(lamp, clock, ledger, 109.5e-6)
 
     def expose() -> None:
         with guarded.on(GREEN, ("OD",), in_visit=True):
             clock.sleep(9.9)
         clock.sleep(10)
 
-    for _ in range(72):  # 72 x 9.9 s x 219 uW/cm2
+    for _ in range(145):  # 145 x 9.9 s x 109.5 uW/cm2
         expose()
     with pytest.raises(LightLimit, match="again after"):
         expose()
     assert lamp.illumination is None
     # at most one reservation below the limit
-    assert 0 <= light_limits().stop_j_per_cm2 - ledger.spent_j_per_cm2("OD") < 219e-6 * (10 + AFTERGLOW_S)
+    assert 0 <= light_limits().stop_j_per_cm2 - ledger.spent_j_per_cm2("OD") < 109.5e-6 * (10 + AFTERGLOW_S)
     with guarded.on(GREEN, ("OS",)):
         assert lamp.illumination == GREEN
     assert guarded.dose_report().dose_high == ("OD",)
