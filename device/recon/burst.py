@@ -19,6 +19,7 @@ from device.errors import FrameError
 from device.recon.assessment.image_quality import NO_SIGNAL
 from device.recon.estimation.registration import Detail, Registrar, Registration, Shift
 from device.recon.model.fft_plans import Planner
+from device.recon.model.field_of_view import lit_field
 from device.recon.model.grid import Grid
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Preprocessor
@@ -27,10 +28,9 @@ from device.recon.reconstructor import Reconstructor, default_schedule, plane
 from device.values import Calibration, Image
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
-LEAST_SD = 6.0  # a match by chance: the highest of some 10,000 independent shifts lies at 4 sd
-LEAST_OF_TYPICAL = 0.75  # of the median correlation of the matching frames: half a lid reaches 0.35, a saccade 0.98
+LEAST_SD = 6.0  # a match by chance: the highest of 10,000 independent values lies at about 4 sd
+LEAST_OF_TYPICAL = 0.75  # of the median correlation of the matching frames; half a lid reaches 0.5 of it
 LEAST_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
-LIT_SHARE, LIT_SIGMA_PX = 0.3, 6.0  # of an unknown field
 MOST_FRAMES = 64
 
 
@@ -127,6 +127,7 @@ class BurstJoiner:
         report = self._single(counts, dark).report
         if NO_SIGNAL in report.warnings:
             raise FrameError("the frame holds no signal above the black level")
+        # A preprocessor of its own: its buffers are the result, and those of all frames are needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
         linear = full(counts, dark, self._single.defects(counts, dark))
         return _Seen(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn)
@@ -167,21 +168,6 @@ class BurstJoiner:
         light = total_dn / reference.mean_dn
         frames = tuple(replace(one, weight=weights.get(one.index, 0.0)) for one in uses)
         return JoinedFrame(joined, joined_calibration(self._calibration, light, len(used)), frames)
-
-
-def lit_field(picture: Image, grid: Grid) -> Image:
-    """Return the lit field in a picture whose field is unknown, on its grid, 0 or 1: its largest bright area.
-
-    Bright is LIT_SHARE of the level that a tenth of the window exceeds; holes, such as a dark macula, are filled.
-    """
-    level = ndimage.gaussian_filter(picture, LIT_SIGMA_PX / grid.n)
-    bright = np.zeros(grid.shape, bool)
-    bright[grid.slices] = (level > LIT_SHARE * np.quantile(level[grid.slices], 0.9))[grid.slices]
-    areas, count = ndimage.label(bright)
-    if count == 0:
-        return np.ones(grid.shape, np.float32)
-    largest = 1 + int(np.argmax(ndimage.sum_labels(bright, areas, range(1, count + 1))))
-    return np.asarray(ndimage.binary_fill_holes(areas == largest), np.float32)
 
 
 def joined_calibration(calibration: Calibration, light: float, count: int) -> Calibration:

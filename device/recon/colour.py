@@ -2,8 +2,8 @@
 
 The colours are taken one after the other, and the eye moves in between. Each channel has its own PSF and is solved by
 itself; the others are registered to green and moved to its grid. Edges are where green has them, so red and blue are
-then filtered with green as the guide. A blue that was not taken can be predicted from red and green: at blue light the
-hazard is ten times that of green. NUMERICS.md 10.
+then filtered with green as the guide. A blue that was not taken can be predicted from red and green: blue at full
+drive has 45 times the hazard of green (OPTICS.md 4.4). NUMERICS.md 10.
 """
 
 from collections.abc import Mapping
@@ -14,11 +14,12 @@ import numpy as np
 from scipy import ndimage
 
 from device.recon.estimation.registration import Registrar, Registration, Shift
-from device.recon.model.resampling import moved_back
+from device.recon.model.resampling import block_mean, moved_back
 from device.values import Image
 
 ChannelName = Literal["red", "green", "blue", "amber"]
 CHANNELS: tuple[ChannelName, ...] = ("red", "green", "blue", "amber")
+RGB: tuple[ChannelName, ...] = ("red", "green", "blue")  # channels of the picture
 FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
 BAND_PER_PX = (0.01, 0.12)
 GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
@@ -59,8 +60,8 @@ def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) ->
     """Join linear pictures (rows, cols) of one eye in several colours to one picture in red, green and blue.
 
     `field` is the lit field, (rows, cols) in 0..1; `n` the pixels per sample at which the pictures were solved. The
-    reference is green, else the first. Amber stands for a missing red. A missing blue is predicted from red and green,
-    any other missing channel, and blue without red or green, repeats the nearest one.
+    reference is green, else the first. Amber stands for a missing red. A missing blue is predicted from red and green;
+    a missing red repeats the reference, a missing green repeats red. Both count as predicted.
     """
     reference: ChannelName = "green" if "green" in pictures else next(iter(pictures))
     shifts, doubtful = register_colours(pictures, reference, field, n)
@@ -69,12 +70,12 @@ def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) ->
         name: picture if name == reference else guided_filter(picture, on_grid[reference], field)
         for name, picture in on_grid.items()
     }
-    uses = [ChannelUse(name, shifts[name]) for name in pictures]
-    if "blue" not in guided:
-        uses.append(ChannelUse("blue", None, predicted=True))
     red = guided.get("red", guided.get("amber", guided[reference]))
     green = guided.get("green", red)
     blue = guided["blue"] if "blue" in guided else predicted_blue(red, green, field)
+    missing = [name for name in RGB if name not in pictures and not (name == "red" and "amber" in pictures)]
+    uses = [ChannelUse(name, shifts[name]) for name in pictures]
+    uses += [ChannelUse(name, None, predicted=True) for name in missing]
     return ColourPicture(np.stack([red, green, blue], axis=2).astype(np.float32), tuple(uses), doubtful)
 
 
@@ -133,10 +134,3 @@ def predicted_blue(red: Image, green: Image, field: Image) -> Image:
     offset, of_red, of_green = BLUE_FROM_RED_GREEN
     blue = offset + of_red * r + of_green * g
     return np.asarray(np.maximum(blue, 0) * BLUE_OVER_GREEN * means[1] * field, np.float32)
-
-
-def block_mean(image: Image, n: int) -> Image:
-    """Return the means of n x n pixels; rows and columns beyond the last whole block are left out."""
-    rows, cols = (size // n for size in image.shape)
-    means: Image = image[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float32)
-    return means

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.errors import FrameError
-from device.recon.burst import lit_field
-from device.recon.colour import block_mean
 from device.recon.estimation.masked_correlation import (
     FlatPicture,
     MaskedCorrelator,
@@ -23,7 +21,9 @@ from device.recon.estimation.masked_correlation import (
     flatten,
     rotation_matrix,
 )
+from device.recon.model.field_of_view import lit_field
 from device.recon.model.grid import Grid
+from device.recon.model.resampling import block_mean
 from device.values import Image
 
 LEAST_PEAK, LEAST_OVER_SECOND, LEAST_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.24 to 0.51
@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 class Placement:
     """Place of one picture in a montage, relative to the first picture.
 
-    What is at (r, c) of the first picture stands at (r, c) + `shift_px` in this one, after that turned about its centre
+    What is at (r, c) of the first picture stands in this one at (r, c) + `shift_px`, turned about the picture's centre
     by `rotation_deg`, counter-clockwise as displayed. `peak` is the normalised correlation with the picture to which it
     was registered, `overlap` their common part as a share of the smaller field; both None for the first. `reason` says
     why a picture is not used.

@@ -19,6 +19,7 @@ from PIL import ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 
 from device.errors import FrameError, SettingError
+from device.recon.model.resampling import block_mean
 from device.values import Counts, Image, check_image_shape
 from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metadata
 
@@ -73,7 +74,7 @@ def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int 
     if longest_side_px < 1 or not 1 <= quality <= 95:
         raise SettingError(f"a picture {longest_side_px} px long, at quality {quality} of 1 to 95, cannot be made")
     _refuse_invalid_picture(picture)
-    small = _block_mean(picture, max(picture.shape[:2]) // longest_side_px)
+    small = block_mean(picture, max(picture.shape[:2]) // longest_side_px)
     image = Pillow.fromarray(_display_pixels(small))
     image.thumbnail(
         (longest_side_px, longest_side_px), Pillow.Resampling.BILINEAR
@@ -90,9 +91,9 @@ def counts_jpeg(counts: Counts, black_dn: float, white_dn: float, longest_side_p
     Reduced by a whole factor, so its longer side is below twice `longest_side_px`. Marked if `simulated`.
     """
     smaller = max(counts.shape) // longest_side_px
-    share = (_block_mean(counts.astype(np.float32), smaller) - black_dn) / (white_dn - black_dn)
+    share = (block_mean(counts.astype(np.float32), smaller) - black_dn) / (white_dn - black_dn)
     grey = _srgb_curve().take((np.clip(share, 0, 1) * (_STEPS - 1)).astype(np.uint16))
-    full = _block_mean((counts >= white_dn).astype(np.float32), smaller) > _SATURATED_SHARE
+    full = block_mean((counts >= white_dn).astype(np.float32), smaller) > _SATURATED_SHARE
     pixels = np.stack([np.where(full, 255, grey), *[np.where(full, 0, grey)] * 2], -1).astype(np.uint8)
     out = BytesIO()
     Pillow.fromarray(_marked(pixels, simulated)).save(out, "JPEG", quality=80)
@@ -177,17 +178,6 @@ def _srgb_curve() -> Pixels:
     return pixels
 
 
-def _block_mean(picture: Image, block: int) -> Image:
-    """Return the means of blocks of `block` x `block` pixels per channel; incomplete blocks at the edge are dropped."""
-    if block < 2:
-        return picture
-    down, across = (min(block, length) for length in picture.shape[:2])  # a narrow picture may be thinner than a block
-    rows, cols = picture.shape[0] // down * down, picture.shape[1] // across * across
-    strips = sum((picture[row:rows:down] for row in range(1, down)), start=picture[0:rows:down])
-    total = sum((strips[:, col:cols:across] for col in range(1, across)), start=strips[:, 0:cols:across])
-    return np.asarray(total / np.float32(down * across), np.float32)
-
-
 def _marked(pixels: Pixels, simulated: bool) -> Pixels:
     """Return a copy of the pixels with the mark in the bottom left corner if `simulated`, else the same array."""
     if not simulated:
@@ -217,3 +207,9 @@ def _lengths(size: float) -> list[float]:
     font, gap = ImageFont.load_default(size), 0.15 * size
     ends = list(accumulate((font.getlength(letter) + gap for letter in MARK), initial=0.3 * size))
     return [*ends[1:], ends[-1] + 0.45 * size]
+
+
+def from_srgb(pixels: NDArray[np.uint8]) -> Image:
+    """Return the linear light, 0 to 1, of 8-bit sRGB values of any shape (IEC 61966-2-1)."""
+    coded = pixels.astype(np.float32) / np.float32(255)
+    return np.asarray(np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4), np.float32)

@@ -33,7 +33,7 @@ def _joined(args: Sequence[str]) -> list[str]:
 
 
 def parse_channels(words: Sequence[str]) -> list[ChannelSource]:
-    """Return the values of `--channel`, in their order; SettingError for an unknown name or a missing file."""
+    """Return the values of `--channel`, in their order; SettingError for an unknown name or fewer than three values."""
     found = []
     for word in words:
         values = word.split(SEPARATOR)

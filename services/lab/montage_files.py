@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from device.config.image_files import is_marked_simulated, only_frame, read_image_file
-from device.errors import FrameError, SettingError
+from device.errors import FrameError
 from device.recon.montage import Montage, make_montage
 from device.values import Image
-from services.lab.reconstruct_file import refuse_output, require_writable, write_or_raise, write_picture
+from services.imaging.picture_files import from_srgb
+from services.lab.reconstruct_file import refuse_output, refuse_overwriting, write_or_raise, write_picture
 
 
 def montage_files(
@@ -19,17 +20,11 @@ def montage_files(
 ) -> Montage:
     """Join picture files (.npy, .tiff or .png), write the montage and its report, and return it.
 
-    `progress` gets a line for each picture that is placed.
-    FrameError for a file that is no picture, or for pictures of different sizes; SettingError for an output that cannot
-    be written or would replace a picture.
+    `progress` gets a line for each picture that is placed. FrameError for a file that is no picture, or for pictures of
+    different sizes; SettingError for an output that cannot be written or would replace a picture.
     """
     refuse_output(output)
-    if report is not None:
-        require_writable(report)
-    inputs = {path.resolve() for path in pictures}
-    for path in (output, report):
-        if path is not None and path.resolve() in inputs:
-            raise SettingError(f"{path} is an input and would be overwritten", "Choose another name for the result.")
+    refuse_overwriting((output, report), pictures)
     joined = make_montage(
         [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed")
     )
@@ -41,9 +36,14 @@ def montage_files(
 
 
 def read_picture(path: Path) -> Image:
-    """Return a picture file as float32, (rows, cols) or (rows, cols, 3); FrameError for values that are not numbers."""
+    """Return a picture file as linear float32, (rows, cols) or (rows, cols, 3); an 8-bit PNG is decoded from sRGB.
+
+    FrameError for values that are not numbers, or for a black picture.
+    """
     name = str(path)
-    pixels = np.asarray(only_frame(read_image_file(path).frames, name), np.float32)
+    stored = only_frame(read_image_file(path).frames, name)
+    is_coded = path.suffix.lower() == ".png" and stored.dtype == np.uint8
+    pixels = from_srgb(stored.astype(np.uint8)) if is_coded else np.asarray(stored, np.float32)
     if not np.isfinite(pixels).all():
         raise FrameError(f"{name} holds values that are not numbers", "Reconstruct the picture again.")
     if not pixels.max() > 0:

@@ -17,6 +17,7 @@ from services.lab.reconstruct_file import (
     file_report,
     plan_reconstructor,
     refuse_invalid,
+    refuse_overwriting,
     write_picture,
 )
 from services.lab.reconstruct_inputs import (
@@ -50,6 +51,9 @@ def load_burst(raws: Sequence[Source], options: ReconstructOptions) -> list[Load
     refuse_invalid(options)
     if options.sweep is not None:
         raise SettingError("a sweep is drawn for one raw", "Leave --sweep out, or give one raw.")
+    if options.even:
+        raise SettingError("the picture of a burst is not evened out", "Leave --even out.")
+    refuse_overwriting((options.output, options.report), raws)  # the options name only the first raw
     return [load_raw(raw, options.bayer, checked=False) for raw in raws]
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from device.errors import FrameError, SettingError
-from device.recon.burst import FrameUse, lit_field
+from device.recon.burst import FrameUse
 from device.recon.colour import CHANNELS, ChannelName, ColourPicture, join_colours
 from device.recon.model.fft_plans import Planner
-from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
 from device.values import Image
 from services.lab.reconstruct_burst import load_burst, solve_burst
@@ -18,7 +18,9 @@ from services.lab.reconstruct_file import (
     FileReconstruction,
     FileReconstructor,
     field_mask,
+    given_options,
     refuse_output,
+    refuse_overwriting,
     summed_seconds,
     write_picture,
 )
@@ -43,17 +45,12 @@ def reconstruct_colours(
     green of the first frame. `options` holds all other options (`raw` and `psfs` are ignored), `darks` the dark frames
     of single channels. SettingError for options that do not fit, FrameError for frames of different shapes.
     """
-    channels = _by_name(sources)
-    if options.output is not None:
-        refuse_output(options.output)
-    if options.calibration is not None or options.psfs or options.bayer is not None:
-        raise SettingError("each channel has a PSF of its own", "Leave --psf, --calibration and --bayer out.")
-    for name in darks or {}:
-        if name not in channels:
-            raise SettingError(f"a dark frame is given for {name}, which is no channel", "Give the channel, too.")
+    channels, darks = _by_name(sources), darks or {}
+    _refuse_invalid(channels, options, darks)
     planner = Planner(options.plans)
+    share_s = None if options.budget_s is None else options.budget_s / len(channels)
     made = {
-        name: _channel(given, replace(options, dark=(darks or {}).get(name, options.dark)), planner)
+        name: _channel(given, replace(options, dark=darks.get(name, options.dark), budget_s=share_s), planner)
         for name, given in channels.items()
     }
     shapes = {one.picture.shape for one in made.values()}
@@ -61,6 +58,24 @@ def reconstruct_colours(
         listed = ", ".join(f"{name} {one.picture.shape[0]} x {one.picture.shape[1]}" for name, one in made.items())
         raise FrameError(f"the channels have different sizes: {listed} pixels", "Give frames of one camera mode.")
     return _joined(sources, channels, made, options)
+
+
+def _refuse_invalid(
+    channels: Mapping[ChannelName, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
+) -> None:
+    """Raise SettingError for options that a colour picture does not have, or an output that is an input."""
+    if options.calibration is not None or options.psfs or options.bayer is not None:
+        raise SettingError("each channel has a PSF of its own", "Leave --psf, --calibration and --bayer out.")
+    if options.even or options.sweep is not None:
+        raise SettingError("a colour picture is not evened out, and has no sweep", "Leave --even and --sweep out.")
+    for name in darks:
+        if name not in channels:
+            raise SettingError(f"a dark frame is given for {name}, which is no channel", "Give the channel, too.")
+    if options.output is not None:
+        refuse_output(options.output)
+    given = [source for one in channels.values() for source in one]
+    inputs = [*(one.raw for one in given), *(one.psf for one in given), *darks.values()]
+    refuse_overwriting((options.output, options.report), [*inputs, options.dark, options.flat, options.head])
 
 
 def _by_name(sources: Sequence[ChannelSource]) -> dict[ChannelName, list[ChannelSource]]:
@@ -87,7 +102,7 @@ def _same(one: Source, other: Source) -> bool:
 def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
     """Reconstruct the frames of one channel: one frame, or a burst."""
     raws = [one.raw for one in given]
-    options = replace(options, raw=raws[0], psfs=(given[0].psf,), output=None, report=None, even=False)
+    options = replace(options, raw=raws[0], psfs=(given[0].psf,), output=None, report=None)
     try:
         if len(raws) > 1:
             return solve_burst(load_burst(raws, options), options, planner)
@@ -114,7 +129,7 @@ def _joined(
     report = replace(
         main.report, seconds=summed_seconds(made.values()), channels=joined.channels,
         frames=_frames(channels, made, sources),
-        warnings=_warnings(made, joined), psf_channels=len(made),
+        warnings=_warnings(made, joined), psf_channels=len(made), given=given_options(options),
     )  # fmt: skip
     solved = FileReconstruction(joined.picture, report, any(one.simulated for one in made.values()))
     if options.output is not None:

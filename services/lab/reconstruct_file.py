@@ -241,7 +241,7 @@ class _Plan:
 
 def file_report(report: Report, solver: Reconstructor, options: ReconstructOptions) -> FileReport:
     """Return the report of a solver with what was set and the size on which it solved the frame."""
-    return FileReport(**vars(report), solved=_solved_size(solver, report), given=_given(options))
+    return FileReport(**vars(report), solved=_solved_size(solver, report), given=given_options(options))
 
 
 def _share_s(deadline: Deadline, channels_left: int) -> float:
@@ -276,7 +276,7 @@ def _solved_size(solver: Reconstructor, report: Report) -> Shape:
     return found[-1].grid.window
 
 
-def _given(options: ReconstructOptions) -> dict[str, float | str | dict[str, float]]:
+def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[str, float]]:
     """Return the options that replaced a choice of the program, by their names."""
     single: dict[str, float | str | None] = {
         "method": options.method, "bin": options.bin, "rounds": options.rounds, "budget_s": options.budget_s,
@@ -349,15 +349,19 @@ def _refuse_outputs(options: ReconstructOptions) -> None:
     """Raise SettingError for an output that cannot be written, is of no known kind, or would replace an input."""
     if options.output is not None:
         refuse_output(options.output)
-    images = (options.raw, *options.psfs, options.dark, options.flat)
-    inputs = {path.resolve() for path in (*images, options.head) if isinstance(path, Path)}
-    for path in (options.output, options.report, options.sweep):
-        if path is not None:
-            require_writable(path)
-            if path.resolve() in inputs:
-                raise SettingError(
-                    f"{path} is an input and would be overwritten", "Choose another name for the result."
-                )
+    inputs = (options.raw, *options.psfs, options.dark, options.flat, options.head)
+    refuse_overwriting((options.output, options.report, options.sweep), inputs)
+
+
+def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[Source | None]) -> None:
+    """Raise SettingError for an output that cannot be written or is an input; None and arrays are skipped."""
+    read = {path.resolve() for path in inputs if isinstance(path, Path)}
+    for path in outputs:
+        if path is None:
+            continue
+        require_writable(path)
+        if path.resolve() in read:
+            raise SettingError(f"{path} is an input and would be overwritten", "Choose another name for the result.")
 
 
 def refuse_output(path: Path) -> None:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from services.imaging.picture_files import to_png
+from services.lab.montage_files import read_picture
 from tests.journey.wrong_inputs import call
 from tests.moving_retina import WIDE_RETINA, gaze
 
@@ -21,6 +23,16 @@ def test_two_pictures_are_joined_and_their_places_reported(tmp_path: Path) -> No
     assert (first["shift_px"], first["rotation_deg"], first["used"]) == ([0, 0], 0, True)
     assert np.allclose(second["shift_px"], (60, -20), atol=0.6)  # as in the unit test
     assert call([*words, "-o", str(tmp_path / "out.png")]).code == 0
+
+
+def test_a_png_is_read_as_the_light_that_it_shows(tmp_path: Path) -> None:
+    first = gaze(WIDE_RETINA, (0, 0))
+    (tmp_path / "a.png").write_bytes(to_png(first, simulated=False))
+    light = read_picture(tmp_path / "a.png")
+    inside = (first > 0.5) & (light < 1)  # the window of a PNG clips the brightest pixels
+    assert np.corrcoef(light[inside], first[inside])[0, 1] > 0.9995  # 8 bits
+    line = np.polyfit(first[inside], light[inside], 1)
+    assert np.abs(np.polyval(line, first[inside]) - light[inside]).max() < 0.02  # gamma alone would bend it by 0.1
 
 
 def test_wrong_inputs_are_refused_with_the_remedy(tmp_path: Path) -> None:

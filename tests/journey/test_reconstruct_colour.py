@@ -49,10 +49,10 @@ def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: 
     assert [(one["name"], one["predicted"]) for one in report["channels"]] == [
         ("green", False), ("red", False), ("blue", True),
     ]  # fmt: skip
-    assert report["channels"][1]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)
+    assert report["channels"][1]["shift_px"] == pytest.approx(SHIFTS_PX["red"], abs=0.5)  # a quarter of a sample
     assert report["channels"][2]["shift_px"] is None
     assert [one["index"] for one in report["frames"]] == [0, 1, 2]
-    assert report["frames"][2]["shift_px"] == pytest.approx(SHIFTS_PX["green2"], abs=0.3)
+    assert report["frames"][2]["shift_px"] == pytest.approx(SHIFTS_PX["green2"], abs=0.3)  # as in bursts
     assert np.load(folder / "out.npy").shape == (*SHAPE, 3)
     assert call(reconstruct(folder, "red=red.npy", "green=green.npy", out="out.png")).code == 0
 
@@ -66,6 +66,7 @@ def test_red_and_two_greens_give_a_colour_picture_with_a_predicted_blue(folder: 
         (["a.npy", "--psf", "b.npy", "--dark", "red=c.npy"], "Give --dark FILE without a name."),
         (["--channel", "green", "a.npy", "b.npy", "--dark", "red=c.npy"], "which is no channel"),
         (["--channel", "green", "a.npy", "b.npy", "--psf", "b.npy"], "a PSF of its own"),
+        (["--channel", "green", "a.npy", "b.npy", "--even"], "Leave --even and --sweep out."),
         ([], "no raw is given"),
     ],
 )
@@ -76,3 +77,17 @@ def test_wrong_channels_are_refused_with_the_remedy(folder: Path, words: list[st
 def test_channels_of_different_size_or_without_a_file_are_refused(folder: Path) -> None:
     assert "344 x 480" in refusal(call(reconstruct(folder, "red=small.npy", "green=green.npy")))
     assert "missing.npy" in refusal(call(reconstruct(folder, "red=missing.npy", "green=green.npy")))
+
+
+@pytest.mark.parametrize("input", ["red.npy", "psf.npy", "dark.npy"])
+def test_no_input_of_a_colour_picture_is_overwritten(folder: Path, input: str) -> None:
+    before = (folder / input).read_bytes()
+    words = [*reconstruct(folder, "red=red.npy", "green=green.npy", out=input), "--dark", f"red={folder / 'dark.npy'}"]
+    assert "would be overwritten" in refusal(call(words))
+    assert (folder / input).read_bytes() == before
+
+
+def test_a_time_budget_is_shared_by_the_channels(folder: Path) -> None:
+    words = [*reconstruct(folder, "red=red.npy", "green=green.npy"), "--budget-s", "20"]
+    assert call(words).code == 0
+    assert json.loads((folder / "report.json").read_text())["given"]["budget_s"] == 20

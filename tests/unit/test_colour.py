@@ -24,19 +24,29 @@ def test_channels_are_moved_to_the_grid_of_green_and_their_shifts_reported() -> 
     joined = join_colours(pictures, LIT, 2)
     shifts = {one.name: one.shift_px for one in joined.channels}
     assert shifts["green"] == (0, 0)
-    assert shifts["red"] == pytest.approx((3.4, -5.2), abs=0.3)
+    assert shifts["red"] == pytest.approx((3.4, -5.2), abs=0.3)  # a sixth of a sample
     assert shifts["blue"] == pytest.approx((-60, 2), abs=0.6)  # two fifths of the field are in both frames
     assert (joined.doubtful, [one.predicted for one in joined.channels]) == ((), [False] * 3)
     assert correlation(joined.picture[..., 0], pictures["green"]) > 0.98
     assert joined.picture.shape == (*LIT.shape, 3)
 
 
-def test_a_channel_of_another_retina_is_not_moved_and_named() -> None:
+def test_a_channel_that_shows_no_retina_is_not_moved_and_named() -> None:
     blank = np.asarray(LIT * np.random.default_rng(3).normal(1, 0.1, LIT.shape), np.float32)
     joined = join_colours({"green": seen(RETINA, (0, 0)), "red": blank}, LIT, 2)
     assert joined.doubtful == ("red",)
     assert joined.channels[1].shift_px == (0, 0)
-    assert joined.doubtful != join_colours({"green": seen(RETINA, (0, 0)), "red": seen(RED, (1, 1))}, LIT, 2).doubtful
+    assert join_colours({"green": seen(RETINA, (0, 0)), "red": seen(RED, (1, 1))}, LIT, 2).doubtful == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "predicted"),
+    [("green", {"red", "blue"}), ("red", {"green", "blue"}), ("blue", {"red", "green"}), ("amber", {"green", "blue"})],
+)
+def test_every_channel_that_was_not_taken_is_marked(given: ChannelName, predicted: set[str]) -> None:
+    joined = join_colours({given: seen(RETINA, (0, 0))}, LIT, 2)
+    assert {one.name for one in joined.channels if one.predicted} == predicted
+    assert joined.picture.shape == (*LIT.shape, 3)
 
 
 def test_a_missing_blue_is_predicted_and_marked_and_amber_stands_for_red() -> None:

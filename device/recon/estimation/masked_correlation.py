@@ -18,7 +18,7 @@ FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of 
 MOST_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
 LEAST_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
 SECOND_SAMPLES = 8  # distance from the peak at which another one begins
-ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search; 2 degrees off still gives half the peak
+ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search: at most 1 degree off (NUMERICS.md 11)
 REFINEMENTS = 8  # of shift and rotation; they converge in three or four
 
 Floats = NDArray[np.float64]
@@ -125,8 +125,8 @@ class MaskedCorrelator:
 def refined(reference: FlatPicture, picture: FlatPicture, start: Match) -> Match:
     """Return a match with shift and rotation improved by Gauss-Newton steps on the normalised difference.
 
-    The start must be nearer than the width of a vessel (inverse compositional form of the correlation coefficient: G.
-    Evangelidis and E. Psarakis, IEEE TPAMI 30, 1858, 2008).
+    The start must be nearer than the width of a vessel (enhanced correlation coefficient: G. Evangelidis and
+    E. Psarakis, IEEE TPAMI 30, 1858, 2008).
     """
     middle = (np.array(reference.field.shape) - 1) / 2
     rows, cols = np.indices(reference.field.shape, dtype=np.float64) - middle[:, None, None]

@@ -71,6 +71,20 @@ def _pixels(part: slice, axis: int, grid: Grid) -> tuple[int, int]:
     return low, high
 
 
+def block_mean(picture: Image, block: int) -> Image:
+    """Return the means of blocks of `block` x `block` pixels of an image, (rows, cols) or (rows, cols, 3).
+
+    Incomplete blocks at the edge are dropped.
+    """
+    if block < 2:
+        return picture
+    down, across = (min(block, length) for length in picture.shape[:2])  # a narrow picture may be thinner than a block
+    rows, cols = picture.shape[0] // down * down, picture.shape[1] // across * across
+    strips = sum((picture[row:rows:down] for row in range(1, down)), start=picture[0:rows:down])
+    total = sum((strips[:, col:cols:across] for col in range(1, across)), start=strips[:, 0:cols:across])
+    return np.asarray(total / np.float32(down * across), np.float32)
+
+
 def moved_back(image: Image, good: Image, shift_px: tuple[float, float]) -> tuple[Image, Image]:
     """Return image(r + shift) and the share of good pixels behind it, 0 or 1, both (rows, cols) float32.
 
