@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,17 @@ CASES = {  # what happens on the disk before the start; the first start wrote a 
 CODES = {"full": "store.full", "full, with the reserve": "store.full", "read-only": "store.readonly"}
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """Folder with a head file and a data folder that the program has used, and what it shows of the data."""
+
+    folder: Path
+    shown: dict[str, Any]
+
+
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a data folder that a first start has used, with one finished visit and its captures."""
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
+    """A data folder that two starts have used, with one finished visit and its captures."""
     folder = tmp_path_factory.mktemp("prepared")
     filled_store(folder, with_log=False).rename(folder / "data")
     shutil.rmtree(folder / "data/calibrations")
@@ -41,7 +50,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with running(folder, folder / "data", ()) as client:
         press(client)
     assert (folder / "data/reserve.bin").stat().st_blocks * 512 >= 8_000_000
-    return folder
+    with running(folder, folder / "data", ()) as client:
+        return Prepared(folder, seen(client))
 
 
 @contextmanager
@@ -94,18 +104,16 @@ def seen(client: httpx.Client) -> dict[str, Any]:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("case", CASES)
 def test_the_program_starts_for_reading_on_a_disk_that_takes_no_changes(
-    case: str, prepared: Path, tmp_path: Path
+    case: str, prepared: Prepared, tmp_path: Path
 ) -> None:
     (tmp_path / "disk").mkdir()
     prefix = own_disk(tmp_path / "disk")
     if prefix is None:
         pytest.skip("no permission to mount")  # a user who may not mount has no disk to fill; CI runs as root
-    with running(prepared, prepared / "data", ()) as client:
-        before = seen(client)
     script = f'{DISK} {{ {CASES[case]}; }} && shift 2 && exec "$@"'
-    inside = (*prefix, "sh", "-c", script, "sh", str(tmp_path / "disk"), str(prepared / "data"))
-    with running(prepared, tmp_path / "disk/data", inside) as client:
-        assert seen(client) == before
+    inside = (*prefix, "sh", "-c", script, "sh", str(tmp_path / "disk"), str(prepared.folder / "data"))
+    with running(prepared.folder, tmp_path / "disk/data", inside) as client:
+        assert seen(client) == prepared.shown
         for eye in EYES:
             answer = client.post("/api/captures", json={"eye": eye}).json()
             assert answer["code"] == CODES[case]
