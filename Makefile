@@ -205,7 +205,7 @@ test-site: .venv/ready browser site ## Build the documentation, then test its li
 lock: .venv/ready ## Write requirements.lock anew, the part of it that a release needs, those of the printed parts and the documentation.
 	@$(BIN)/pip install -qq --disable-pip-version-check uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
-		--extra instrument --extra test --group lock pyproject.toml -o requirements.lock
+		--extra instrument --extra archive --extra test --group lock pyproject.toml -o requirements.lock
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--constraints requirements.lock --extra instrument pyproject.toml -o systemd/image/requirements.lock
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \

@@ -21,6 +21,7 @@ from device.values import Colour
 from services import resources
 from services.backup import command as backup_command
 from services.lab import calibration_archive
+from services.lab.archive import command as archive_command
 from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
 from services.lab.montage_files import montage_files, placed_lines
@@ -45,6 +46,7 @@ app.add_typer(snapshots, name="snapshots")
 app.add_typer(store, name="store")
 store.command()(backup_command.backup)
 store.command()(backup_command.restore)
+app.add_typer(archive_command.app, name="archive")
 
 INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage"})
 SIM_HEAD = resources.HEADS / "sim.toml"

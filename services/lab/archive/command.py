@@ -1,0 +1,39 @@
+"""Command `diffuscope archive plan|run|report`: reprocess every stored raw frame, on one machine or a cluster."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from device.clock import SystemClock
+from services.lab.archive.plan import PlanSettings, write_plan
+from services.lab.reconstruct_file import require_writable
+
+app = typer.Typer(help="Reprocess an archive of raw frames: plan, run, report.", no_args_is_help=True)
+
+
+def _progress(line: str) -> None:
+    typer.echo(line, err=True)
+
+
+@app.command()
+def plan(
+    source: Annotated[list[Path], typer.Argument(help="A store, exports, or a folder with raw frames and psf.tiff.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Where to write the plan, as TOML.")],
+    method: Annotated[str | None, typer.Option(help="A name of `diffuscope methods`; else what suits a frame.")] = None,
+    rounds: Annotated[int | None, typer.Option(help="Rounds of an iterative method, at the most.")] = None,
+    budget_s: Annotated[float | None, typer.Option(help="Seconds for each capture; results depend on them.")] = None,
+) -> None:
+    """List what would be reconstructed, and how; nothing is computed yet."""
+    from services.lab.archive.planning import make_plan
+
+    require_writable(output)
+    settings = PlanSettings(method=method, rounds=rounds, budget_s=budget_s)
+    made = make_plan(source, settings, SystemClock(), _progress)
+    write_plan(made, output)
+    for one in made.left_out[:20]:
+        _progress(f"left out: {one.id}: {one.reason}")
+    if len(made.left_out) > 20:
+        _progress(f"and {len(made.left_out) - 20} more, which the plan lists")
+    counts = f"{len(made.captures)} captures with {len(made.calibrations)} calibrations"
+    typer.echo(f"{output}: {counts}; {len(made.left_out)} left out")

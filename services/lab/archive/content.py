@@ -1,0 +1,63 @@
+"""Names by content: SHA-256 of files, of the software that computes, and of one result."""
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import device
+from services import lab
+
+NUMERICAL_PACKAGES = ("numpy", "scipy", "pyfftw", "numba")
+NAME_DIGITS = 32  # hexadecimal digits of the name of a result: 128 bits
+_SOURCES = (
+    (Path(device.__file__).parent, ("recon/**/*.py", "config/**/*.py", "calibration/**/*.py", "values.py")),
+    (Path(lab.__file__).parent, ("reconstruct_*.py", "archive/solve.py", "archive/result.py")),
+)
+
+
+@cache
+def software() -> dict[str, str]:
+    """Return the versions that decide about the pixels of a result, by name.
+
+    `code` is a digest of the sources of the solvers, because a development version keeps its number.
+    """
+    digest = hashlib.sha256()
+    for folder, patterns in _SOURCES:
+        for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+            digest.update(f"{path.relative_to(folder).as_posix()}\0".encode() + path.read_bytes() + b"\0")
+    packages = {name: version(name) for name in NUMERICAL_PACKAGES}
+    own = {"diffuscope": version("diffuscope"), "code": digest.hexdigest()[:12]}
+    return {**own, "python": platform.python_version(), **packages}
+
+
+def different_versions(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
+    """Return the differing versions as `name 1 here, 2 there; ...`; empty if all are equal."""
+    names = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
+    return "; ".join(f"{name} {expected.get(name, 'none')} here, {found.get(name, 'none')} there" for name in names)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal; OSError if it cannot be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest_of(value: object) -> str:
+    """Return the SHA-256 (hexadecimal) of the canonical JSON of a value: sorted keys, no spaces."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def result_name(
+    frames: tuple[str, ...], calibration: str, versions: Mapping[str, str], settings: Mapping[str, object]
+) -> str:
+    """Return the name of a result, NAME_DIGITS hexadecimal digits.
+
+    `frames`: SHA-256 of the raw frame and of its dark frame (empty: none); `calibration`: digest of its files;
+    `versions` as of `software`; `settings` of the reconstruction. Equal input gives the equal name on every machine.
+    """
+    content = {"frames": list(frames), "calibration": calibration, "software": dict(versions), "settings": settings}
+    return digest_of(content)[:NAME_DIGITS]

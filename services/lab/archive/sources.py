@@ -1,0 +1,186 @@
+"""Sources of an archive: a store of the instrument, exported visits, and folders of raw frames with their PSFs.
+
+Every source is only read. A store is read by the files of its records (`record.json`), not by its database, so it may
+be in use, on a disk that takes no changes, or a restored backup.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from device.calibration.archive import MANIFEST, Archive
+from device.config.image_files import SUFFIXES
+from device.errors import CalibrationError, SettingError
+from services.lab.archive.plan import Role
+from services.lab.dataset_pairs import Entry
+from services.lab.datasets import open_dataset
+
+COMPANIONS = ("dark", "flat")
+RECORDING_REMEDY = "Give a store (captures/), a folder of exports, or a folder with raw frames and psf.tiff."
+
+
+@dataclass(frozen=True)
+class FoundCalibration:
+    """Files of one calibration by role: PSFs, dark, flat; or a folder of a calibration archive."""
+
+    psfs: tuple[Path, ...] = ()
+    dark: Path | None = None
+    flat: Path | None = None
+    archived: Path | None = None
+
+    @property
+    def files(self) -> tuple[tuple[Role, Path], ...]:
+        """Role and path of each file, in the order that decides about the picture."""
+        if self.archived is not None:
+            names = Archive(self.archived.parent).files(self.archived.name)
+            return tuple(("archive", self.archived / name) for name in sorted(names))
+        found: list[tuple[Role, Path]] = [("psf", path) for path in self.psfs]
+        found += [("dark", self.dark)] if self.dark is not None else []
+        found += [("flat", self.flat)] if self.flat is not None else []
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class FoundCapture:
+    """A capture in a source; `refused` is the reason why it cannot be reconstructed, None if it can.
+
+    `raw_sha256` and `dark_sha256` are as recorded in a store, None where the file must be read.
+    """
+
+    id: str
+    raw: Path
+    calibration: FoundCalibration | None = None
+    raw_sha256: str | None = None
+    dark: Path | None = None
+    dark_sha256: str | None = None
+    truth: Path | None = None
+    before: Path | None = None
+    report: Path | None = None
+    device: str = ""
+    eye: str = ""
+    taken_at: str = ""
+    refused: str | None = None
+
+
+def find_captures(source: Path, calibrations: Mapping[str, Path]) -> Iterator[FoundCapture]:
+    """Yield every capture of a source, sorted by name; `calibrations`: folders of archived calibrations by id.
+
+    SettingError for a folder that is no source, or that does not exist.
+    """
+    if not source.is_dir():
+        raise SettingError(f"{source} is not a folder", RECORDING_REMEDY)
+    if is_store(source):
+        yield from _of_store(source, dict(calibrations) | archived_calibrations(source))
+    elif exports := _exports(source):
+        for place in exports:
+            yield from _of_export(place)
+    else:
+        yield from _of_recording(source)
+
+
+def is_store(folder: Path) -> bool:
+    """Return whether a folder is the store of an instrument."""
+    return (folder / "captures").is_dir()
+
+
+def archived_calibrations(folder: Path) -> dict[str, Path]:
+    """Return the folder of each archived calibration below a folder (at most three levels), by its id."""
+    found: dict[str, Path] = {}
+    for pattern in (f"*/{MANIFEST}", f"*/*/{MANIFEST}", f"*/*/*/{MANIFEST}"):
+        found |= {path.parent.name: path.parent for path in sorted(folder.glob(pattern))}
+    return found
+
+
+def _of_store(store: Path, calibrations: Mapping[str, Path]) -> Iterator[FoundCapture]:
+    unusable = {id: refusal for id, folder in calibrations.items() if (refusal := _refusal(folder))}
+    places = sorted(path for path in (store / "captures").iterdir() if path.is_dir() and path.name[:1] != ".")
+    for place in places:
+        yield _stored(store, place, calibrations, unusable)
+
+
+def _refusal(folder: Path) -> str | None:
+    """Return why an archived calibration cannot be used, None if it is whole."""
+    try:
+        Archive(folder.parent).files(folder.name)
+    except CalibrationError as error:
+        return error.message
+    return None
+
+
+def _stored(
+    store: Path, place: Path, calibrations: Mapping[str, Path], unusable: Mapping[str, str]
+) -> FoundCapture:  # fmt: skip
+    """Return one capture of a store; refused without a record, a raw frame or a calibration."""
+    from services.errors import StoreDamaged
+    from services.records.record_files import RecordFiles  # deferred: imports SQLAlchemy, of the extra `instrument`
+
+    found = FoundCapture(place.name, place / "raw.tiff")
+    try:
+        record = RecordFiles(store).read("capture", place.name)
+    except StoreDamaged as error:
+        return replace(found, refused=f"its record is damaged: {error.message}")
+    if record is None:
+        return replace(found, refused="it has no record; open the store once with this release")
+    content, digests = record.content, _digests(record.content.get("files"))
+    id = str(content.get("calibration_id"))
+    found = replace(
+        found, raw_sha256=digests.get("raw.tiff"), dark_sha256=digests.get("dark.tiff"),
+        dark=place / "dark.tiff" if "dark.tiff" in digests else None, report=place / "report.json",
+        before=place / "picture.png", eye=str(content.get("eye", "")), taken_at=str(content.get("taken_at", "")),
+        device=calibrations[id].parent.name if id in calibrations else "",
+    )  # fmt: skip
+    if not found.raw.is_file():
+        return replace(found, refused="its raw frame was removed")
+    if id not in calibrations:
+        return replace(found, refused=f"its calibration {id} is in no source; give the folder that holds it, too")
+    if id in unusable:
+        return replace(found, refused=f"its calibration {id} cannot be used: {unusable[id]}")
+    return replace(found, calibration=FoundCalibration(archived=calibrations[id]))
+
+
+def _digests(files: object) -> dict[str, str]:
+    """Return the SHA-256 of each file that a record of a capture names."""
+    entries = files.items() if isinstance(files, dict) else ()
+    return {name: str(entry.get("sha256")) for name, entry in entries if isinstance(entry, dict)}
+
+
+def _exports(source: Path) -> list[Path]:
+    """Return the folders of exported visits in a folder, or the folder itself."""
+    return [path.parent for path in sorted([*source.glob("visit.json"), *source.glob("*/visit.json")])]
+
+
+def _of_export(visit: Path) -> Iterator[FoundCapture]:
+    """Yield the captures of an exported visit: an export has pictures and reports, and no raw frames."""
+    for picture in sorted(visit.glob("*.png")):
+        raw = visit / f"{picture.stem}.tiff"
+        reason = "an export holds no raw frame; give the store or its backup instead"
+        yield FoundCapture(f"{visit.name}/{picture.stem}", raw, before=picture, refused=reason)
+
+
+def _of_recording(folder: Path) -> Iterator[FoundCapture]:
+    """Yield the frames of a folder of a known data set, else of one with raw frames beside psf, dark and flat."""
+    images = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES}
+    psfs = tuple(path for stem, path in images.items() if "psf" in stem.lower())
+    own = {stem: path for stem, path in images.items() if path not in psfs and stem not in COMPANIONS}
+    if not (psfs and own) or "raw" in images:  # a published layout, or a scene of `diffuscope simulate`
+        dataset = open_dataset(folder, split="all")
+        for entry in dataset.entries:
+            yield _of_entry(folder, entry, dataset.layout.aligned or dataset.layout.name == "pairs")
+        return
+    calibration = FoundCalibration(psfs, images.get("dark"), images.get("flat"))
+    for stem, path in own.items():
+        yield FoundCapture(stem, path, calibration)
+
+
+def _of_entry(folder: Path, entry: Entry, aligned: bool) -> FoundCapture:
+    """Return a pair of a data set; `aligned`: its truth is on the pixels of the stored frame."""
+    dark, flat = (_beside(folder, name) for name in COMPANIONS)
+    before = _beside(folder / "before", entry.raw.stem)
+    calibration = FoundCalibration(entry.psfs, dark, flat)
+    return FoundCapture(entry.name, entry.raw, calibration, truth=entry.truth if aligned else None, before=before)
+
+
+def _beside(folder: Path, stem: str) -> Path | None:
+    """Return the image with this stem in a folder, None without one."""
+    found = [folder / f"{stem}{ending}" for ending in SUFFIXES]
+    return next((path for path in found if path.is_file()), None)

@@ -1,0 +1,165 @@
+"""Plans of a reprocessing run: sources, names by content, what is left out, and refusals."""
+
+from pathlib import Path
+
+import pytest
+import tifffile
+
+from device.calibration.archive import Archive, Provenance
+from device.clock import VirtualClock
+from device.errors import SettingError
+from services.imaging.picture_files import raw_tiff
+from services.imaging.raw_metadata import RawMetadata
+from services.lab.archive.content import NAME_DIGITS, different_versions, result_name, software
+from services.lab.archive.plan import Plan, PlanSettings, read_plan, write_plan
+from services.lab.archive.planning import make_plan
+from services.records.capture import Capture, CaptureReport
+from services.records.capture_store import CaptureStore
+from tests.datasets import Scene, simulate_tiny
+from tests.scenes import calibration, speckle
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return simulate_tiny(tmp_path_factory.mktemp("scene"))
+
+
+def recording(folder: Path, scene: Scene, frames: int = 3) -> Path:
+    folder.mkdir(parents=True)
+    tifffile.imwrite(folder / "psf.tiff", scene.psf)
+    for k in range(frames):
+        tifffile.imwrite(folder / f"eye{k}.tiff", scene.raw + k)
+    return folder
+
+
+def plan_of(*sources: Path, settings: PlanSettings | None = None) -> Plan:
+    return make_plan(sources, settings or PlanSettings(rounds=2), VirtualClock(), lambda _: None)
+
+
+def test_a_plan_lists_each_frame_with_its_digests_and_survives_a_file(scene: Scene, tmp_path: Path) -> None:
+    plan = plan_of(recording(tmp_path / "a", scene))
+    assert [one.id for one in plan.captures] == ["eye0", "eye1", "eye2"]
+    assert len(plan.calibrations) == 1
+    assert len({one.result for one in plan.captures}) == 3
+    assert all(len(one.result) == NAME_DIGITS for one in plan.captures)
+    write_plan(plan, tmp_path / "plan.toml")
+    assert read_plan(tmp_path / "plan.toml") == plan
+
+
+def test_a_name_depends_on_capture_calibration_versions_and_settings() -> None:
+    first = result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
+    assert first == result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
+    others = {
+        result_name(("b", ""), "c", {"code": "1"}, {"rounds": 1}),
+        result_name(("a", "d"), "c", {"code": "1"}, {"rounds": 1}),
+        result_name(("a", ""), "e", {"code": "1"}, {"rounds": 1}),
+        result_name(("a", ""), "c", {"code": "2"}, {"rounds": 1}),
+        result_name(("a", ""), "c", {"code": "1"}, {"rounds": 2}),
+    }
+    assert len(others | {first}) == 6
+
+
+def test_versions_of_another_machine_are_named() -> None:
+    assert different_versions(software(), software()) == ""
+    assert different_versions({"numpy": "2", "code": "a"}, {"numpy": "3", "code": "a"}) == "numpy 2 here, 3 there"
+
+
+def test_a_frame_of_equal_content_is_planned_once(scene: Scene, tmp_path: Path) -> None:
+    folder = recording(tmp_path / "a", scene, 2)
+    (folder / "eye9.tiff").write_bytes((folder / "eye0.tiff").read_bytes())
+    plan = plan_of(folder, recording(tmp_path / "b", scene, 1))
+    assert len(plan.captures) == 2
+    assert {one.reason for one in plan.left_out} == {"it has the same content as eye0"}
+
+
+def test_a_scene_and_own_pairs_are_sources_with_their_truth(scene: Scene, tmp_path: Path) -> None:
+    plan = plan_of(scene.folder)
+    assert plan.captures[0].truth == str(scene.folder / "truth.npy")
+    assert plan.captures[0].raw.endswith("raw.tiff")
+
+
+def test_an_export_has_no_raw_frames(tmp_path: Path) -> None:
+    visit = tmp_path / "exports" / "P1-v1"
+    visit.mkdir(parents=True)
+    (visit / "visit.json").write_text("{}")
+    (visit / "od-1.png").write_bytes(b"")
+    plan = plan_of(tmp_path / "exports")
+    assert plan.captures == ()
+    assert "no raw frame" in plan.left_out[0].reason
+
+
+def stored(folder: Path, scene: Scene, calibration_id: str, names: tuple[str, ...]) -> None:
+    with CaptureStore(folder, reserve_bytes=0) as store:
+        for k, name in enumerate(names):
+            taken_at = VirtualClock().wall()
+            capture = Capture(name, "OD", taken_at, True, calibration_id, CaptureReport(), {})
+            metadata = RawMetadata(
+                id=name, eye="OD", taken_at=taken_at, exposure_s=0.1, illumination=None, simulated=True,
+                calibration_id=calibration_id, head="tiny",
+            )  # fmt: skip
+            raw, dark = raw_tiff(scene.raw + k, metadata), raw_tiff(scene.raw // 100, metadata)
+            store.save(capture, {"raw.tiff": raw, "dark.tiff": dark, "report.json": b"{}", "picture.png": b""})
+
+
+def test_a_store_is_read_by_its_records_and_left_as_it_is(scene: Scene, tmp_path: Path) -> None:
+    store, made = tmp_path / "store", calibration(speckle(scene.raw.shape))
+    kept = Archive(store / "calibrations" / "tiny-head")
+    id = kept.add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
+    stored(store, scene, id, ("a", "b"))
+    stored(store, scene, "0123456789abcdef", ("c",))
+    (store / "captures" / "b" / "raw.tiff").unlink()
+    before = {path: path.stat().st_mtime_ns for path in store.rglob("*")}
+    plan = plan_of(store)
+    assert {path: path.stat().st_mtime_ns for path in store.rglob("*")} == before
+    (planned,) = plan.captures
+    assert (planned.id, planned.device, planned.eye) == ("a", "tiny-head", "OD")
+    assert planned.dark.endswith("dark.tiff")
+    assert plan.calibrations[0].id == id
+    assert [one.id for one in plan.left_out] == ["b", "c"]
+    assert "was removed" in plan.left_out[0].reason
+    assert "0123456789abcdef is in no source" in plan.left_out[1].reason
+
+
+def test_calibrations_of_another_folder_are_used(scene: Scene, tmp_path: Path) -> None:
+    made = calibration(speckle(scene.raw.shape))
+    id = Archive(tmp_path / "kept").add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
+    stored(tmp_path / "store", scene, id, ("a",))
+    assert len(plan_of(tmp_path / "store", tmp_path / "kept").captures) == 1
+
+
+def test_an_archive_of_none_is_a_plan(tmp_path: Path) -> None:
+    (tmp_path / "captures").mkdir()
+    assert plan_of(tmp_path).captures == ()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"rounds": 2, "budget_s": 1.0}, "limit the same"), ({"rounds": 0}, "cannot be run"),
+        ({"budget_s": -1.0}, "not a time"), ({"method": "magic"}, "no method"),
+    ],
+)  # fmt: skip
+def test_impossible_settings_are_refused(settings: dict[str, float | str], message: str, tmp_path: Path) -> None:
+    (tmp_path / "captures").mkdir()
+    with pytest.raises(SettingError, match=message):
+        plan_of(tmp_path, settings=PlanSettings.model_validate(settings))
+
+
+def test_a_folder_that_is_no_source_is_refused(tmp_path: Path) -> None:
+    for folder in (tmp_path, tmp_path / "none"):
+        with pytest.raises(SettingError):
+            plan_of(folder)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "format None"), ("format = 9", "format 9"), ("format = 1", "is no plan: made_at"),
+        ("format = ", "not whole TOML"),
+    ],
+)  # fmt: skip
+def test_a_damaged_plan_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    with pytest.raises(SettingError, match=message):
+        read_plan(path)
