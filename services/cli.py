@@ -49,6 +49,7 @@ store.command()(backup_command.restore)
 app.add_typer(archive_command.app, name="archive")
 
 INSTRUMENT_PACKAGES = frozenset({"fastapi", "starlette", "uvicorn", "sqlalchemy", "alembic", "cryptography", "pyrage"})
+ARCHIVE_PACKAGES = frozenset({"distributed", "dask", "pyarrow"})
 SIM_HEAD = resources.HEADS / "sim.toml"
 
 DataSet = Annotated[Path, typer.Argument(help="Folder of a data set: DLMD, DiffuserCam, LenslessPiCam or own pairs.")]
@@ -523,8 +524,8 @@ def root(
 def main(words: list[str] | None = None) -> None:
     """Run the command line with `words`, by default the process arguments.
 
-    For a DiffuscopeError, or a command that needs the extra `instrument` where it is not installed, print the message
-    and its remedy to stderr and exit with status 2.
+    For a DiffuscopeError, or a command that needs an extra (`instrument`, `archive`) which is not installed, print the
+    message and its remedy to stderr and exit with status 2.
     """
     try:
         app(words)
@@ -532,8 +533,11 @@ def main(words: list[str] | None = None) -> None:
         typer.echo(f"error: {error.message}\n{error.remedy}", err=True)
         sys.exit(2)
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in INSTRUMENT_PACKAGES:
+        package = (error.name or "").partition(".")[0]
+        extras = {"instrument": INSTRUMENT_PACKAGES, "archive": ARCHIVE_PACKAGES}
+        missing = [extra for extra, packages in extras.items() if package in packages]
+        if not missing:
             raise
-        remedy = 'Install the instrument: pip install "diffuscope[instrument]"'
+        remedy = f'Install it with: pip install "diffuscope[{missing[0]}]"'
         typer.echo(f"error: this command needs {error.name}, which is not installed\n{remedy}", err=True)
         sys.exit(2)

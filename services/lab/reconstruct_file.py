@@ -41,6 +41,7 @@ from services.lab.reconstruct_inputs import (
     ReconstructOptions,
     Shape,
     Source,
+    companion,
     load_calibrations,
     load_psfs,
     load_raw,
@@ -115,23 +116,27 @@ class FileReconstructor:
     """Reconstruction of the raw frames of one recording: the options but `raw` hold for all of them.
 
     PSFs are read once for each shape of raw, and a solver is planned once for each shape and set of levels; KEPT_PLANS
-    are kept. Not thread-safe. SettingError for invalid options.
+    are kept. Not thread-safe. `planner` replaces the one that keeps its FFT plans in `options.plans`. SettingError for
+    invalid options.
     """
 
-    def __init__(self, options: ReconstructOptions) -> None:
+    def __init__(self, options: ReconstructOptions, planner: Planner | None = None) -> None:
         refuse_invalid(options)
-        self._options, self._planner = options, Planner(options.plans)
+        self._options, self._planner = options, planner or Planner(options.plans)
         self._psfs: dict[tuple[Shape, int, str | None], LoadedPsfs | None] = {}
         self._plans: OrderedDict[tuple[object, ...], _Plan] = OrderedDict()
         self._last: _Plan | None = None
 
-    def __call__(self, source: Source) -> FileReconstruction:
-        """Return the picture of a raw, a file or an array; FrameError or PsfError for one that cannot be solved."""
+    def __call__(self, source: Source, dark: Source | None = None) -> FileReconstruction:
+        """Return the picture of a raw, a file or an array; FrameError or PsfError for one that cannot be solved.
+
+        `dark`: the dark frame of this raw alone, (rows, cols) of it.
+        """
         loaded = load_raw(source, self._options.bayer)
         psfs = self._psfs_for(loaded)
         plan = self._last = self._plan(loaded, psfs)
         try:
-            made = plan.solve(loaded)
+            made = plan.solve(loaded, None if dark is None else companion(dark, "the dark frame", loaded))
         except FrameError as error:  # its remedy is for the operator of a head
             raise FrameError(
                 f"{loaded.name}: {error.message}",
@@ -197,8 +202,11 @@ class _Plan:
         if options.sweep is not None and len(calibrations[0].psfs) < 2:
             raise SettingError("a sweep compares several PSFs", "Give --psf more than once, or leave --sweep out.")
 
-    def solve(self, loaded: LoadedRaw) -> FileReconstruction:
-        """Return the picture and the report of a raw, on the pixels on which it is solved."""
+    def solve(self, loaded: LoadedRaw, dark: Image | None = None) -> FileReconstruction:
+        """Return the picture and the report of a raw, on the pixels on which it is solved.
+
+        `dark` is its own dark frame, (rows, cols), or of a mosaic (rows, cols, 3).
+        """
         options, pixels = self._options, loaded.raw.pixels
         index = self._most_likely_psf(loaded)
         if index not in self._solvers:
@@ -209,7 +217,8 @@ class _Plan:
         made = []
         for c, (solver, frame) in enumerate(zip(solvers, frames, strict=True)):
             shared = None if deadline is None else Deadline.after(self._clock, _share_s(deadline, len(frames) - c))
-            made.append(solver(frame, simulated=solver.calibration.simulated, deadline=shared))
+            own = dark if dark is None or len(solvers) == 1 else plane(dark, c)
+            made.append(solver(frame, own, simulated=solver.calibration.simulated, deadline=shared))
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
         picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
         report = replace(

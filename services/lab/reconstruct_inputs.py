@@ -290,8 +290,8 @@ def load_calibrations(
     geometry, field_deg = _geometry(options, spec, loaded.bayer is not None)
     black_dn = loaded.black_dn or 0.0
     sensor = Sensor(black_dn, white_dn=raw.white_dn) if spec is None else _sensor(spec.camera, raw)
-    dark = None if options.dark is None else _companion(options.dark, "the dark frame", loaded)
-    flat = None if options.flat is None else _companion(options.flat, "the flat frame", loaded)
+    dark = None if options.dark is None else companion(options.dark, "the dark frame", loaded)
+    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded)
     simulated = loaded.simulated or (spec is not None and spec.camera.backend == "sim")
     return tuple(
         Calibration(
@@ -361,8 +361,8 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     require_same_shape(found.psfs, loaded.solved_shape)
     known = "white_dn" not in kept.provenance.unknown
     white_dn = min(found.sensor.white_dn, raw.white_dn) if known else raw.white_dn
-    dark = None if options.dark is None else _companion(options.dark, "the dark frame", loaded)
-    flat = None if options.flat is None else _companion(options.flat, "the flat frame", loaded)
+    dark = None if options.dark is None else companion(options.dark, "the dark frame", loaded)
+    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded)
     return replace(
         found,
         sensor=replace(found.sensor, white_dn=white_dn),
@@ -373,7 +373,7 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     )
 
 
-def _companion(source: Source, what: str, loaded: LoadedRaw) -> Image:
+def companion(source: Source, what: str, loaded: LoadedRaw) -> Image:
     """Return a dark or flat frame in the counts of its raw frame, divided by `2**raw.shift`.
 
     (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3).

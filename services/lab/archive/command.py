@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from device.clock import SystemClock
-from services.lab.archive.plan import PlanSettings, write_plan
+from services.lab.archive.plan import PlanSettings, read_plan, write_plan
 from services.lab.reconstruct_file import require_writable
 
 app = typer.Typer(help="Reprocess an archive of raw frames: plan, run, report.", no_args_is_help=True)
@@ -37,3 +37,23 @@ def plan(
         _progress(f"and {len(made.left_out) - 20} more, which the plan lists")
     counts = f"{len(made.captures)} captures with {len(made.calibrations)} calibrations"
     typer.echo(f"{output}: {counts}; {len(made.left_out)} left out")
+
+
+@app.command()
+def run(
+    plan: Annotated[Path, typer.Argument(help="A plan of `diffuscope archive plan`.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the results; again to resume.")],
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine; else one per core.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, as tcp://host:8786.")] = None,
+) -> None:
+    """Reconstruct what a plan lists and has no result yet; write captures.parquet. Exit status 1 if some failed."""
+    from services.lab.archive.run import run_plan  # deferred: imports Dask and pyarrow, of the extra `archive`
+
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("choose --workers on this machine or --scheduler, not both")
+    ran = run_plan(read_plan(plan), output, SystemClock(), _progress, workers, scheduler)
+    typer.echo(
+        f"{output}: {ran.done} with a result, {ran.quarantined} in quarantine, {ran.left_out} left out; "
+        f"{ran.computed} computed in {ran.seconds:.0f} s"
+    )
+    raise typer.Exit(1 if ran.quarantined else 0)

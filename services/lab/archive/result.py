@@ -1,0 +1,130 @@
+"""Folder of results: one folder for each capture, named by content, and one file for each capture in quarantine.
+
+plan.toml                       the plan that is computed here
+results/<ab>/<name>/            one result, renamed into place when it is complete; <ab> are the first two digits
+    picture.tiff                linear float32, rows x cols (x 3) of the raw frame
+    report.json                 provenance, report and scores: equal for equal input, settings and versions
+    run.json                    durations, worker and time, which differ from run to run
+quarantine/<name>.json          a capture that failed, with the reason; tried again by the next run if it may help
+captures.parquet                one row for each capture
+.lock                           held by the run that writes here
+"""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from device import atomic_io
+from device.errors import SettingError
+from services.lab.archive.plan import Plan, encoded, read_plan
+from services.lab.reconstruct_file import write_or_raise
+
+PICTURE, REPORT, RUN, PLAN, TABLE = "picture.tiff", "report.json", "run.json", "plan.toml", "captures.parquet"
+
+
+@dataclass(frozen=True)
+class Quarantined:
+    """A capture without a result: its name, the reason, a remedy, and whether the next run tries it again."""
+
+    name: str
+    code: str
+    reason: str
+    remedy: str = ""
+    retry: bool = False
+
+
+@dataclass(frozen=True)
+class Stored:
+    """The two JSON documents of a stored result."""
+
+    report: Mapping[str, object]
+    run: Mapping[str, object]
+
+
+class ResultFolder:
+    """Results of one plan below a folder; several processes may add the same result, and one of them is kept."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._results, self._quarantine = root / "results", root / "quarantine"
+
+    @property
+    def lock(self) -> Path:
+        """File whose lock the writing run holds."""
+        return self.root / ".lock"
+
+    def prepare(self, plan: Plan) -> None:
+        """Make the folders and store the plan; remove what a killed run left incomplete.
+
+        SettingError if the folder holds another plan; StoreError if it cannot be written.
+        """
+        for folder in (self._results, self._quarantine):
+            write_or_raise(folder, lambda folder=folder: atomic_io.make_folder(folder))  # type: ignore[misc]
+        kept = self.root / PLAN
+        if kept.is_file() and read_plan(kept) != plan:
+            raise SettingError(
+                f"{self.root} holds the results of another plan",
+                f"Choose another folder, or resume with {kept}.",
+            )
+        write_or_raise(kept, lambda: atomic_io.write_atomically(kept, encoded(plan)))
+        for part in self._results.glob("*/.*.part"):
+            shutil.rmtree(part, ignore_errors=True)
+
+    def place(self, name: str) -> Path:
+        """Return the folder of a result."""
+        return self._results / name[:2] / name
+
+    def has(self, name: str) -> bool:
+        """Return whether a result is complete."""
+        return (self.place(name) / REPORT).is_file()
+
+    def add(self, name: str, files: Mapping[str, bytes]) -> None:
+        """Store the files of a result atomically and durably; a result that is there already stays.
+
+        OSError if the disk refuses; nothing incomplete has the name of a result then.
+        """
+        place = self.place(name)
+        part = place.with_name(f".{name}.{uuid4().hex[:8]}.part")
+        atomic_io.make_folder(place.parent)
+        try:
+            atomic_io.write_folder(part, files)
+            if not place.is_dir():
+                atomic_io.replace_durably(part, place)
+        except OSError:
+            if not self.has(name):  # else another worker was faster, and the rename found its result
+                raise
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+    def read(self, name: str) -> Stored:
+        """Return the documents of a result; SettingError if one cannot be read."""
+        report, run = (_document(self.place(name) / file) for file in (REPORT, RUN))
+        return Stored(report, run)
+
+    def quarantine(self, one: Quarantined) -> None:
+        """Store why a capture has no result; OSError if the disk refuses."""
+        path = self._quarantine / f"{one.name}.json"
+        atomic_io.write_atomically(path, json.dumps(asdict(one), indent=1).encode())
+
+    def release(self, name: str) -> None:
+        """Take a capture out of quarantine; no-op if it is not there."""
+        (self._quarantine / f"{name}.json").unlink(missing_ok=True)
+
+    def quarantined(self) -> Iterator[Quarantined]:
+        """Yield every capture in quarantine, sorted by name."""
+        for path in sorted(self._quarantine.glob("[!.]*.json")):
+            entries = _document(path)
+            yield Quarantined(**entries)
+
+
+def _document(path: Path) -> Any:
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise SettingError(
+            f"{path} cannot be read: {error}", f"Remove {path.parent}, and run the plan again."
+        ) from error

@@ -1,0 +1,112 @@
+"""`diffuscope archive run`: compute what a plan still lacks, and write the table of all captures."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from device import atomic_io
+from device.clock import Clock
+from device.errors import DiffuscopeError, SettingError
+from services.lab.archive import cluster
+from services.lab.archive.content import different_versions, software
+from services.lab.archive.plan import Plan
+from services.lab.archive.result import TABLE, Quarantined, ResultFolder
+from services.lab.archive.solve import Outcome
+from services.lab.archive.table import write_table
+from services.lab.reconstruct_file import write_or_raise
+
+PROGRESS_S = 2.0
+
+
+@dataclass(frozen=True)
+class Ran:
+    """Numbers of captures after a run: with a result, in quarantine, left out; computed now, and in how many s."""
+
+    done: int
+    quarantined: int
+    left_out: int
+    computed: int
+    seconds: float
+
+
+def run_plan(
+    plan: Plan, root: Path, clock: Clock, progress: Callable[[str], None], workers: int | None = None,
+    scheduler: str | None = None,
+) -> Ran:  # fmt: skip
+    """Compute every capture of a plan that has no result yet, and write the table; idempotent.
+
+    `workers` and `scheduler` as of `cluster.connected`. `progress` gets lines of text. SettingError for a folder of
+    another plan or another run, and for a plan of other versions; StoreFull or StoreError if the disk refuses;
+    DiffuscopeError if the scheduler or a source is gone: results so far stay.
+    """
+    if found := different_versions(plan.software, software()):
+        raise SettingError(f"the plan was made with other versions (plan, here): {found}", "Make a new plan.")
+    results = ResultFolder(root)
+    write_or_raise(root, lambda: atomic_io.make_folder(root))
+    try:
+        with atomic_io.file_lock(results.lock, wait=False):
+            results.prepare(plan)
+            return _run(plan, results, clock, progress, workers, scheduler)
+    except BlockingIOError as error:
+        raise SettingError(f"another run is writing into {root}", "Wait for its end, or choose another.") from error
+
+
+def _run(
+    plan: Plan, results: ResultFolder, clock: Clock, progress: Callable[[str], None], workers: int | None,
+    scheduler: str | None,
+) -> Ran:  # fmt: skip
+    kept = {one.name for one in results.quarantined() if not one.retry}
+    captures = sorted(plan.captures, key=lambda one: one.calibration)
+    names = [one.result for one in captures if one.result not in kept and not results.has(one.result)]
+    begin_s = clock.now_s()
+    if names:
+        with cluster.connected(workers, scheduler) as client:
+            cluster.refuse_other_versions(client)
+            used = {one.calibration for one in captures}
+            for calibration in plan.calibrations:
+                if calibration.digest in used:
+                    cluster.send_calibration(client, calibration)
+            progress(f"{len(names)} of {len(captures)} captures to compute; dashboard: {client.dashboard_link}")
+            computing = _Computing(plan, results, len(names), clock, progress)
+            for outcome in cluster.outcomes(client, plan, names, results.root):
+                computing.take(outcome)
+    done = sum(results.has(one.result) for one in captures)
+    path = results.root / TABLE
+    write_or_raise(path, lambda: write_table(plan, results))
+    return Ran(done, len(captures) - done, len(plan.left_out), len(names), clock.now_s() - begin_s)
+
+
+class _Computing:
+    """Progress of a run, and its quarantine."""
+
+    def __init__(
+        self, plan: Plan, results: ResultFolder, count: int, clock: Clock, progress: Callable[[str], None]
+    ) -> None:
+        self._sources = {one.result: one.source for one in plan.captures}
+        self._results, self._count, self._clock, self._progress = results, count, clock, progress
+        self._begin_s = self._shown_s = clock.now_s()
+        self._ended = self._failed = 0
+
+    def take(self, outcome: Outcome) -> None:
+        """Record the end of a task; DiffuscopeError if its whole source is gone."""
+        failure = outcome.failure
+        if failure is None:
+            self._results.release(outcome.name)
+        else:
+            self._quarantine(failure)
+        self._ended += 1
+        now_s = self._clock.now_s()
+        if now_s - self._shown_s >= PROGRESS_S or self._ended == self._count:
+            self._shown_s = now_s
+            each_s = (now_s - self._begin_s) / self._ended
+            self._progress(
+                f"{self._ended}/{self._count} done, {self._failed} in quarantine, {60 / max(each_s, 1e-9):.0f} "
+                f"captures/min, {each_s * (self._count - self._ended):.0f} s left"
+            )
+
+    def _quarantine(self, failure: Quarantined) -> None:
+        source = Path(self._sources[failure.name])
+        if failure.code == "source" and not source.is_dir():
+            raise DiffuscopeError(f"{source} is gone", f"Connect it again. {cluster.RESUME}")
+        self._failed += 1
+        write_or_raise(self._results.root, lambda: self._results.quarantine(failure))
