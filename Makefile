@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-mutants bundle browser buses strace lint release bench bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -30,7 +30,7 @@ run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for anothe
 JOURNEYS := tests/browser/test_page.py
 # What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below nine minutes.
 FAULTS := tests/hard tests/physics tests/property
-NOT_HERE := not bench and not rig and not systemd and not paper and not site
+NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive
 # Many tests wait for a clock, a process or a browser: three workers keep two cores busy.
 WORKERS := -n 3 --dist loadfile
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
@@ -67,6 +67,9 @@ test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files
 
 test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults and signals on the exam; N=count.
 	@$(BIN)/python -m tests.property.exam_sequences $(N)
+
+test-archive: .venv/ready ## Reprocess small archives on Dask: results, table, kills of workers, runs and schedulers.
+	@$(BIN)/python -m pytest -n 2 -m archive tests/archive
 
 test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store and exam against seeded mutants; ten minutes, not in CI.
 	@$(BIN)/python -m tests.golden mutants
@@ -128,6 +131,11 @@ release: lint ## Check version, changelog and citation, build wheel and source a
 
 bench: .venv/ready browser ## Print figures of speed and truth, measured on this machine.
 	@$(BIN)/python -m tests.bench
+
+COUNT ?= 2000
+
+bench-archive: .venv/ready ## Print captures a minute on Dask and in bare processes, memory, and results after kills; COUNT=200.
+	@$(BIN)/python -m tests.bench.archive $(COUNT)
 
 bench-attacks: .venv/ready ## Measure status and press while clients hold connections that they do not use.
 	@$(BIN)/python -m tests.bench.attacks

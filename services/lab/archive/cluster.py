@@ -5,8 +5,9 @@ unpickled or executed.
 """
 
 import hashlib
+import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import Any
 
 import dask
 from distributed import Client, LocalCluster, Worker, WorkerPlugin, as_completed, get_worker
+from distributed.client import ClosedClientError, FutureCancelledError
+from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from device import atomic_io
@@ -24,10 +27,14 @@ from services.lab.archive.plan import Plan, PlannedCalibration
 from services.lab.archive.result import Quarantined, ResultFolder
 from services.lab.archive.solve import CalibrationFiles, Outcome, Solvers, Task, local_names
 
+log = logging.getLogger(__name__)
+
 TASKS_PER_THREAD = 4  # under way: enough that no worker waits for the next one, few enough that memory stays flat
 ALLOWED_FAILURES = 5  # workers that may end during one task before the capture is put into quarantine
 CONNECT_TIMEOUT_S = 20.0
+TRIES = 3
 RESUME = "Run the same command again: it resumes."
+LOST = (CommClosedError, ClosedClientError, FutureCancelledError, TimeoutError)
 _LOCK = Lock()  # a worker with several threads: the solvers are for one thread at a time
 
 dask.config.set({
@@ -53,18 +60,42 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Client]:
         with client:
             yield client
         return
-    count = workers or os.cpu_count() or 1
-    cluster = LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0")
-    with cluster, Client(cluster, set_as_default=False) as client:
+    with _local_cluster(workers or os.cpu_count() or 1) as cluster, Client(cluster, set_as_default=False) as client:
         yield client
+
+
+def _local_cluster(workers: int) -> LocalCluster:
+    """Start worker processes on this machine; again if one of them is killed meanwhile."""
+    for _ in range(TRIES):
+        try:
+            return LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0")
+        except RuntimeError as error:
+            log.warning("worker processes ended while they started: %s", error)
+    raise DiffuscopeError("worker processes end while they start", "Give the machine more memory, or fewer --workers.")
+
+
+def _retried(call: Callable[[], Any]) -> Any:
+    """Return what an idempotent call of the cluster returns; a worker may end meanwhile, and another takes its place.
+
+    DiffuscopeError after TRIES failures.
+    """
+    for _ in range(TRIES - 1):
+        try:
+            return call()
+        except OSError as error:
+            log.warning("calling the workers again: %s", error)
+    try:
+        return call()
+    except OSError as error:
+        raise DiffuscopeError(f"the workers do not answer: {error}", RESUME) from error
 
 
 def refuse_other_versions(client: Client) -> None:
     """Raise SettingError unless scheduler and all workers have the client's versions of Dask, Python and the solver."""
     remedy = "Install the same release of Diffuscope and its extra `archive` on every machine."
     try:
-        client.get_versions(check=True)
-        there = client.run(software)
+        _retried(lambda: client.get_versions(check=True))
+        there = _retried(lambda: client.run(software))
     except ValueError as error:
         raise SettingError(f"client and cluster have different versions: {error}", remedy) from error
     except ModuleNotFoundError as error:
@@ -91,7 +122,7 @@ def send_calibration(client: Client, calibration: PlannedCalibration) -> None:
     files = {}
     for (_, name), one in zip(local_names(calibration), calibration.files, strict=True):
         files[name] = _planned_content(Path(one.path), one.sha256)
-    client.register_plugin(CalibrationPlugin(calibration.digest, files))
+    _retried(lambda: client.register_plugin(CalibrationPlugin(calibration.digest, files)))
 
 
 def _planned_content(path: Path, sha256: str) -> bytes:
@@ -141,10 +172,13 @@ def outcomes(client: Client, plan: Plan, names: Sequence[str], root: Path) -> It
     most = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
     first = [future for _ in range(most) if (future := submit()) is not None]
     under_way = as_completed(first, loop=client.loop)
-    for future in under_way:
-        yield _outcome(future)
-        if (following := submit()) is not None:
-            under_way.add(following)
+    try:
+        for future in under_way:
+            yield _outcome(future)
+            if (following := submit()) is not None:
+                under_way.add(following)
+    except LOST as error:
+        raise DiffuscopeError(f"the scheduler no longer answers: {error}", RESUME) from error
 
 
 def _outcome(future: Any) -> Outcome:

@@ -57,3 +57,15 @@ def run(
         f"{ran.computed} computed in {ran.seconds:.0f} s"
     )
     raise typer.Exit(1 if ran.quarantined else 0)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder of `diffuscope archive run`.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Where to write the page, as HTML.")],
+) -> None:
+    """Write one page: quality before and after, best and worst as pictures, drift, retakes, refraction, cost."""
+    from services.lab.archive.report import write_report  # deferred: imports pyarrow, of the extra `archive`
+
+    require_writable(output)
+    typer.echo(f"{output}: {write_report(folder, output, _progress)}")

@@ -22,9 +22,9 @@ QUALITY = (
 )  # fmt: skip
 TEXT, NUMBER, COUNT, FLAG, TEXTS = pa.string(), pa.float64(), pa.int64(), pa.bool_(), pa.list_(pa.string())
 BEFORE = {
-    "before_method": TEXT, "before_residual": NUMBER, "before_cutoff_per_px": NUMBER, "before_structure_sure": NUMBER,
-    "before_sphere_dpt": NUMBER, "before_verdict": TEXT, "before_cause": TEXT, "dose_j_per_cm2": NUMBER,
-    "before_seconds": NUMBER,
+    "before_picture": TEXT, "before_method": TEXT, "before_residual": NUMBER, "before_cutoff_per_px": NUMBER,
+    "before_structure_sure": NUMBER, "before_sphere_dpt": NUMBER, "before_verdict": TEXT, "before_cause": TEXT,
+    "dose_j_per_cm2": NUMBER, "before_seconds": NUMBER,
 }  # fmt: skip
 SCHEMA = pa.schema({
     "id": TEXT, "state": TEXT, "reason": TEXT, "reason_code": TEXT, "source": TEXT, "raw": TEXT, "raw_sha256": TEXT,
@@ -73,6 +73,7 @@ def planned_columns(capture: PlannedCapture, made_at: str) -> Row:
     """Return the columns that the plan knows; `made_at`: time of the calibration (ISO 8601), empty if unknown."""
     same = ("id", "source", "raw", "raw_sha256", "result", "device", "eye", "taken_at", "calibration")
     row: Row = {name: getattr(capture, name) or None for name in same}
+    row["before_picture"] = capture.before or None
     return row | {"calibration_made_at": made_at or None, "calibration_age_days": age_days(made_at, capture.taken_at)}
 
 
