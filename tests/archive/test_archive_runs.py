@@ -5,6 +5,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
 
 import duckdb
@@ -15,9 +16,15 @@ import pytest
 import tifffile
 
 from device import atomic_io
+from device.calibration.archive import Archive as Calibrations
+from device.calibration.archive import Provenance
+from device.clock import VirtualClock
+from device.values import Sensor
 from services.lab.archive.plan import read_plan
 from tests.archive.conftest import COMMAND, FRAMES, Archive, result_digests, write_recording
 from tests.datasets import Scene
+from tests.scenes import calibration
+from tests.stored_captures import write_store
 
 
 @pytest.fixture(scope="module")
@@ -210,3 +217,21 @@ def test_the_report_shows_improvements_and_losses(recording: Path, archive: Arch
     assert page.count("data:image/jpeg") == 8
     assert "http" not in page.replace("http://www.w3.org", "")
     assert archive("report", tmp_path, "-o", tmp_path / "none.html").returncode == 2
+
+
+def test_a_store_is_computed_with_its_calibration_and_dark_frames(
+    scene: Scene, archive: Archive, tmp_path: Path
+) -> None:
+    store, made_at = tmp_path / "store", VirtualClock().wall() - timedelta(days=30)
+    kept = calibration(scene.psf, sensor=Sensor(black_dn=4.0, white_dn=4095.0))
+    id = Calibrations(store / "calibrations" / "tiny").add_and_activate(kept, Provenance("D1", made_at, "test", "0"))
+    write_store(store, scene.raw, id, ("a", "b"))
+    assert archive("plan", store, "-o", tmp_path / "plan.toml", "--rounds", 2).returncode == 0
+    done = archive("run", tmp_path / "plan.toml", "-o", tmp_path / "out", "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    rows = pd.read_parquet(tmp_path / "out" / "captures.parquet")
+    assert list(rows["eye"]) == ["OD", "OD"]
+    assert list(rows["device"]) == ["tiny", "tiny"]
+    assert list(rows["calibration_age_days"]) == [30, 30]
+    assert list(rows["exposure_s"]) == [0.1, 0.1]
+    assert rows["simulated"].all()

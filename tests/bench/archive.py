@@ -5,6 +5,7 @@ Frames of the small simulated head (270 x 480 pixels) at three light levels, eve
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ import tifffile
 
 from device.config.head_file import load_head
 from device.sim.render import crop_or_pad
+from services.lab.archive import cluster
 from services.lab.archive.plan import Plan, read_plan
 from services.lab.archive.result import ResultFolder
 from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
@@ -80,6 +82,12 @@ def solve_bare(plan_file: Path, root: Path, part: int, parts: int) -> None:
         solvers.solve(task, results, "bare")
 
 
+def children_s() -> float:
+    """Return the processor seconds of all ended child processes, and of theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def bare(plan_file: Path, root: Path, processes: int) -> float:
     """Return the seconds of a plan in bare processes, their start included."""
     begin_s = time.monotonic()
@@ -123,6 +131,20 @@ def same_results(plan: Plan, one: Path, other: Path) -> bool:
     )  # fmt: skip
 
 
+def overhead_s(plan: Plan, root: Path, tasks: int = 2000) -> float:
+    """Return the seconds of one task whose result is there already: submission, scheduling, transport."""
+    results, first = ResultFolder(root), plan.captures[0]
+    captures = tuple(first.model_copy(update={"result": f"{k:032x}"}) for k in range(tasks))
+    for one in captures:
+        results.place(one.result).mkdir(parents=True)
+        (results.place(one.result) / "report.json").touch()
+    with cluster.connected(1, None) as client:
+        names = [one.result for one in captures]
+        begin_s = time.monotonic()
+        count = sum(1 for _ in cluster.outcomes(client, plan.model_copy(update={"captures": captures}), names, root))
+        return (time.monotonic() - begin_s) / count
+
+
 @contextmanager
 def started_run(plan_file: Path, root: Path) -> Iterator["subprocess.Popen[bytes]"]:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -159,15 +181,21 @@ def main() -> None:
         subprocess.run(command("plan", folder / "recording", "-o", plan_file, "--rounds", ROUNDS), check=True)
         plan, seconds = read_plan(plan_file), {}
         for processes in (1, 2):
+            used_s = [children_s()]
             seconds[f"bare {processes}"] = bare(plan_file, folder / f"bare{processes}", processes)
+            used_s.append(children_s())
             seconds[f"dask {processes}"], memory_mb = on_dask(plan_file, folder / f"dask{processes}", processes)
+            used_s.append(children_s())
+            bare_s, dask_s = used_s[1] - used_s[0], used_s[2] - used_s[1]
+            print(f"{processes}: processor time {bare_s:.0f} s bare, {dask_s:.0f} s Dask: {bare_s / dask_s:.3f}")
             half = len(memory_mb) // 2
             late = max(memory_mb[half:]) - max(memory_mb[half // 2 : half], default=0.0)
             print(f"{processes}: largest worker {max(memory_mb):.0f} MB, second half {late:+.0f} MB", flush=True)
             for kind in ("bare", "dask"):
                 print(f"{kind} {processes}: {count / seconds[f'{kind} {processes}'] * 60:.0f} captures a minute")
             print(f"efficiency: {seconds[f'bare {processes}'] / seconds[f'dask {processes}']:.3f}", flush=True)
-        killed = with_kills(plan_file, folder / "killed", min(30, count // 10), 3)
+        print(f"overhead of a task: {1e3 * overhead_s(plan, folder / 'empty'):.2f} ms", flush=True)
+        killed = with_kills(plan_file, folder / "killed", min(30, count // 4), 3)
         rows = pd.read_parquet(folder / "killed" / "captures.parquet")
         print(f"kills of workers and runs: {killed}; rows {len(rows)}, states {dict(rows['state'].value_counts())}")
         for other in ("bare1", "bare2", "dask1", "dask2"):

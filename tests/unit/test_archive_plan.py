@@ -8,15 +8,12 @@ import tifffile
 from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.errors import SettingError
-from services.imaging.picture_files import raw_tiff
-from services.imaging.raw_metadata import RawMetadata
 from services.lab.archive.content import NAME_DIGITS, different_versions, result_name, software
 from services.lab.archive.plan import Plan, PlanSettings, read_plan, write_plan
 from services.lab.archive.planning import make_plan
-from services.records.capture import Capture, CaptureReport
-from services.records.capture_store import CaptureStore
 from tests.datasets import Scene, simulate_tiny
 from tests.scenes import calibration, speckle
+from tests.stored_captures import write_store
 
 
 @pytest.fixture(scope="module")
@@ -88,25 +85,12 @@ def test_an_export_has_no_raw_frames(tmp_path: Path) -> None:
     assert "no raw frame" in plan.left_out[0].reason
 
 
-def stored(folder: Path, scene: Scene, calibration_id: str, names: tuple[str, ...]) -> None:
-    with CaptureStore(folder, reserve_bytes=0) as store:
-        for k, name in enumerate(names):
-            taken_at = VirtualClock().wall()
-            capture = Capture(name, "OD", taken_at, True, calibration_id, CaptureReport(), {})
-            metadata = RawMetadata(
-                id=name, eye="OD", taken_at=taken_at, exposure_s=0.1, illumination=None, simulated=True,
-                calibration_id=calibration_id, head="tiny",
-            )  # fmt: skip
-            raw, dark = raw_tiff(scene.raw + k, metadata), raw_tiff(scene.raw // 100, metadata)
-            store.save(capture, {"raw.tiff": raw, "dark.tiff": dark, "report.json": b"{}", "picture.png": b""})
-
-
 def test_a_store_is_read_by_its_records_and_left_as_it_is(scene: Scene, tmp_path: Path) -> None:
     store, made = tmp_path / "store", calibration(speckle(scene.raw.shape))
     kept = Archive(store / "calibrations" / "tiny-head")
     id = kept.add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
-    stored(store, scene, id, ("a", "b"))
-    stored(store, scene, "0123456789abcdef", ("c",))
+    write_store(store, scene.raw, id, ("a", "b"))
+    write_store(store, scene.raw, "0123456789abcdef", ("c",))
     (store / "captures" / "b" / "raw.tiff").unlink()
     before = {path: path.stat().st_mtime_ns for path in store.rglob("*")}
     plan = plan_of(store)
@@ -123,7 +107,7 @@ def test_a_store_is_read_by_its_records_and_left_as_it_is(scene: Scene, tmp_path
 def test_calibrations_of_another_folder_are_used(scene: Scene, tmp_path: Path) -> None:
     made = calibration(speckle(scene.raw.shape))
     id = Archive(tmp_path / "kept").add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
-    stored(tmp_path / "store", scene, id, ("a",))
+    write_store(tmp_path / "store", scene.raw, id, ("a",))
     assert len(plan_of(tmp_path / "store", tmp_path / "kept").captures) == 1
 
 

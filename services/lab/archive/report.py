@@ -28,6 +28,7 @@ SIDE_PX = 360
 MOST_MARKS = 2_000  # of a plot; a larger table is sampled evenly
 LOSS_DB = -0.1  # less is within the fit of intensity
 LOSS_RATIO = 0.98
+DONE = "done"  # state of a capture with a result
 Cells = Sequence[Sequence[str]]
 
 
@@ -262,10 +263,8 @@ def _retakes(columns: Columns) -> str:
     if not verdicts:
         return "<p>No capture has a stored verdict.</p>"
     causes = Counter(word for word in columns.words("before_cause") if word)
-    hard = [
-        row for row, word in enumerate(columns.words("before_verdict"))
-        if word == "again" and columns.words("state")[row] == "done"
-    ]  # fmt: skip
+    states = columns.words("state")
+    hard = [row for row, word in enumerate(columns.words("before_verdict")) if word == "again" and states[row] == DONE]
     clear = sum(not columns.values("messages")[row] for row in hard)
     rows = [[cause, str(count), f"{count / len(verdicts):.1%}"] for cause, count in causes.most_common(20)]
     words = f"<p>{len(hard)} frames had the verdict to take another; {clear} of them now have no message.</p>"
