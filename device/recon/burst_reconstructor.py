@@ -1,7 +1,7 @@
 """Reconstruction of the bursts of an instrument: quick look of the first frame, joined frame, one picture.
 
-Everything is planned at construction, for bursts of `count` frames. The joined frame of fewer frames is scaled to the
-gain of that plan: `light` frames of full light have the noise of `count` frames of `light / count` of it.
+The joined frame is solved as the sum of its frames: a sum has the gain of the sensor, so that nothing is planned for
+the number of frames. Its read noise, sqrt(N) times that of one frame, is small beside the shot noise of the sum.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from device.clock import Deadline
-from device.recon.burst import BurstJoiner, JoinedFrame, joined_calibration
+from device.recon.burst import BurstJoiner, JoinedFrame
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
@@ -20,23 +20,20 @@ NO_TIME = "the time budget left no time to join the burst"
 
 
 class BurstReconstructor:
-    """Reconstruction of bursts of up to `count` frames; `single` makes quick looks and pictures of one frame.
+    """Reconstruction of bursts by `single`, which also makes quick looks and pictures of one frame.
 
     One burst at a time; between two of its steps `single` may make quick looks of other frames. Not thread-safe.
     """
 
-    def __init__(self, single: Reconstructor, planner: Planner, count: int) -> None:
+    def __init__(self, single: Reconstructor, planner: Planner) -> None:
         calibration, shape, index = single.calibration, single.shape, single.psf_index
-        self.single, self.clock, self.count = single, single.clock, count
-        self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index)
-        recipes = tuple(stage.recipe for stage in single.stages)
-        joined = joined_calibration(calibration, float(count), count)
-        self.joined = Reconstructor(joined, shape, planner, single.clock, recipes, index)
+        self.single, self.clock = single, single.clock
+        self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index, single)
         self.join_cost = DurationEstimate()  # of one frame
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Join two frames of noise, to compile the kernels and to measure the cost."""
+        """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
         noise = np.random.default_rng(0).integers(100, 200, self.single.shape, dtype=np.uint16)
         for _ in range(2):  # the first one compiles
             self.join_cost = DurationEstimate()
@@ -77,7 +74,7 @@ class BurstReconstructor:
         if len(used) == 1:
             yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated)
         else:
-            yield from run.solve_joined(first, simulated)
+            yield from run.solve_joined(frames[used[0]], dark, first, simulated)
 
 
 class _Run:
@@ -109,12 +106,14 @@ class _Run:
             self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
         owner.join_cost.add(self._join_s / len(frames))
 
-    def solve_joined(self, first: Reconstruction, simulated: bool) -> Iterator[Step]:
-        """Yield the steps of the picture of the joined frame; `first` is the quick look of the first frame."""
+    def solve_joined(
+        self, counts: Pixels, dark: Pixels | None, first: Reconstruction, simulated: bool
+    ) -> Iterator[Step]:
+        """Yield the steps of the picture of the joined frame; `counts` and `first`: first frame and its quick look."""
         owner, joined = self._owner, self.joined
         assert joined is not None
-        counts = joined.counts * np.float32(joined.light / owner.count)
-        for step in owner.joined.steps(counts, simulated=simulated, deadline=self._deadline):
+        total = joined.counts * np.float32(joined.light)
+        for step in owner.single.steps(counts, dark, simulated=simulated, deadline=self._deadline, joined=total):
             if isinstance(step, Reconstruction):
                 quality = step.report.quality | {"saturated": first.report.quality["saturated"]}
                 yield self._reported(replace(step, report=replace(step.report, quality=quality)), joined.frames)

@@ -31,7 +31,7 @@ from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
 from services.records.capture import NO_METHOD, Capture
-from services.records.capture_target import FRAMES, CaptureTarget
+from services.records.capture_target import CaptureTarget
 
 log = logging.getLogger(__name__)
 
@@ -222,7 +222,7 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
         live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
     feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
     is_recording = head.spec.camera.backend == "replay"  # whose next raw may show something else
-    bursts = None if is_recording else BurstReconstructor(reconstructor, planner, FRAMES)
+    bursts = None if is_recording else BurstReconstructor(reconstructor, planner)
     return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts)
 
 

@@ -26,7 +26,7 @@ COUNT = 4
 
 @pytest.fixture(scope="module")
 def bursts() -> BurstReconstructor:
-    return BurstReconstructor(Reconstructor(burst_calibration(), SHAPE, PLANNER, SystemClock()), PLANNER, COUNT)
+    return BurstReconstructor(Reconstructor(burst_calibration(), SHAPE, PLANNER, SystemClock()), PLANNER)
 
 
 @pytest.fixture(scope="module")
