@@ -2,7 +2,7 @@
 
 import pytest
 
-from device.errors import CameraStalled, LightCut
+from device.errors import CameraMissing, LightLimit
 from device.head import hazard_of
 from device.light_safety.burst import burst, colour_sequence
 from device.light_safety.dose_ledger import MemoryLedger
@@ -36,11 +36,22 @@ def test_a_burst_ends_before_the_guard_would_end_it():
     assert light.illumination is None
 
 
-def test_an_error_in_a_burst_turns_the_light_off():
-    rig = guarded_rig()
-    rig.camera.world.faults.add("camera.stalled")
-    with pytest.raises(CameraStalled):
-        burst(rig.camera, rig.light, Illumination("green"), SHOT, 3, rig.clock)
+class UnpluggedCamera:
+    """Camera that is unplugged after its first exposure."""
+
+    def __init__(self, camera):
+        self.camera, self.exposures = camera, 0
+
+    def expose(self, shot):
+        self.exposures += 1
+        if self.exposures > 1:
+            raise CameraMissing("unplugged")
+        return self.camera.expose(shot)
+
+
+def test_an_error_between_two_frames_of_a_burst_turns_the_light_off(rig):
+    with pytest.raises(CameraMissing):
+        burst(UnpluggedCamera(rig.camera), guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
     assert rig.light.illumination is None
 
 
@@ -69,13 +80,15 @@ class CuttingCamera:
         return self.rig.camera.expose(shot)
 
 
-@pytest.mark.parametrize("last", [1, 3])
-def test_a_frame_that_the_guard_has_ended_is_left_out(last):
+def test_a_burst_longer_than_the_guard_allows_raises_light_limit():
     rig = guarded_rig()
-    camera = CuttingCamera(rig, last)
-    if last == 1:
-        with pytest.raises(LightCut):
-            burst(camera, rig.light, Illumination("green"), SHOT, 4, rig.clock)
-    else:
-        assert len(burst(camera, rig.light, Illumination("green"), SHOT, 4, rig.clock)) == 2
+    with pytest.raises(LightLimit):
+        burst(CuttingCamera(rig, 1), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+    assert rig.light.illumination is None
+
+
+def test_a_later_frame_that_the_guard_has_ended_is_left_out():
+    rig = guarded_rig()
+    frames = burst(CuttingCamera(rig, 3), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+    assert len(frames) == 2
     assert rig.light.illumination is None
