@@ -223,6 +223,25 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class FrameUse:
+    """What became of one frame of a burst.
+
+    What is at (r, c) of the reference, the first used frame, stands at (r, c) + `shift_px` (rows, cols) in this frame,
+    in pixels of the sensor; None if the frame was not registered. `weight` is its share of the joined frame, 0 to 1.
+    `reason` says why it was not used.
+    """
+
+    index: int
+    used: bool
+    shift_px: tuple[float, float] | None
+    weight: float
+    reason: str | None = None
+
+
+ONLY_FRAME = FrameUse(0, True, (0.0, 0.0), 1.0)  # a picture of one frame
+
+
+@dataclass(frozen=True)
 class Report:
     """Report of a reconstruction; its fields are the keys of `report.json`.
 
@@ -270,6 +289,9 @@ class Report:
 
     warnings: tuple[str, ...] = ()
     """Sentences for the operator, in English, the most useful first; the wording is not stable."""
+
+    frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
+    """What became of each frame of the burst, in its order; one entry for one frame. Not in earlier releases."""
 
 
 @dataclass(frozen=True)

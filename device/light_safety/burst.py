@@ -2,30 +2,41 @@
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from device.clock import Clock
 from device.errors import LightCut
+from device.light_safety.guard import GuardedLight
 from device.ports import Camera, Light
-from device.values import Colour, ExposureSettings, Frame, Illumination
+from device.values import EYES, Colour, ExposureSettings, Eye, Frame, Illumination
 
 
 def burst(
     camera: Camera,
-    light: Light,
+    light: GuardedLight,
     illumination: Illumination,
     shot: ExposureSettings,
     count: int,
-    into: NDArray[np.uint16] | None = None,
-) -> Iterator[Frame]:
-    """Yield `count` frames in one illumination, which stays on from the first to the last of them.
+    clock: Clock,
+    eyes: Sequence[Eye] = EYES,
+    *,
+    in_visit: bool = False,
+) -> tuple[Frame, ...]:
+    """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 
-    `into` (count, rows, cols) is filled if given. Raises LightCut if the guard ends the light early; the lamp is then
-    dark.
+    There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
+    off. The dose counts for `eyes`, without a visit up to a lower limit. Raises LightCut if the guard has ended the
+    first exposure; a frame that it ended later is left out. The lamp is dark at every exit.
     """
-    with light.on(illumination):
-        for k in range(count):
-            yield require_lit(camera.expose(shot, None if into is None else into[k]))
+    frames: list[Frame] = []
+    with light.on(illumination, eyes, in_visit=in_visit):
+        begin_s = last_s = clock.now_s()
+        longest_s = 0.0
+        while len(frames) < count and (not frames or last_s + longest_s - begin_s < light.max_on_s):
+            frame = camera.expose(shot)
+            if frames and frame.illumination is None:
+                break
+            frames.append(require_lit(frame))
+            longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
+    return tuple(frames)
 
 
 def colour_sequence(

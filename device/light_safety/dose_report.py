@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 class DoseReport:
     """Light of one exposure: its dose, the dose of each eye in 24 h, the limit (all J/cm2), eyes above the warning.
 
-    None and empty where the report of an earlier release has no figure.
+    `limits_unchecked`: names of the limits that were not compared with the purchased standard. None and empty where the
+    report of an earlier release has no figure.
     """
 
     dose_j_per_cm2: float | None = None
     dose_24h_j_per_cm2: Mapping[str, float] = field(default_factory=dict)
     dose_stop_j_per_cm2: float | None = None
     dose_high: tuple[str, ...] = ()
+    limits_unchecked: tuple[str, ...] = ()

@@ -72,6 +72,7 @@ class GuardedLight:
             dose_24h_j_per_cm2=eyes,
             dose_stop_j_per_cm2=limits.stop_j_per_cm2,
             dose_high=tuple(eye for eye, spent in eyes.items() if spent > limits.warn_j_per_cm2),
+            limits_unchecked=limits.unchecked,
         )
 
     def turn_on(self, glow: Illumination, eyes: Sequence[Eye], in_visit: bool) -> None:

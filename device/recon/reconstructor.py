@@ -7,7 +7,7 @@ only if its measured cost fits into the time that is left.
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, isinf
 
 import numpy as np
@@ -125,6 +125,7 @@ class _Stage:
         self.scale = 1.0
         self.solver: Solver = method.solver(self.model, calibration, planner, dict(recipe.settings))
         self.preparer = Preprocessor(calibration, self.grid, self.solver.input_buffer)
+        self.joined_preparer = Preprocessor(without_sensor(calibration), self.grid, self.solver.input_buffer)
         self.most = method.rounds if recipe.rounds is None else recipe.rounds
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
         self.start_cost, self.round_cost, self.finish_cost = DurationEstimate(), DurationEstimate(), DurationEstimate()
@@ -219,7 +220,7 @@ class Reconstructor:
 
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
-        rounds: int | None = None, quick: bool = False,
+        rounds: int | None = None, quick: bool = False, joined: Image | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -227,11 +228,12 @@ class Reconstructor:
         float32 of that shape. `simulated` is copied to the result. The first stage always runs; with `quick` it is the
         only one. `rounds` limits the rounds of every stage. With several stages a ROUND_DONE follows each round of the
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
-        called with `quick`. FrameError for another shape than that of the sensor, or if too many pixels are missing
-        (`Preprocessor`).
+        called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
+        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. FrameError for another shape than
+        that of the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
-        run = _Run(self, counts, dark, deadline, rounds)
+        run = _Run(self, counts, dark, deadline, rounds, joined)
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick:
@@ -324,12 +326,14 @@ class _Run:
     """State of the reconstruction of one frame."""
 
     def __init__(
-        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
-    ) -> None:
+        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None,
+        joined: Image | None,
+    ) -> None:  # fmt: skip
         self.clock, self.counts, self.dark = owner.clock, counts, dark
         self._defects = owner.defects
         self._found: dict[int, Places | None] = {}
         self.deadline, self.most = deadline, most
+        self._joined, self._first = joined, owner.stages[0]
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
         self.done: _Stage = owner.stages[0]
         self.solved: _Solved | None = None  # None before the first stage
@@ -388,7 +392,10 @@ class _Run:
     def _channel(self, stage: _Stage, c: int, pauses: bool) -> Iterator[RoundDone]:
         """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""
         begin_s = self.clock.now_s()
-        frame = stage.preparer(*self.channel(c))
+        if self._joined is None or stage is self._first:
+            frame = stage.preparer(*self.channel(c))
+        else:
+            frame = stage.joined_preparer(plane(self._joined, c))
         stage.solver.start(frame)
         now_s = self.clock.now_s()
         stage.start_cost.add(now_s - begin_s)
@@ -424,6 +431,12 @@ class _Run:
             return True
         others_s = (channels_left - 1) * (stage.start_cost.seconds + (self.rounds_done + 1) * stage.round_cost.seconds)
         return self.deadline.fits(stage.round_cost.seconds + others_s + stage.finish_cost.seconds)
+
+
+def without_sensor(calibration: Calibration) -> Calibration:
+    """Return the calibration for linear frames above dark: no level, no bend, no dark and flat frame, no bad pixels."""
+    sensor = replace(calibration.sensor, black_dn=0.0, white_dn=float("inf"), bend_per_dn=0.0)
+    return replace(calibration, sensor=sensor, dark_dn=None, flat=None, bad=None)
 
 
 def plane(image: Pixels, c: int) -> Pixels:

@@ -45,6 +45,7 @@ class SimCamera:
         world.frames += 1
         seed = (world.scene.seed, world.frames)
         counts = world.sensor.read(world.electrons(shot.exposure_s), seed, into)
+        world.lit_frames += world.illumination is not None
         if world.has_fault("camera.mode"):
             counts = counts[::2, ::2].copy()
         return Frame(counts, shot.exposure_s, world.frames, world.illumination, simulated=True)

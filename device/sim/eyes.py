@@ -7,12 +7,14 @@ import numpy as np
 
 from device.config.head_file import InstrumentSpec
 from device.sim.fundus import Fundus
-from device.sim.objects import draw_object
+from device.sim.objects import draw_object, moved_behind_field
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, build_setup
 from device.sim.render import electrons_per_s
 from device.values import Colour, Eye, Image
 
+STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
+LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 
 
@@ -26,7 +28,7 @@ class RenderedEyes:
         self.scene = Scene(spec, spec.light.colour, eye)
         self._choose = choose
         self._setups: dict[tuple[Eye, Colour], OpticalSetup] = {}
-        self._rates: dict[tuple[Eye, Colour], Image] = {}
+        self._rates: dict[tuple[Eye, Colour, int], Image] = {}
         self._retinas: dict[Eye, Fundus] = {}
 
     @cached_property
@@ -52,18 +54,35 @@ class RenderedEyes:
         """Return the optical setup of an eye in one colour with its selected effects, built once per eye and colour."""
         key = eye, colour
         if key not in self._setups:
-            spec = self.scene.spec
-            scene = Scene(spec, colour, eye)
-            chosen = self.plan if colour == spec.light.colour else self._choose(scene)
-            self._setups[key] = build_setup(scene, self.retina(eye), chosen)
+            scene = Scene(self.scene.spec, colour, eye)
+            self._setups[key] = build_setup(scene, self.retina(eye), self._chosen(scene))
         return self._setups[key]
 
-    def electrons_per_s(self, eye: Eye, colour: Colour) -> Image:
+    @cached_property
+    def drift_px(self) -> float:
+        """Movement of the retina to the right from one frame of a burst to the next, in pixels; 0 if it is too small.
+
+        The eye drifts by `drift_deg_per_s` for the time of one exposure.
+        """
+        step_deg = self.scene.sim.eye.drift_deg_per_s * self.scene.spec.camera.exposure_s
+        step_px = step_deg * self.scene.geometry.px_per_deg
+        return step_px if STEPS * step_px >= LEAST_DRIFT_PX else 0.0
+
+    def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
-        Computed once per eye and colour.
+        `step`, 0 to STEPS, is the number of frames for which the eye has drifted. Computed once per eye, colour, step.
         """
-        key = eye, colour
+        key = eye, colour, step
         if key not in self._rates:
-            self._rates[key] = electrons_per_s(self.setup(eye, colour))
+            setup = self.setup(eye, colour)
+            if step > 0:
+                scene = setup.scene
+                radius_px = scene.geometry.px_per_deg * scene.half_field_deg
+                moved = moved_behind_field(self.retina(eye), (0.0, step * self.drift_px), radius_px)
+                setup = build_setup(scene, moved, self._chosen(scene))
+            self._rates[key] = electrons_per_s(setup)
         return self._rates[key]
+
+    def _chosen(self, scene: Scene) -> tuple[Decision, ...]:
+        return self.plan if scene.colour == self.scene.spec.light.colour else self._choose(scene)

@@ -76,6 +76,28 @@ def _shifted_picture(
     )
 
 
+def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float) -> Fundus:
+    """Return an object moved by `move_px` (down, right) behind a round field that stands still.
+
+    What comes in from beyond the field repeats the nearest pixels at its edge.
+    """
+    edge = _soft_field(found.field.shape, radius_px)
+    nearest = ndimage.distance_transform_edt(edge < 1, return_distances=False, return_indices=True)
+
+    def moved(plane: Image) -> Image:
+        shifted = ndimage.shift(plane[tuple(nearest)], move_px, order=3, mode="nearest")
+        return np.asarray(np.maximum(shifted, 0) * edge, np.float32)
+
+    def place(position: Pair | None) -> Pair | None:
+        return None if position is None else (position[0] + move_px[0], position[1] + move_px[1])
+
+    vessels = found.vessels
+    if vessels is not None:
+        vessels = (ndimage.shift(vessels.astype(np.float32), move_px, order=1) > 0.5) & found.field
+    planes = {colour: moved(plane) for colour, plane in found.reflectance.items()}
+    return Fundus(planes, found.field, vessels, place(found.disc), place(found.fovea))
+
+
 def _picture(scene: SimSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, wide_deg: float) -> Fundus:
     """Return a photograph if the scene names one, else a retina drawn from its seed; both are `wide_deg` wide."""
     what = scene.object

@@ -8,7 +8,7 @@ import numpy as np
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
-from device.sim.eyes import EffectSelector, RenderedEyes
+from device.sim.eyes import STEPS, EffectSelector, RenderedEyes
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, decide
@@ -56,6 +56,7 @@ class World:
         self.shake_px = 0
         self.faults: set[str] = set()
         self.frames = 0
+        self.lit_frames = 0  # since the eye was presented
         self.temperature_c, self.battery_state = REFERENCE_C, BatteryState(0.775, 3.88)
         self.identity: HeadIdentity | None = None
         self.pressed_since_s: float | None = None
@@ -71,11 +72,15 @@ class World:
     def present_eye(self, eye: Eye) -> None:
         """Present an eye to the head, with the fault "eye.other" the fellow eye; a calibration target stays in place.
 
-        The light of this eye is computed now for the picture's and the aiming colour, not later while the lamp is lit.
+        The light of this eye is computed now for the picture's and the aiming colour, not later while the lamp is lit:
+        with drift for each step of a burst. The drift begins at its start.
         """
+        self.lit_frames = 0
         self.eye = FELLOW_EYE[eye] if self.has_fault("eye.other") else eye
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
+        for step in range(1, STEPS + 1) if self.eyes.drift_px else ():
+            self.eyes.electrons_per_s(self.eye, self.spec.light.colour, step)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -138,7 +143,8 @@ class World:
         glow = self.illumination  # read once: the guard's thread may turn the lamp off at any time
         if glow is None:
             return np.broadcast_to(unlit_e, self.shape)
-        returned: Image | float = self.electrons_per_s(glow.colour)
+        step = self.lit_frames % (STEPS + 1) if self.eyes.drift_px and glow.colour == self.spec.light.colour else 0
+        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step)
         if self.has_fault("eye.closed"):
             returned = np.full(self.shape, np.mean(returned), np.float32)
         return returned * np.float32(glow.level * exposure_s) + unlit_e

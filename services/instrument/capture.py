@@ -2,8 +2,9 @@
 
 import json
 from collections import OrderedDict
+from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 import numpy as np
@@ -67,19 +68,26 @@ class Press:
 
 @dataclass(frozen=True)
 class ExposedCapture:
-    """Exposed capture: the lit (`frame`) and dark frame of a press, before reconstruction.
+    """Exposed capture: the lit frames and the dark frame of a press, before reconstruction.
 
-    `expose_s`: duration of both exposures. `light`: dose report. `verdict`: first verdict, on the raw frame.
+    `expose_s`: duration of all exposures. `light`: dose report. `verdict`: first verdict, on `frame`. `unusable`:
+    reason of each frame that must not enter the picture, by its index.
     """
 
     press: Press
     id: str
     taken_at: datetime
-    frame: Frame
+    frames: tuple[Frame, ...]
     dark: Frame
     expose_s: float
     light: DoseReport
     verdict: Verdict
+    unusable: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def frame(self) -> Frame:
+        """The first lit frame: the reference of the burst, and the quick look."""
+        return self.frames[0]
 
 
 class IdempotencyKeys:
@@ -106,19 +114,23 @@ class IdempotencyKeys:
 
 
 def capture_files(
-    capture: Capture, head: str, frame: Frame, dark: Frame, shown: Image, quick: bytes | None
+    capture: Capture, head: str, lit: tuple[Frame, ...], dark: Frame, shown: Image, quick: bytes | None
 ) -> dict[str, bytes]:
     """Return the files of a capture by name; `shown` is the linear picture of the field, `quick` its quick look (JPEG).
 
     `head` is the name of the head. The raw frames and the calibration in their metadata suffice to repeat the
-    reconstruction.
+    reconstruction: `raw.tiff` is the first frame of the burst, `raw-1.tiff` the next one.
     """
+    frame = lit[0]
     metadata = RawMetadata(
         id=capture.id, eye=capture.eye, taken_at=capture.taken_at, exposure_s=frame.exposure_s,
         illumination=frame.illumination, simulated=frame.simulated, calibration_id=capture.calibration_id, head=head,
     )  # fmt: skip
     return {
-        "raw.tiff": picture_files.raw_tiff(frame.counts, metadata),
+        **{
+            "raw.tiff" if k == 0 else f"raw-{k}.tiff": picture_files.raw_tiff(one.counts, metadata)
+            for k, one in enumerate(lit)
+        },
         "dark.tiff": picture_files.raw_tiff(dark.counts, replace(metadata, illumination=None)),
         "picture.png": picture_files.to_png(shown, capture.simulated, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"),
         "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),

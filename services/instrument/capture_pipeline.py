@@ -5,8 +5,8 @@ between two steps. One thread, the one that owns the head, calls it.
 """
 
 import logging
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,10 +15,11 @@ import numpy as np
 from device.clock import Clock, Deadline
 from device.errors import DiffuscopeError, FrameError
 from device.head import Head
-from device.light_safety.burst import require_lit
+from device.light_safety.burst import burst, require_lit
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
+from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction import RefractionEstimator
 from device.recon.model.fft_plans import Planner
@@ -57,6 +58,16 @@ class FrameReconstructor(Protocol):
         """Return the picture of all stages, or with `quick` of the first one."""
 
 
+class FramesReconstructor(Protocol):
+    """Reconstruction of bursts in steps, as `device.recon.burst_reconstructor.BurstReconstructor` does it."""
+
+    def steps(
+        self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
+        deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the quick look of the first frame, a pause after each frame and round, and the picture."""
+
+
 class FrameFeedback(Protocol):
     """Assessment of frames and pictures, as `FrameAssessor` does it."""
 
@@ -75,12 +86,16 @@ class FrameFeedback(Protocol):
 
 @dataclass(frozen=True)
 class Exposure:
-    """Lit and dark frame of one press, with the clock seconds of the begin and the duration of both exposures."""
+    """Lit frames of one press, their dark frame, and begin (clock seconds) and duration of all exposures.
 
-    lit: Frame
+    `unusable` holds the reason of each lit frame that must not enter the picture, by its index.
+    """
+
+    lit: tuple[Frame, ...]
     dark: Frame
     begin_s: float
     duration_s: float
+    unusable: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -97,7 +112,7 @@ class CaptureRecord:
     """Capture before its storage: its row, its frames, and the picture of the illuminated field; `head`: its name."""
 
     capture: Capture
-    lit: Frame
+    lit: tuple[Frame, ...]
     dark: Frame
     shown: Image
     head: str
@@ -110,25 +125,39 @@ class CaptureRecord:
 class CapturePipeline:
     """Steps of the captures and live pictures of one head.
 
-    `reconstructor` makes the pictures of captures, `live` those of live pictures, whose colour may have another PSF.
+    `reconstructor` makes the pictures of captures of one frame, `bursts` those of several (None: a press takes one
+    frame), `live` those of live pictures, whose colour may have another PSF.
     """
 
     def __init__(
         self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
-        feedback: FrameFeedback,
+        feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
     ) -> None:  # fmt: skip
-        self.reconstructor, self.live = reconstructor, live
+        self.reconstructor, self.live, self.bursts = reconstructor, live, bursts
         self._head, self._clock, self._feedback = head, clock, feedback
 
-    def expose(self, eye: Eye, *, in_visit: bool = False) -> Exposure:
-        """Return a lit and a dark frame of an eye, as the module function `expose`, below, with its errors."""
-        begin_s = self._clock.now_s()
-        lit, dark = expose(self._head, (eye,), in_visit=in_visit)
+    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1) -> Exposure:
+        """Return up to `count` lit frames and a dark one of an eye, as the function `expose`, with its errors."""
+        begin_s, count = self._clock.now_s(), count if self.bursts is not None else 1
+        lit, dark = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count)
         return Exposure(lit, dark, begin_s, self._clock.now_s() - begin_s)
 
-    def assess(self, exposure: Exposure) -> Verdict:
-        """Return the verdict on the raw frame."""
-        return self._feedback.assess(exposure.lit.counts, exposure.dark.counts, exposure.begin_s)
+    def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
+        """Return the exposure with its first good frame at the front, and the verdict on that frame.
+
+        Without a good frame the order stays, and the verdict is that on the first one. Frames with another verdict than
+        the first one are marked as unusable.
+        """
+        dark, begin_s = exposure.dark.counts, exposure.begin_s
+        verdicts = [self._feedback.assess(frame.counts, dark, begin_s) for frame in exposure.lit]
+        best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
+        order = [best, *(k for k in range(len(verdicts)) if k != best)]
+        unusable = {
+            place: f"frame quality: {verdicts[k].code}"
+            for place, k in enumerate(order)
+            if verdicts[k].code != verdicts[best].code
+        }
+        return replace(exposure, lit=tuple(exposure.lit[k] for k in order), unusable=unusable), verdicts[best]
 
     def quick_look(self, shot: ExposedCapture) -> Image:
         """Return the picture of the first stage, cropped to the illuminated field; FrameError for a useless frame."""
@@ -142,12 +171,17 @@ class CapturePipeline:
         """
         deadline = Deadline.after(self._clock, budget_s)
         try:
-            yield from self.reconstructor.steps(
-                shot.frame.counts, shot.dark.counts, simulated=shot.frame.simulated, deadline=deadline
-            )
+            yield from self._steps(shot, deadline)
         except FrameError as error:
             log.warning("reconstruction failed: %s", error, extra={"code": error.code, "about": shot.id})
             yield unreconstructed(shot.frame, error)
+
+    def _steps(self, shot: ExposedCapture, deadline: Deadline) -> Iterator[Step]:
+        dark, simulated = shot.dark.counts, shot.frame.simulated
+        if self.bursts is None or len(shot.frames) == 1:
+            return self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
+        counts = [frame.counts for frame in shot.frames]
+        return self.bursts.steps(counts, dark, unusable=shot.unusable, simulated=simulated, deadline=deadline)
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
         """Return the final verdict, from the first one, the report and the number of tries of the slot."""
@@ -160,7 +194,7 @@ class CapturePipeline:
         report = capture_report(shot, made.report, verdict, side, budget_s)
         id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
-        return CaptureRecord(capture, shot.frame, shot.dark, shown, self._head.spec.name)
+        return CaptureRecord(capture, shot.frames, shot.dark, shown, self._head.spec.name)
 
     def expose_live(self, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> LiveFrame:
         """Return a frame in aiming light, whose dose counts for `eyes`; without a visit a lower limit applies."""
@@ -181,28 +215,34 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
     """
     planner, light, shape = Planner(plans), head.spec.light, head.camera.shape
     calibration, live = (head.calibration.for_colour(colour) for colour in (light.colour, light.preview_colour))
-    index = _best_psf(head, calibration, planner)
+    index = _best_psf(head, clock, calibration, planner)
     recipes = default_schedule(calibration, shape, index)
     reconstructor = live_reconstructor = Reconstructor(calibration, shape, planner, clock, recipes, index)
     if live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
         live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
     feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
-    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback)
+    is_recording = head.spec.camera.backend == "replay"  # whose next raw may show something else
+    bursts = None if is_recording else BurstReconstructor(reconstructor, planner)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts)
 
 
-def _best_psf(head: Head, calibration: Calibration, planner: Planner) -> int:
+def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Planner) -> int:
     """Return the index of the PSF with the highest likelihood for one frame exposed now; 0 if there is only one.
 
     A recording may hold PSFs of several depths.
     """
     if len(calibration.psfs) == 1:
         return 0
-    frame, _ = expose(head, EYES)
+    (frame,), _ = expose(head, EYES, clock)
     return most_likely_psf(calibration, frame.counts, planner)[0]
 
 
-def expose(head: Head, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> tuple[Frame, Frame]:
-    """Return a lit and a dark frame; the dose counts for `eyes`, without a visit up to a lower limit.
+def expose(
+    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1
+) -> tuple[tuple[Frame, ...], Frame]:
+    """Return up to `count` lit frames and a dark one; the dose counts for `eyes`, without a visit up to a lower limit.
+
+    There are fewer lit frames if the guard permits no light for so long.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
@@ -212,9 +252,9 @@ def expose(head: Head, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> tupl
     announce_eye(head, eyes)
     head.camera.prepare(shot)
     try:
-        with head.light.on(Illumination(head.spec.light.colour), eyes, in_visit=in_visit):
-            frame = require_lit(head.camera.expose(shot))
-        return frame, head.camera.expose(shot)
+        glow = Illumination(head.spec.light.colour)
+        lit = burst(head.camera, head.light, glow, shot, count, clock, eyes, in_visit=in_visit)
+        return lit, head.camera.expose(shot)
     finally:
         head.light.off()
 
@@ -252,5 +292,5 @@ def crop_to_field(image: Image, head: Head) -> Image:
 
 def unreconstructed(frame: Frame, error: DiffuscopeError) -> Reconstruction:
     """Return the raw frame as picture, with the error in the report, for a failed reconstruction."""
-    report = Report(method=NO_METHOD, rounds=0, stopped=error.code, warnings=(error.message,))
+    report = Report(method=NO_METHOD, rounds=0, stopped=error.code, warnings=(error.message,), frames=())
     return Reconstruction(frame.counts.astype(np.float32), report, frame.simulated)

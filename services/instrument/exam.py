@@ -27,7 +27,7 @@ from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S, Capture
 from services.records.capture_journal import CaptureJournal
 from services.records.capture_store import CaptureStore
-from services.records.capture_target import TEST_PICTURE, CaptureTarget
+from services.records.capture_target import FRAMES, TEST_PICTURE, CaptureTarget
 
 
 class ExamService:
@@ -45,7 +45,7 @@ class ExamService:
         self.head, self.store, self.ready = head, store, Event()
         self._watchdog = watchdog
         self._requests = requests = ExamRequests(clock)
-        self.progress = Progress(clock, head.spec.camera.exposure_s, budget_s)
+        self.progress = Progress(clock, (FRAMES + 1) * head.spec.camera.exposure_s, budget_s)
         self.capture_journal = CaptureJournal(store)
         self.calibration_monitor = CalibrationMonitor(
             head, store, event_bus, clock, lambda: requests.snapshot.is_interrupted, watchdog

@@ -115,12 +115,13 @@ class ExamLoop:
         self._parts.store.refuse_light_in_vain()
         self._parts.capture_journal.begin(press.journal_entry(id), press.key)
         self._events.stage(press, id, "expose")
-        exposure = self._pipeline.expose(press.eye, in_visit=press.target.visit is not None)
-        verdict = self._pipeline.assess(exposure)
+        target = press.target
+        exposure = self._pipeline.expose(press.eye, in_visit=target.visit is not None, count=target.frames)
+        exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
         light = self._parts.head.light.dose_report()
         return ExposedCapture(
-            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light=light, verdict=verdict
+            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable
         )
 
     def _complete_oldest(self) -> None:

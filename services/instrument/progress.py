@@ -28,8 +28,9 @@ class ProgressEstimate:
 class Progress:
     """Progress estimator: the time left at a stage is the median time from that stage to storage, last RECENT captures.
 
-    Before the first capture, defaults from the exposure time `exposing_s`, the time budget `budget_s` (seconds) and
-    STORAGE_S replace the median. The thread that owns the head calls the methods; `late_s` may be read from any thread.
+    Before the first capture, defaults from the duration of all exposures `exposing_s`, the time budget `budget_s`
+    (seconds) and STORAGE_S replace the median. The thread that owns the head calls the methods; `late_s` may be read
+    from any thread.
     """
 
     def __init__(self, clock: Clock, exposing_s: float, budget_s: Callable[[], float]) -> None:
@@ -82,7 +83,7 @@ class Progress:
     def _own_left_s(self, stage: str) -> float:
         if self._took_s[stage]:
             return median(self._took_s[stage])
-        default_s = {"expose": 2 * self._exposing_s + self._at_most_s(), "quick": self._at_most_s(), "keep": STORAGE_S}
+        default_s = {"expose": self._exposing_s + self._at_most_s(), "quick": self._at_most_s(), "keep": STORAGE_S}
         return default_s[stage]
 
 

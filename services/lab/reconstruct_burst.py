@@ -8,10 +8,11 @@ import numpy as np
 from device.clock import Deadline, SystemClock
 from device.config.image_files import Raw
 from device.errors import FrameError, SettingError
-from device.recon.burst import MOST_FRAMES, BurstJoiner, FrameUse
+from device.recon.burst import MOST_FRAMES, BurstJoiner
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
+from device.values import FrameUse
 from services.lab.reconstruct_file import (
     FileReconstruction,
     file_report,

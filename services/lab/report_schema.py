@@ -42,7 +42,7 @@ REGULARISATION: Mapping[str, str] = {
 QUALITY: Mapping[str, str] = {
     "saturated": "Share of the pixels at or above the white level, 0 to 1.",
     "missing": "Share of the frame that was left out (saturated, defective, not a number), 0 to 1.",
-    "mean_dn": "Mean of the pixels that are not missing, above dark, in DN.",
+    "mean_dn": "Mean of the pixels that are not missing, above dark, in DN; of an instrument's burst: of its sum.",
     "through": "Share of the light that came through the eye: one minus stray light over mean. Eyes have 0.9 and more.",
     "coverage": "Share of the field that is lit, 0 to 1; null if the field is not known.",
     "cutoff_per_px": "Lowest frequency where the signal is below the noise, in cycles per sensor pixel.",
@@ -58,6 +58,17 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
+FRAME: Mapping[str, JsonValue] = {
+    "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
+    "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
+    "shift_px": {
+        "type": ["array", "null"], "items": {"type": "number"}, "minItems": 2, "maxItems": 2,
+        "description": "Rows and columns: what is at (r, c) of the reference, the first used frame of the channel, "
+        "stands at (r, c) plus this in the frame, in pixels of the sensor. Null if the frame was not registered.",
+    },
+    "weight": {"type": "number", "description": "Share of the frame in the joined frame, 0 to 1."},
+    "reason": {"type": ["string", "null"], "description": "Reason why the frame is not used; null if it is."},
+}  # fmt: skip
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",
     "light_e_per_um2": "Mean light on the sensor in electrons per um^2.",
@@ -113,21 +124,6 @@ FILES: Mapping[str, JsonValue] = {
     ),
     "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
     "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
-    "frames": _typed(
-        "array", "What became of each raw of a burst, in the order in which they were given; one entry for one raw.",
-        items={"type": "object", "properties": {
-            "index": _typed("integer", "Place of the raw in the burst, from 0."),
-            "used": _typed("boolean", "True if the picture has the light of this raw."),
-            "shift_px": _typed(
-                ["array", "null"],
-                "Rows and columns: what is at (r, c) of the reference, the first used raw of the channel, stands "
-                "at (r, c) plus this in the raw, in pixels of the raw. Null if the raw was not registered.",
-                items={"type": "number"}, minItems=2, maxItems=2,
-            ),
-            "weight": _number("Share of the raw in the joined frame, 0 to 1."),
-            "reason": _text("Reason why the raw is not used; null if it is."),
-        }},
-    ),
     "channels": _typed(
         "array", "Colours of light of a colour picture, in the order in which they were given; empty for a grey one.",
         items={"type": "object", "properties": {
@@ -150,6 +146,10 @@ CAPTURE: Mapping[str, JsonValue] = {
     ),
     "dose_stop_j_per_cm2": _figure("Dose in 24 hours at which an eye gets no more light, in J/cm2."),
     "dose_high": _typed("array", "Eyes whose dose is above the warning.", items={"type": "string"}),
+    "limits_unchecked": _typed(
+        "array", "Names of the light limits that were not compared with the purchased standard.",
+        items={"type": "string"},
+    ),
     "visit": _text("Identifier of the visit; null for a test picture."),
     "slot": _text("Picture slot of the programme, for example R-centre; null for a test picture."),
     "test": _typed("boolean", "True for a test picture, which belongs to no visit."),
@@ -207,6 +207,7 @@ def report_schema() -> dict[str, JsonValue]:
         "refraction_dpt": {"type": ["object", "null"], "properties": _each(REFRACTION, _number)},
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
+        "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},
     }
     for name, entries in nested.items():
         properties[name] = {"description": properties[name]["description"], **entries}
@@ -215,12 +216,12 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels, bayer, frames and channels, and the instrument the others. "
+            "given, psf_channels, bayer and channels, and the instrument the others. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",
         "properties": {**properties, **FILES, **CAPTURE},
-        "required": [one.name for one in fields(Report)],
+        "required": [one.name for one in fields(Report) if one.name != "frames"],  # earlier releases had none
     }
 
 

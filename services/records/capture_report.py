@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from device.light_safety.dose_report import DoseReport
-from device.values import EYES, Report
+from device.values import EYES, FrameUse, Report
 from services.records.capture import (
     BUDGET_S,
     NO_METHOD,
@@ -45,18 +45,27 @@ def verdict_as_json(verdict: PictureVerdict) -> dict[str, JsonValue]:
 def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     made, light = report.reconstruction, report.light
     entries: dict[str, JsonValue] = {
-        **vars(made), "warnings": list(made.warnings),
-        **vars(light), "dose_high": list(light.dose_high),
+        **vars(made), "warnings": list(made.warnings), "frames": [_frame_as_json(one) for one in made.frames],
+        **vars(light), "dose_high": list(light.dose_high), "limits_unchecked": list(light.limits_unchecked),
         "visit": report.visit, "slot": report.slot, "test": report.is_test,
         "verdict": None if report.verdict is None else verdict_as_json(report.verdict),
         "laterality": None if report.laterality is None else _laterality_as_json(report.laterality),
         "budget_s": report.budget_s,
     }  # fmt: skip
+    if not made.frames:
+        del entries["frames"]
+    if not light.limits_unchecked:
+        del entries["limits_unchecked"]
     if report.moved:
         entries["moved"] = [_correction_as_json(one) for one in report.moved]
     if report.confirmed is not None:
         entries["confirmed"] = _confirmation_as_json(report.confirmed)
     return entries
+
+
+def _frame_as_json(one: FrameUse) -> JsonValue:
+    shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
+    return {"index": one.index, "used": one.used, "shift_px": shift, "weight": one.weight, "reason": one.reason}
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -133,7 +142,20 @@ def _reconstruction(entries: JsonObject) -> Report:
         residual=_lenient(entries, "residual", _number, None),
         quality=_lenient(entries, "quality", _copied, {}),
         warnings=_lenient(entries, "warnings", _texts, ()),
+        frames=_lenient(entries, "frames", _frames, ()),
     )
+
+
+def _frames(value: object) -> tuple[FrameUse, ...]:
+    if not isinstance(value, list):
+        raise ValueError("frames that are no list")
+    return tuple(_frame(_object(one)) for one in value)
+
+
+def _frame(entries: JsonObject) -> FrameUse:
+    index, used = _checked(entries, "index", _whole, 0), entries.get("used") is True
+    shift_px, weight = _checked(entries, "shift_px", _position, None), _checked(entries, "weight", _number, 0.0)
+    return FrameUse(index, used, shift_px, weight, _checked(entries, "reason", text, None))
 
 
 def _dose_report(entries: JsonObject) -> DoseReport:
@@ -142,6 +164,7 @@ def _dose_report(entries: JsonObject) -> DoseReport:
         _lenient(entries, "dose_24h_j_per_cm2", _numbers, {}),
         _lenient(entries, "dose_stop_j_per_cm2", _number, None),
         _lenient(entries, "dose_high", _texts, ()),
+        _lenient(entries, "limits_unchecked", _texts, ()),
     )
 
 

@@ -48,7 +48,7 @@ from services.records.record_rows import capture_content, file_entries
 from services.records.record_signing import PAGE_ROWS, recorded, write_signature
 from services.records.recovery import Recovery, damage_of, set_aside
 from services.records.recovery_report import RecoveryReport
-from services.records.removed_captures import REMOVED_FILES, RemovedCaptures
+from services.records.removed_captures import RemovedCaptures, is_large
 from services.records.reserve_file import ReserveFile
 from services.records.restoration import finish_restoration
 from services.records.row_validation import REMEDY
@@ -229,7 +229,7 @@ class CaptureStore:
         try:
             content = blobs.read_blob(self._captures / row.id / name)
         except OSError as error:
-            if (removal := self.removed.removal(row.id)) is not None and name in REMOVED_FILES:
+            if (removal := self.removed.removal(row.id)) is not None and is_large(name):
                 when = f"{removal.removed_at:%Y-%m-%d}"
                 raise RecordRemoved(f"{name} was removed on {when}, after its visit was {removal.reason}") from error
             raise StoreDamaged(f"{name} of {id} cannot be read: {error}") from error

@@ -9,6 +9,7 @@ from services.records.capture import Capture
 
 RowWriter = Callable[[Session, Capture], None]
 Permit = Callable[[], None]
+FRAMES = 4  # of one press: the burst for which the instrument plans
 
 
 def permit_test_picture() -> None:
@@ -22,7 +23,7 @@ class CaptureTarget:
     `tries`: number of earlier captures of the slot; `retakes`: permitted number of retakes. `write_rows` adds
     rows in the transaction that stores the capture, whose record holds `request`, the reference of the press
     (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing
-    or ConsentDeclined if the visit does not allow light.
+    or ConsentDeclined if the visit does not allow light. `frames`: number of lit frames, 1 to FRAMES.
     """
 
     visit: str | None = None
@@ -33,6 +34,7 @@ class CaptureTarget:
     write_rows: RowWriter | None = None
     request: str | None = None
     permit: Permit = permit_test_picture
+    frames: int = FRAMES
 
 
 TEST_PICTURE = CaptureTarget()

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
+from services.records.capture_target import FRAMES
 
 DEFAULT_PROTOCOL = Path(__file__).parent / "protocol.toml"
 CHOOSE_REMEDY = "Choose one of the pictures on the page."
@@ -43,12 +44,14 @@ class Programme(Table):
 class Protocol(Table):
     """Screening protocol: picture slots in their order, permitted reasons why a picture is not possible, programme.
 
-    `retakes`: number of permitted retakes of a slot.
+    `retakes`: number of permitted retakes of a slot. `frames`: number of frames of one picture; more frames give more
+    light, so less noise, and take longer.
     """
 
     slots: tuple[Slot, ...] = Field(min_length=1, max_length=16)
     reasons: tuple[Reason, ...] = REASONS
     retakes: int = Field(ge=0, le=10)
+    frames: int = Field(default=FRAMES, ge=1, le=FRAMES)
     programme: Programme
 
     @model_validator(mode="after")

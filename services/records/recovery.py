@@ -42,7 +42,7 @@ from services.records.record_signing import (
     write_signature,
 )
 from services.records.recovery_report import RecoveryReport
-from services.records.removed_captures import MARK, REMOVED_FILES
+from services.records.removed_captures import MARK, is_large
 from services.records.schema import CaptureRow, PatientRow, RecordRow
 from services.records.snapshots import move_to_numbered_folder, refuse_in_use
 from services.records.storage_errors import sqlite_name, storage_errors
@@ -228,7 +228,7 @@ class Recovery:
         folder = self._folder / "captures" / row.id
         is_removed = (folder / MARK).exists()
         for file in row.files:
-            if is_removed and file.name in REMOVED_FILES:
+            if is_removed and is_large(file.name):
                 continue
             path = folder / file.name
             if Path(file.name).name != file.name or not path.is_file() or path.stat().st_size != file.bytes:

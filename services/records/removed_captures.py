@@ -9,6 +9,7 @@ removal or its undoing. No clock is involved in the end of the undo period.
 """
 
 import logging
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,7 +23,7 @@ from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
 
-REMOVED_FILES = ("raw.tiff", "dark.tiff", "picture.png")  # nearly all bytes of a capture
+LARGE_FILE = re.compile(r"(raw(-[0-9]+)?|dark)[.]tiff|picture[.]png")  # nearly all bytes of a capture
 MARK = "removed.json"
 Reason = Literal["exported", "sent"]
 
@@ -33,6 +34,11 @@ class Removal:
 
     reason: Reason
     removed_at: datetime
+
+
+def is_large(name: str) -> bool:
+    """Return whether a file of a capture with this name is removed to free space."""
+    return LARGE_FILE.fullmatch(name) is not None
 
 
 class RemovedCaptures:
@@ -55,15 +61,17 @@ class RemovedCaptures:
 
     def removable_bytes(self, id: str) -> int:
         """Return the size (bytes) of the large files of a capture that are still in its folder."""
-        paths = (self._captures / id / name for name in REMOVED_FILES)
-        return sum(path.stat().st_size for path in paths if path.is_file())
+        return sum(path.stat().st_size for path in self._large_files(id))
+
+    def _large_files(self, id: str) -> list[Path]:
+        """Return the large files that are still in the folder of a capture, sorted; empty without a folder."""
+        return sorted(path for path in (self._captures / id).glob("*") if is_large(path.name) and path.is_file())
 
     def remove(self, ids: Iterable[str], removal: Removal) -> None:
         """Move the large files of captures aside; no-op for a capture without them. StoreError if the disk refuses."""
         with storage_errors(), atomic_io.file_lock(self._lock):
             for id in ids:
-                paths = (self._captures / id / name for name in REMOVED_FILES)
-                present = [path for path in paths if path.exists()]
+                present = self._large_files(id)
                 if not present:
                     continue
                 mark = {"reason": removal.reason, "removed_at": removal.removed_at.isoformat()}

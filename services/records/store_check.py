@@ -18,7 +18,7 @@ from services.records.dose_ledger_log import DoseLedgerLog
 from services.records.record_document import Kind, RecordDocument
 from services.records.record_files import RecordFiles
 from services.records.recovery import damage_of
-from services.records.removed_captures import MARK, REMOVED_FILES
+from services.records.removed_captures import MARK, is_large
 from services.records.storage_errors import storage_errors
 
 KINDS: dict[Kind, str] = {"patient": "patients", "visit": "visits", "capture": "captures"}
@@ -145,7 +145,7 @@ def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocumen
             try:
                 content = blobs.read_blob(folder / "captures" / id / Path(name).name)
             except OSError:
-                if name not in REMOVED_FILES or not (folder / "captures" / id / MARK).exists():
+                if not is_large(name) or not (folder / "captures" / id / MARK).exists():
                     result.damaged.append(f"{id}/{name}")
                 continue
             expected = described.get("sha256") if isinstance(described, dict) else None

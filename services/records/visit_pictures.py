@@ -38,7 +38,7 @@ class VisitPictures:
         """
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         if id is None or slot is None:
-            return CaptureTarget(write_rows=self._row_writer(key), request=request)
+            return CaptureTarget(write_rows=self._row_writer(key), request=request, frames=self._protocol.frames)
         visit, protocol_slot = self._get(id), self._protocol.slot(slot)
         if protocol_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
@@ -48,8 +48,9 @@ class VisitPictures:
         permit()
         tries = len(visit.slots[slot].captures)
         return CaptureTarget(
-            id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit
-        )
+            id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit,
+            self._protocol.frames,
+        )  # fmt: skip
 
     def permission(self, id: str | None) -> Permit:
         """Return a function that checks the consent of a visit, to be called before each light.

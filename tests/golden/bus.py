@@ -106,7 +106,7 @@ def record() -> dict[str, Any]:
     with listener.phase("aim"):
         expose_live(head, EYES, clock)
     with listener.phase("press"):
-        expose(head, ("OD",))
+        expose(head, ("OD",), clock)
     with listener.phase("close"):
         head.close()
     with listener.phase("write the head's memory"), head_memory(head_with_real_drivers(), clock) as memory:

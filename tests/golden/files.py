@@ -8,8 +8,8 @@ kept/send.toml          settings of the upload
 kept/update/            the state of an update
 records/files.json      the content of all of these as read by the code
 records/schema.sql      the tables
-kept-r0005/data/        a data folder of an earlier release, with the schema in its name
-records/files-r0005.json    its content as that release read it
+kept-r0006/data/        a data folder of an earlier release, with the schema in its name: captures of one frame
+records/files-r0006.json    its content as that release read it
 """
 
 import hashlib
@@ -53,7 +53,7 @@ from tests.unit.test_archive import WHO, calibration
 
 KEPT = Path(__file__).parent / "kept"
 # Data folders of earlier releases, by schema.
-EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in ("r0004", "r0005")}
+EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in ("r0004", "r0005", "r0006")}
 SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)
@@ -308,7 +308,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         zip_bytes = zip_archive(name, export_files(store, visit, people.undo_until(visit)), visit.begun_at)
         lost = CaptureJournal(store).interrupted[0]
         note = store.folder / "underway" / f"{lost.id}.json"
-        before = json.loads(note.read_bytes())
+        before = digested_json.decoded(note.read_bytes())
         note.unlink()
         CaptureJournal(store).begin(lost, "0" * 16)
         journal = digested_json.decoded(note.read_bytes()) == before

@@ -85,9 +85,9 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(GUARD, "        self.hazard.refuse(glow)\n", "", T_GUARD),
     Mutant(GUARD, "limits.stop_j_per_cm2 if in_visit else", "limits.stop_j_per_cm2 if True else", T_GUARD),
     Mutant(GUARD, "if in_visit or total_j_per_cm2 > limits.stop_j_per_cm2:", "if in_visit:", T_GUARD),
-    Mutant(LOOP, "in_visit=press.target.visit is not None", "in_visit=True", T_LIGHT),
+    Mutant(LOOP, "in_visit=target.visit is not None", "in_visit=True", T_LIGHT),
     Mutant(LIVE, "in_visit=wanted.visit is not None", "in_visit=True", T_LIGHT),
-    Mutant(LOOP, "in_visit=press.target.visit is not None", "in_visit=False", T_LIGHT),
+    Mutant(LOOP, "in_visit=target.visit is not None", "in_visit=False", T_LIGHT),
     Mutant(LIVE, "in_visit=wanted.visit is not None", "in_visit=False", T_LIGHT),
     # Dose ledger
     Mutant(LEDGER, "if boot == self.boot:", "if True:", T_BOOK),

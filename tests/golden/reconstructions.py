@@ -1,7 +1,7 @@
 """Record of the solvers: the picture of each method after fixed rounds, and the keys and values of its report."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def cases() -> Iterator[tuple[str, Reconstruction]]:
 
 def report(made: Reconstruction) -> dict[str, Any]:
     """Return the report of a reconstruction without times, its figures with five digits."""
-    values = {key: value for key, value in vars(made.report).items() if key not in TIMED}
+    values = {key: value for key, value in asdict(made.report).items() if key not in TIMED}
     rounded: dict[str, Any] = _rounded(values)
     return rounded
 

@@ -17,7 +17,7 @@ from device.errors import CameraMissing, CameraStalled, DiffuscopeError, LightFa
 from device.errors import LightLimit as Limit
 from device.ports import Camera
 from device.recon.reconstructor import Reconstructor
-from device.values import ExposureSettings, Frame, Illumination
+from device.values import ExposureSettings, Frame, Illumination, Reconstruction
 from services.errors import Busy
 from services.imaging.picture_files import read_raw_tiff, to_png
 from services.instrument.capture_pipeline import CapturePipeline, crop_to_field, plan_pipeline
@@ -25,7 +25,8 @@ from services.instrument.events import EventBus
 from services.records.capture_report import report_as_json
 from tests.journey.asking import live_picture
 
-FILES = {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
+RAWS = ("raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff")
+FILES = {*RAWS, "dark.tiff", "picture.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
 
 
@@ -45,10 +46,13 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert report == report_as_json(kept.report) | {"simulated": True}
     assert report["stopped"] == "done"
     assert report["bin"] == 1
-    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 0.1, rel=1e-3)  # default radiometry, one exposure
+    assert [frame["used"] for frame in report["frames"]] == [True] * 4
+    assert sum(frame["weight"] for frame in report["frames"]) == pytest.approx(1)
+    assert "photochemical_dose" in report["limits_unchecked"]
+    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 4 * 0.1, rel=1e-3)  # default radiometry, four exposures
     day = report["dose_24h_j_per_cm2"]  # the reservation is settled, up to rounding
     assert report["dose_j_per_cm2"] <= day["OS"] * (1 + 1e-9) < report["dose_stop_j_per_cm2"]
-    assert report["seconds"]["expose"] == pytest.approx(0.2)
+    assert report["seconds"]["expose"] == pytest.approx(0.5)
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         picture.load()
         assert min(picture.size) > 60
@@ -154,6 +158,40 @@ class PressAtQuickLook(EventBus):
             self.pressed.append(press())
 
 
+class Blinking:
+    """Camera of a simulated head whose eye is closed in the lit frames with these numbers."""
+
+    def __init__(self, camera: Any, closed: set[int]) -> None:
+        self._camera, self._closed, self._lit = camera, closed, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def expose(self, shot: ExposureSettings) -> Frame:
+        world = self._camera.world
+        is_closed = world.illumination is not None and self._lit in self._closed
+        self._lit += world.illumination is not None
+        if is_closed:
+            world.faults.add("eye.closed")
+        frame: Frame = self._camera.expose(shot)
+        world.faults.discard("eye.closed")
+        return frame
+
+
+@pytest.mark.parametrize("closed", [{0}, {2}, {0, 1, 2}], ids=str)
+def test_closed_frames_of_a_burst_are_left_out_of_the_picture(make_rig: Any, closed: set[int]) -> None:
+    rig = make_rig(camera=lambda camera: Blinking(camera, closed))
+    kept = rig.exam.press("OD").result(30)
+    assert kept.report.verdict.word == "good"
+    frames = kept.report.reconstruction.frames
+    assert len(frames) == 4
+    assert frames[0].used, "the first good frame is the reference"
+    assert [one.used for one in frames].count(True) == 4 - len(closed)
+    assert all(one.reason for one in frames if not one.used)
+    reference = read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))[0].astype(float)
+    assert reference.std() > 3 * np.sqrt(reference.mean()), "an open eye has structure beyond its noise"
+
+
 def planned(rig: Any, plans: Path) -> CapturePipeline:
     """Return another pipeline of the same head, with the same plans."""
     return plan_pipeline(rig.exam.head, rig.clock, plans)
@@ -171,8 +209,12 @@ def test_a_press_suspends_a_refinement_which_resumes_to_the_same_picture(make_ri
     a, b = first.id, second.id
     assert order[:5] == [(a, "expose"), (a, "quick"), (b, "expose"), (b, "quick"), (a, "keep")]
     assert first.report.reconstruction.rounds == second.report.reconstruction.rounds > 5
-    raw, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in ("raw.tiff", "dark.tiff"))
-    alone = crop_to_field(planned(rig, plans).reconstructor(raw, dark, simulated=True).picture, rig.exam.head)
+    *raws, dark = (read_raw_tiff(rig.store.read(a, name))[0] for name in (*RAWS, "dark.tiff"))
+    bursts = planned(rig, plans).bursts
+    assert bursts is not None
+    *_, made = bursts.steps(raws, dark, simulated=True)
+    assert isinstance(made, Reconstruction)
+    alone = crop_to_field(made.picture, rig.exam.head)
     kept = rig.store.read(a, "picture.png")
     assert to_png(alone, True, f"OD {first.taken_at:%Y-%m-%d}") == kept  # bitwise equal
 

@@ -178,7 +178,7 @@ def test_stage_events_estimate_the_seconds_left(make_rig: MakeRig) -> None:
     rig = make_rig(event_bus=SlowBus())
     for _ in range(2):
         rig.exam.press("OD").result(30)
-    assert list(left_s.values()) == pytest.approx([5.2, 5.0, 0.4, 3.2, 2.0, 1.0], abs=0.11)
+    assert list(left_s.values()) == pytest.approx([5.5, 5.0, 0.4, 3.5, 2.0, 1.0], abs=0.11)
 
 
 @pytest.mark.parametrize(

@@ -1,30 +1,57 @@
 """Bursts and colour sequences of frames, over every camera and lamp."""
 
-import numpy as np
 import pytest
 
-from device.errors import LightLimit
+from device.errors import CameraMissing, LightLimit
+from device.head import hazard_of
 from device.light_safety.burst import burst, colour_sequence
+from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.guard import GuardedLight
+from device.sim.light import SimLight
 from device.values import ExposureSettings, Illumination
-from tests.ports.conftest import guarded_rig
+from tests.ports.conftest import Rig, guarded_rig, small_head
 
 SHOT = ExposureSettings(0.02)
 
 
+def guarded(rig, max_on_s=30.0):
+    hazard = hazard_of(small_head())
+    return GuardedLight(rig.light, rig.clock, max_on_s, hazard, MemoryLedger(rig.clock))
+
+
 def test_a_burst_is_lit_throughout_and_dark_afterwards(rig):
-    rows, cols = rig.camera.shape
-    into = np.zeros((3, rows, cols), np.uint16)
-    frames = list(burst(rig.camera, rig.light, Illumination("green"), SHOT, 3, into))
+    frames = burst(rig.camera, guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
     assert [frame.illumination for frame in frames] == [Illumination("green")] * 3
-    assert all(np.array_equal(frame.counts, plane) for frame, plane in zip(frames, into, strict=True))
+    numbers = [frame.number for frame in frames]
+    assert numbers == sorted(set(numbers))
     assert rig.light.illumination is None
 
 
-def test_closing_an_unfinished_burst_turns_the_light_off(rig):
-    frames = burst(rig.camera, rig.light, Illumination("green"), SHOT, 3)
-    next(frames)
-    assert rig.light.illumination is not None
-    frames.close()
+def test_a_burst_ends_before_the_guard_would_end_it():
+    rig = guarded_rig()
+    shot = ExposureSettings(0.3)
+    light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock), max_on_s=1.0)
+    frames = burst(rig.camera, light, Illumination("green"), shot, 16, rig.clock)
+    assert len(frames) == 3  # a fourth one might last until 1.2 s
+    assert light.illumination is None
+
+
+class UnpluggedCamera:
+    """Camera that is unplugged after its first exposure."""
+
+    def __init__(self, camera):
+        self.camera, self.exposures = camera, 0
+
+    def expose(self, shot):
+        self.exposures += 1
+        if self.exposures > 1:
+            raise CameraMissing("unplugged")
+        return self.camera.expose(shot)
+
+
+def test_an_error_between_two_frames_of_a_burst_turns_the_light_off(rig):
+    with pytest.raises(CameraMissing):
+        burst(UnpluggedCamera(rig.camera), guarded(rig), Illumination("green"), SHOT, 3, rig.clock)
     assert rig.light.illumination is None
 
 
@@ -40,12 +67,28 @@ def test_each_colour_has_its_own_lit_and_dark_frame(live_rig):
     assert abs(red / green - 1) > 0.05
 
 
+class CuttingCamera:
+    """Camera during whose exposure number `last` the guard's timer fires."""
+
+    def __init__(self, rig, last):
+        self.rig, self.last = rig, last
+
+    def expose(self, shot):
+        self.last -= 1
+        if self.last == 0:
+            self.rig.light.cut()  # the timer's action
+        return self.rig.camera.expose(shot)
+
+
 def test_a_burst_longer_than_the_guard_allows_raises_light_limit():
     rig = guarded_rig()
-    guarded = rig.light
-    frames = burst(rig.camera, guarded, Illumination("green"), SHOT, 3)
-    next(frames)
-    guarded.cut()  # call the timer's action without waiting
     with pytest.raises(LightLimit):
-        next(frames)
+        burst(CuttingCamera(rig, 1), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+    assert rig.light.illumination is None
+
+
+def test_a_later_frame_that_the_guard_has_ended_is_left_out():
+    rig = guarded_rig()
+    frames = burst(CuttingCamera(rig, 3), rig.light, Illumination("green"), SHOT, 4, rig.clock)
+    assert len(frames) == 2
     assert rig.light.illumination is None

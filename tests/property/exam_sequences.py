@@ -277,7 +277,7 @@ class Run:
         light = GuardedLight(SimLight(self.world), clock, 30.0, hazard_of(spec), MemoryLedger(clock))
         camera = BreakableCamera(SimCamera(self.world), self.conditions)
         head = Head(spec, camera, light, calibration, present_eye=self.world.present_eye)
-        progress = Progress(clock, spec.camera.exposure_s, lambda: BUDGET_S)
+        progress = Progress(clock, 2 * spec.camera.exposure_s, lambda: BUDGET_S)
         monitor = CalibrationMonitor(
             head, bench.store, self.event_bus, clock, lambda: self.requests.snapshot.is_interrupted, watchdog
         )

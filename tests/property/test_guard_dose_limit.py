@@ -12,15 +12,17 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from device.errors import LightLimit, StoreError, StoreFull
+from device.light_safety.burst import burst
 from device.light_safety.dose_ledger import DoseLedgerState, Ledger, MemoryLedger, Reserved
 from device.light_safety.guard import AFTERGLOW_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
-from device.values import EYES, Eye, Illumination
+from device.values import EYES, ExposureSettings, Eye, Frame, Illumination
 from services.records import schema
 from services.records.dose_ledger_tables import DoseLedgerStore
 
@@ -62,6 +64,10 @@ class Lamp:
 
     glow: Illumination | None = None
     requested: Illumination | None = None
+
+    @property
+    def illumination(self) -> Illumination | None:
+        return self.glow
 
     def on(self, glow: Illumination) -> "Lamp":
         self.requested = glow
@@ -106,6 +112,19 @@ class LedgerOnDisk:
     def _check(self) -> None:
         if self._disk.full:
             raise StoreFull("no room")
+
+
+class TimedCamera:
+    """Camera whose exposures take true time."""
+
+    def __init__(self, owner: "Eyes", slow: float) -> None:
+        self.owner, self.slow = owner, slow
+
+    def expose(self, shot: ExposureSettings, into: Any = None) -> Frame:
+        """Return a frame; it takes `slow` times its exposure, and the guard's timer may expire meanwhile."""
+        self.owner.keep_on(self.slow * shot.exposure_s)
+        lit = self.owner.guarded.illumination
+        return Frame(np.zeros((2, 2), np.uint16), shot.exposure_s, 1, lit, simulated=True)
 
 
 class Eyes(RuleBasedStateMachine):
@@ -209,6 +228,25 @@ class Eyes(RuleBasedStateMachine):
                 self.keep_on(0.99 * MAX_ON_S)
                 self.switch_off()
             self.pass_time(rest_s)
+
+    @precondition(lambda self: self.open_context is None)
+    @rule(
+        colours=st.lists(st.sampled_from(sorted(BEAMS)), min_size=1, max_size=3), eye=st.sampled_from(EYES),
+        count=st.integers(1, 16), exposure_s=st.floats(0.01, 10), slow=st.floats(1, 3), in_visit=st.booleans(),
+    )  # fmt: skip
+    def take_bursts(
+        self, colours: list[Any], eye: Eye, count: int, exposure_s: float, slow: float, in_visit: bool
+    ) -> None:
+        """Take a burst of frames in each colour; a slow camera may not hold the light longer than the guard permits."""
+        camera, shot = TimedCamera(self, slow), ExposureSettings(exposure_s)
+        for colour in colours:
+            self.exposed_eyes, self.in_visit, self.lit_s = (eye,), in_visit, 0.0
+            light, glow = self.guarded, Illumination(colour)
+            with self.lamp_is_off_after_a_refusal():
+                frames = burst(camera, light, glow, shot, count, self.times, (eye,), in_visit=in_visit)
+                assert 1 <= len(frames) <= count
+                assert not self.disk.full, "light without a record"
+            assert self.lamp.glow is None
 
     @precondition(lambda self: self.open_context is None)
     @rule(duration_s=st.one_of(st.floats(0, 120), st.floats(0, 1.2 * DAY_S), st.floats(DAY_S - 1800, DAY_S)))

@@ -38,11 +38,11 @@ class Bench:
 
     def exposed(self) -> ExposedCapture:
         """Return one exposed capture of the right eye."""
-        exposure = self.pipeline.expose("OD")
+        exposure, verdict = self.pipeline.assess(self.pipeline.expose("OD"))
         press = Press(Future(), "OD", CaptureTarget(visit="v", slot="R-centre"), None)
         return ExposedCapture(
             press, "20260101T000000-OD-000001", self.clock.wall(), exposure.lit, exposure.dark, exposure.duration_s,
-            light=self.head.light.dose_report(), verdict=self.pipeline.assess(exposure),
+            light=self.head.light.dose_report(), verdict=verdict,
         )  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def bench(tmp_path: Path) -> Bench:
 
 def test_an_exposure_is_a_lit_and_a_dark_frame_and_leaves_the_lamp_off(bench: Bench) -> None:
     exposure = bench.pipeline.expose("OS")
-    assert exposure.lit.illumination is not None
+    assert [frame.illumination is not None for frame in exposure.lit] == [True]
     assert exposure.dark.illumination is None
     assert exposure.duration_s == pytest.approx(2 * bench.head.spec.camera.exposure_s)
     assert bench.world.eye == "OS"

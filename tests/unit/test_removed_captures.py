@@ -15,7 +15,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.export_records import ExportRecords
 from services.records.protocol import load_protocol
-from services.records.removed_captures import MARK, REMOVED_FILES, Removal
+from services.records.removed_captures import MARK, Removal, is_large
 from services.records.store_check import check_store
 from services.records.upload_queue import UploadQueue, UploadReceipt
 from services.records.visit import Visit
@@ -52,7 +52,7 @@ def test_only_a_confirmed_copy_of_the_present_state_permits_a_removal(
 def test_removed_files_are_named_as_removed_and_come_back_bit_for_bit(store: CaptureStore) -> None:
     store.removed.remove(["a"], REMOVAL)
     for name in FILES:
-        if name in REMOVED_FILES:
+        if is_large(name):
             with pytest.raises(RecordRemoved, match="removed on 2026-03-01, after its visit was sent"):
                 store.read("a", name)
         else:
@@ -138,7 +138,7 @@ def test_a_finished_visit_is_removable_once_it_was_sent_or_exported(tmp_path: Pa
         exports.write(finished[1].id, state, clock.wall())
         found = removal.removable()
         assert (found.visits, found.captures) == (2, {"exported": ["c1"], "sent": ["c0"]})
-        assert found.size_bytes == 2 * sum(len(FILES[name]) for name in REMOVED_FILES)
+        assert found.size_bytes == 2 * sum(len(FILES[name]) for name in FILES if is_large(name))
         removal.remove()
         assert removal.removable().visits == 0
         assert removal.undoable()[0] == 2

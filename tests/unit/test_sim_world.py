@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 from scipy.signal import convolve2d
 
 from device.clock import VirtualClock
@@ -13,6 +14,7 @@ from device.config.scene import EyeSpec, ObjectSpec
 from device.errors import CameraMissing, CameraStalled, LightFault, SettingError, SpecError
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
+from device.sim.objects import moved_behind_field
 from device.sim.render import convolved, crop_or_pad
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
@@ -240,3 +242,37 @@ def test_frames_are_marked_as_simulated_and_repeat_with_the_seed():
             frames.append(SimCamera(world).expose(ExposureSettings(0.1)))
     assert all(frame.simulated for frame in frames)
     assert np.array_equal(frames[0].counts, frames[1].counts)
+
+
+def lit_frames(drift_deg_per_s, count=5):
+    """Return the noise-free electrons of lit frames of one eye that drifts."""
+    moving = World(small_head(eye=EyeSpec(drift_deg_per_s=drift_deg_per_s)), VirtualClock())
+    camera = SimCamera(moving)
+    moving.present_eye("OD")
+    moving.illumination = Illumination("green")
+    frames = []
+    for _ in range(count):
+        frames.append(moving.electrons(0.1))
+        camera.expose(ExposureSettings(0.1))
+    return moving, frames
+
+
+def test_a_drifting_retina_moves_from_frame_to_frame_behind_a_field_that_stands_still():
+    moving, frames = lit_frames(20.0)
+    step_px = 2.0 * moving.geometry.px_per_deg
+    assert moving.eyes.drift_px == pytest.approx(step_px)
+    assert np.array_equal(frames[0], frames[4]), "after four frames the eye is back"
+    first, second = (frame - frame.mean() for frame in frames[:2])
+    assert np.corrcoef(first.ravel(), second.ravel())[0, 1] > 0.9, "most of the light is the field, which stands still"
+    retina, field = moving.retina.reflectance["green"], moving.retina.field
+    moved = moved_behind_field(moving.retina, (0.0, step_px), moving.geometry.px_per_deg * moving.scene.half_field_deg)
+    inner = ndimage.binary_erosion(field, iterations=round(step_px) + 3)
+    expected = ndimage.shift(retina, (0.0, step_px), order=3)
+    assert np.abs(moved.reflectance["green"] - expected)[inner].max() < 0.01
+    assert not moved.reflectance["green"][~ndimage.binary_dilation(field, iterations=2)].any()
+
+
+def test_a_still_eye_gives_equal_frames():
+    moving, frames = lit_frames(0.05)
+    assert moving.eyes.drift_px == 0
+    assert all(np.array_equal(frames[0], frame) for frame in frames)

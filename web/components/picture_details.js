@@ -10,10 +10,13 @@ const close = () => dialog()?.close();
 
 export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
   const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
+  const frames = report.frames ?? [];
+  const used = frames.filter((one) => one.used).length;
   const rows = [
     ["method", report.method],
     ["rounds", report.rounds],
     ["stopped", report.stopped],
+    ...(frames.length ? [["frames", t("detail.frames.value", { used, all: frames.length })]] : []),
     ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
     ["calibration", calibration],
     ["id", id],

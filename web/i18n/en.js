@@ -177,6 +177,8 @@ export const ENGLISH = {
   "result.details.warn": "Details: with a warning",
   "detail.method": "Method",
   "detail.rounds": "Rounds",
+  "detail.frames": "Frames",
+  "detail.frames.value": "{used} of {all} joined",
   "detail.stopped": "Stopped because",
   "detail.seconds": "Time to make",
   "detail.seconds.value": "{s} s",

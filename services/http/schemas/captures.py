@@ -82,6 +82,19 @@ class LateralityAnswer(StoredPart):
     disc: tuple[Number, Number] | None
 
 
+class FrameAnswer(StoredPart):
+    """What became of one frame of the burst: whether it is used, its shift (rows, cols; pixels), weight, and reason.
+
+    File `raw.tiff` is the frame 0, `raw-1.tiff` the frame 1.
+    """
+
+    index: int
+    used: bool
+    shift_px: tuple[Number, Number] | None
+    weight: Number
+    reason: str | None
+
+
 class EyeCorrectionAnswer(StoredPart):
     """Move of a capture to the other eye: the eye and slot before, the eye after, time (ISO 8601), and screen."""
 
@@ -104,8 +117,9 @@ class ReportAnswer(StoredPart):
     """Report of a capture, with the keys of `report.json`: reconstruction, light, visit, verdict, laterality.
 
     `seconds`: durations by stage; `budget_s`: time budget. `dose_j_per_cm2`: dose of this exposure;
-    `dose_24h_j_per_cm2`: dose of each eye in 24 h; `dose_high`: eyes above the warning. `moved`: corrections of the
-    eye, `confirmed`: its confirmation; both only where they exist.
+    `dose_24h_j_per_cm2`: dose of each eye in 24 h; `dose_high`: eyes above the warning; `limits_unchecked`: light
+    limits that were not compared with the purchased standard. `frames`: one entry per frame of the burst. `moved`:
+    corrections of the eye, `confirmed`: its confirmation; both only where they exist.
     """
 
     method: str
@@ -121,10 +135,12 @@ class ReportAnswer(StoredPart):
     residual: Number | None
     quality: dict[str, JsonValue]
     warnings: list[str]
+    frames: OmittedIfNone[list[FrameAnswer]] = None
     dose_j_per_cm2: Number | None
     dose_24h_j_per_cm2: dict[str, Number]
     dose_stop_j_per_cm2: Number | None
     dose_high: list[str]
+    limits_unchecked: OmittedIfNone[list[str]] = None
     visit: str | None
     slot: str | None
     test: bool
@@ -182,6 +198,8 @@ def report_answer(report: CaptureReport) -> ReportAnswer:
     entries = {
         **vars(report.reconstruction), **vars(report.light), "visit": report.visit, "slot": report.slot,
         "test": report.is_test, "budget_s": report.budget_s, "verdict": verdict_answer(report.verdict),
+        "limits_unchecked": list(report.light.limits_unchecked) or None,
+        "frames": [FrameAnswer.model_validate(vars(one)) for one in report.reconstruction.frames] or None,
         "laterality": _stored(LateralityAnswer, report.laterality) if report.laterality else None,
         "moved": [_stored(EyeCorrectionAnswer, one) for one in report.moved] or None,
         "confirmed": _stored(EyeConfirmationAnswer, report.confirmed) if report.confirmed else None,

@@ -1,0 +1,97 @@
+"""Reconstruction of a burst of the instrument: quick look, joined frame, deadline, and a burst of one good frame."""
+
+import numpy as np
+import pytest
+
+from device.clock import Deadline, SystemClock
+from device.errors import FrameError
+from device.recon.burst_reconstructor import NO_TIME, BurstReconstructor
+from device.recon.model.fft_plans import Planner
+from device.recon.reconstructor import Reconstructor, RoundDone, StageResult
+from device.values import Image, Reconstruction
+from tests.moving_retina import (
+    DRIFT_PX,
+    OTHER_RETINA,
+    RETINA,
+    SHAPE,
+    burst_calibration,
+    frame,
+    seen,
+)
+from tests.unit.test_burst import psnr_db
+
+PLANNER = Planner(folder=None, effort="FFTW_ESTIMATE")
+COUNT = 4
+
+
+@pytest.fixture(scope="module")
+def bursts() -> BurstReconstructor:
+    return BurstReconstructor(Reconstructor(burst_calibration(), SHAPE, PLANNER, SystemClock()), PLANNER)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[np.ndarray]:
+    return [frame(seen(RETINA, moved), 2000, k) for k, moved in enumerate(DRIFT_PX[:COUNT])]
+
+
+def picture(bursts: BurstReconstructor, frames: list[np.ndarray], deadline: Deadline | None = None) -> Reconstruction:
+    *_, made = bursts.steps(frames, simulated=True, deadline=deadline)
+    assert isinstance(made, Reconstruction)
+    return made
+
+
+def truth() -> Image:
+    return seen(RETINA, (0.0, 0.0))
+
+
+def test_a_burst_gives_one_quick_look_pauses_and_one_better_picture(bursts: BurstReconstructor, frames: list) -> None:
+    steps = list(bursts.steps(frames, simulated=True))
+    looks = [step for step in steps if isinstance(step, StageResult)]
+    assert isinstance(steps[0], StageResult)
+    assert [look.last for look in looks] == [False, True]
+    assert sum(isinstance(step, RoundDone) for step in steps) >= COUNT
+    one, made = picture(bursts, frames[:1]), steps[-1]
+    assert isinstance(made, Reconstruction)
+    assert made.simulated
+    assert psnr_db(made.picture, truth()) > psnr_db(one.picture, truth()) + 0.7  # two of three decibels of a still eye
+    assert [use.used for use in made.report.frames] == [True] * COUNT
+    assert made.report.seconds["join"] > 0
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_fewer_frames_than_planned_have_the_noise_of_fewer(
+    bursts: BurstReconstructor, frames: list, count: int
+) -> None:
+    made = picture(bursts, frames[:count])
+    assert made.report.residual == pytest.approx(1, abs=0.25)  # what is left is noise of the assumed size
+    assert psnr_db(made.picture, truth()) > psnr_db(picture(bursts, frames[:1]).picture, truth()) + 0.3
+
+
+def test_a_burst_of_one_good_frame_is_that_frame(bursts: BurstReconstructor, frames: list) -> None:
+    others = [frame(seen(OTHER_RETINA, (0.0, 0.0)), 2000, 7), np.full(SHAPE, 64, np.uint16)]
+    made = picture(bursts, [frames[0], *others])
+    assert [use.used for use in made.report.frames] == [True, False, False]
+    assert all(use.reason for use in made.report.frames[1:])
+    assert np.array_equal(made.picture, picture(bursts, frames[:1]).picture)
+
+
+def test_a_deadline_without_time_to_join_gives_the_first_frame(bursts: BurstReconstructor, frames: list) -> None:
+    made = picture(bursts, frames, Deadline.after(SystemClock(), 0.001))
+    assert [(use.used, use.reason) for use in made.report.frames] == [(True, None), *[(False, NO_TIME)] * 3]
+    assert made.report.stopped == "deadline"
+    later = picture(bursts, frames, Deadline.after(SystemClock(), 60))
+    assert all(use.used for use in later.report.frames)
+
+
+def test_a_quick_look_between_two_steps_does_not_change_the_picture(bursts: BurstReconstructor, frames: list) -> None:
+    alone = picture(bursts, frames)
+    for step in bursts.steps(frames, simulated=True):
+        if isinstance(step, RoundDone):
+            bursts.single(frame(seen(OTHER_RETINA, (0.0, 0.0)), 2000, 8), quick=True)
+    assert isinstance(step, Reconstruction)
+    assert np.array_equal(step.picture, alone.picture)
+
+
+def test_a_frame_of_another_shape_is_refused(bursts: BurstReconstructor, frames: list) -> None:
+    with pytest.raises(FrameError, match="pixels"):
+        picture(bursts, [frames[0][::2], frames[1]])
