@@ -233,14 +233,15 @@ class Reconstructor:
         that of the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
-        run = _Run(self, counts, dark, deadline, rounds, joined)
+        run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick:
                 self._estimate_refraction(run)
             if not run.has_time_for(stage):
                 break
-            yield from run.solve(stage, pauses=stage is self.stages[-1] and len(self.stages) > 1)
+            pauses = stage is self.stages[-1] and len(self.stages) > 1
+            yield from run.solve(stage, pauses, None if stage is self.stages[0] else joined)
             yield StageResult(stage.recipe, stage.shown, last=stage is self.stages[-1])
         solved_s = self.clock.now_s()
         picture = to_sensor(run.done.picture, run.done.grid)
@@ -326,14 +327,12 @@ class _Run:
     """State of the reconstruction of one frame."""
 
     def __init__(
-        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None,
-        joined: Image | None,
-    ) -> None:  # fmt: skip
+        self, owner: Reconstructor, counts: Pixels, dark: Pixels | None, deadline: Deadline | None, most: int | None
+    ) -> None:
         self.clock, self.counts, self.dark = owner.clock, counts, dark
         self._defects = owner.defects
         self._found: dict[int, Places | None] = {}
         self.deadline, self.most = deadline, most
-        self._joined, self._first = joined, owner.stages[0]
         self.channels = 1 if counts.ndim == 2 else counts.shape[2]
         self.done: _Stage = owner.stages[0]
         self.solved: _Solved | None = None  # None before the first stage
@@ -380,22 +379,22 @@ class _Run:
             return False
         return True
 
-    def solve(self, stage: _Stage, pauses: bool) -> Iterator[RoundDone]:
-        """Solve one stage, channel by channel; with `pauses` yield ROUND_DONE after each round."""
+    def solve(self, stage: _Stage, pauses: bool, joined: Image | None) -> Iterator[RoundDone]:
+        """Solve one stage, channel by channel; with `pauses` yield ROUND_DONE after each round.
+
+        With `joined` this linear frame is solved instead of the counts.
+        """
         if len(stage.planes) != self.channels:
             stage.planes = np.zeros((self.channels, *stage.grid.shape), np.float32)
         for c in range(self.channels):
-            yield from self._channel(stage, c, pauses)
+            yield from self._channel(stage, c, pauses, joined)
         self.done = stage
         self.psf_scale = stage.scale
 
-    def _channel(self, stage: _Stage, c: int, pauses: bool) -> Iterator[RoundDone]:
+    def _channel(self, stage: _Stage, c: int, pauses: bool, joined: Image | None) -> Iterator[RoundDone]:
         """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""
         begin_s = self.clock.now_s()
-        if self._joined is None or stage is self._first:
-            frame = stage.preparer(*self.channel(c))
-        else:
-            frame = stage.joined_preparer(plane(self._joined, c))
+        frame = stage.preparer(*self.channel(c)) if joined is None else stage.joined_preparer(plane(joined, c))
         stage.solver.start(frame)
         now_s = self.clock.now_s()
         stage.start_cost.add(now_s - begin_s)
