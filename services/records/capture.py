@@ -80,7 +80,7 @@ class CaptureReport:
     unchanged. A field that is missing in the report of an earlier release has its default.
     """
 
-    reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD))
+    reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD, frames=()))
     light: DoseReport = field(default_factory=DoseReport)
     visit: str | None = None
     slot: str | None = None
