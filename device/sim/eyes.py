@@ -15,6 +15,7 @@ from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
+FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 
 
@@ -62,9 +63,10 @@ class RenderedEyes:
     def drift_px(self) -> float:
         """Movement of the retina to the right from one frame of a burst to the next, in pixels; 0 if it is too small.
 
-        The eye drifts by `drift_deg_per_s` for the time of one exposure.
+        The eye drifts by `drift_deg_per_s` for the time of one exposure, up to FASTEST_DRIFT_DEG_PER_S.
         """
-        step_deg = self.scene.sim.eye.drift_deg_per_s * self.scene.spec.camera.exposure_s
+        speed = self.scene.sim.eye.drift_deg_per_s
+        step_deg = (speed if speed <= FASTEST_DRIFT_DEG_PER_S else 0.0) * self.scene.spec.camera.exposure_s
         step_px = step_deg * self.scene.geometry.px_per_deg
         return step_px if STEPS * step_px >= LEAST_DRIFT_PX else 0.0
 
