@@ -38,7 +38,7 @@ PAGE_WORKERS := -n 4 --dist loadfile
 
 # The page's tests come first: they take longest of all files, and wait while the others compute.
 test: .venv/ready browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
-	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/archive tests/browser tests/ports tests/parts tests/golden $(FAULTS))
+	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
 test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
