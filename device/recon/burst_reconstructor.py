@@ -64,7 +64,7 @@ class BurstReconstructor:
         assert first is not None
         if not run.fits(len(frames) * self.join_cost.seconds):
             self.join_cost.halve_maximum()
-            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, NO_TIME) for k in range(len(frames))]
+            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0) for k in range(len(frames))]
             yield from run.solve_one(frames[0], dark, uses, 0, simulated)
             return
         yield from run.join(frames, dark, unusable)
@@ -112,28 +112,39 @@ class _Run:
         """Yield the steps of the picture of the joined frame; `counts` and `first`: first frame and its quick look."""
         owner, joined = self._owner, self.joined
         assert joined is not None
-        total = joined.counts * np.float32(joined.light)
+        total, is_solved = joined.counts * np.float32(joined.light), False
         for step in owner.single.steps(counts, dark, simulated=simulated, deadline=self._deadline, joined=total):
-            if isinstance(step, Reconstruction):
+            if isinstance(step, RoundDone):
+                yield step
+            elif isinstance(step, Reconstruction) and is_solved:
                 quality = step.report.quality | {"saturated": first.report.quality["saturated"]}
                 yield self._reported(replace(step, report=replace(step.report, quality=quality)), joined.frames)
-            elif isinstance(step, RoundDone) or step.last:  # the quick look was that of the first frame
+            elif isinstance(step, Reconstruction):  # no time for the last stage: this is the picture of one frame
+                yield self._reported(step, only(next(one.index for one in joined.frames if one.used), joined.frames))
+            elif step.last:  # the quick look was that of the first frame
+                is_solved = True
                 yield step
 
     def solve_one(
         self, counts: Pixels, dark: Pixels | None, uses: Sequence[FrameUse], index: int, simulated: bool
     ) -> Iterator[Step]:
         """Yield the steps of the picture of one frame, the one with this index; `uses` says why no other is used."""
-        frames = tuple(
-            FrameUse(one.index, True, (0.0, 0.0), 1.0) if one.index == index else replace(one, used=False, weight=0.0)
-            for one in uses
-        )
         for step in self._owner.single.steps(counts, dark, simulated=simulated, deadline=self._deadline):
             if isinstance(step, Reconstruction):
-                yield self._reported(step, frames)
+                yield self._reported(step, only(index, uses))
             elif isinstance(step, RoundDone) or step.last:
                 yield step
 
     def _reported(self, made: Reconstruction, frames: tuple[FrameUse, ...]) -> Reconstruction:
         seconds = {"join": self._join_s} | made.report.seconds
         return replace(made, report=replace(made.report, seconds=seconds, frames=frames))
+
+
+def only(index: int, uses: Sequence[FrameUse]) -> tuple[FrameUse, ...]:
+    """Return the use of the frames of a picture of one of them; a frame without another reason is left for the time."""
+    return tuple(
+        FrameUse(one.index, True, (0.0, 0.0), 1.0)
+        if one.index == index
+        else replace(one, used=False, weight=0.0, reason=one.reason or NO_TIME)
+        for one in uses
+    )

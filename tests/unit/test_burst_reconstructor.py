@@ -83,6 +83,27 @@ def test_a_deadline_without_time_to_join_gives_the_first_frame(bursts: BurstReco
     assert all(use.used for use in later.report.frames)
 
 
+class TimeToJoinOnly(Deadline):
+    """Deadline that leaves time for what is asked for first, the joining, and for nothing after it."""
+
+    asked = 0
+
+    def fits(self, cost_s: float) -> bool:
+        type(self).asked += 1
+        return type(self).asked == 1
+
+    def later(self, delay_s: float) -> "TimeToJoinOnly":
+        return self
+
+
+def test_a_deadline_after_the_joining_gives_one_frame_and_the_report_says_so(
+    bursts: BurstReconstructor, frames: list
+) -> None:
+    made = picture(bursts, frames, TimeToJoinOnly(SystemClock(), 0.0))
+    assert [(use.used, use.reason) for use in made.report.frames] == [(True, None), *[(False, NO_TIME)] * 3]
+    assert made.report.stopped == "deadline"
+
+
 def test_a_quick_look_between_two_steps_does_not_change_the_picture(bursts: BurstReconstructor, frames: list) -> None:
     alone = picture(bursts, frames)
     for step in bursts.steps(frames, simulated=True):
