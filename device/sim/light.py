@@ -64,6 +64,7 @@ class SimLight:
         """Turn the lamp on; LightFault while "light.fault" or "light.silent" is active."""
         self.check()
         self._refuse_if_silent()
+        self._world.lit_frames = 0
         self._world.illumination = glow
 
     def check(self) -> None:
@@ -90,6 +91,7 @@ class MirroredLight:
 
         def turn_on() -> None:
             lit.__enter__()
+            self._world.lit_frames = 0
             self._world.illumination = self._lamp.illumination
 
         return LampContext(turn_on, self.off)

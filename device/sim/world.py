@@ -56,7 +56,7 @@ class World:
         self.shake_px = 0
         self.faults: set[str] = set()
         self.frames = 0
-        self.lit_frames = 0  # since the eye was presented
+        self.lit_frames = 0  # since the lamp was turned on
         self.temperature_c, self.battery_state = REFERENCE_C, BatteryState(0.775, 3.88)
         self.identity: HeadIdentity | None = None
         self.pressed_since_s: float | None = None
@@ -73,9 +73,8 @@ class World:
         """Present an eye to the head, with the fault "eye.other" the fellow eye; a calibration target stays in place.
 
         The light of this eye is computed now for the picture's and the aiming colour, not later while the lamp is lit:
-        with drift for each step of a burst. The drift begins at its start.
+        with drift for each step of a burst.
         """
-        self.lit_frames = 0
         self.eye = FELLOW_EYE[eye] if self.has_fault("eye.other") else eye
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
