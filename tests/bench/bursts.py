@@ -152,7 +152,7 @@ def displaced(folder: Path, names: Sequence[str] = SIX) -> None:
 def _smeared(plane: Image, psf: Image) -> Counts:
     """Return a frame during a saccade of 30 px: the mean of seven places."""
     lights = [exposed(retina(plane, PAPER, (0.0, 5.0 * step)), psf) for step in range(7)]
-    light = np.mean(lights, axis=0, dtype=np.float32)
+    light = np.asarray(np.mean(lights, axis=0), np.float32)
     return counted(light * np.float32(PEAK_E / light.max()), PAPER, 4)
 
 
