@@ -20,6 +20,7 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> s
     seconds += [one.seconds for one in found.peers]
     worths += [one.psnr_db for one in found.peers]
     y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
+    words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
     plot = Plot(
         title=f"What accuracy costs in time{' and light' if found.light else ''}: {found.scene}",
         subtitle=_subtitle(found),
@@ -27,7 +28,9 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> s
         x=time_axis(seconds, "from counts in memory to the picture on the sensor grid, refraction apart"),
         y=y,
         series=tuple(
-            _series(points, method) for method in methods.values() if any(p.method == method.name for p in points)
+            _series(points, method, words)
+            for method in methods.values()
+            if any(p.method == method.name for p in points)
         )
         + _peers(found)
         + _light(found),
@@ -66,8 +69,8 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
     )
 
 
-def _series(points: Sequence[Point], method: Method) -> Series:
-    """Return the marks of one method.
+def _series(points: Sequence[Point], method: Method, words: str) -> Series:
+    """Return the marks of one method; `words` follow the name of an iterative one.
 
     A closed-form method has one trail over the bins; an iterative one has a trail over the rounds of each bin.
     """
@@ -79,7 +82,7 @@ def _series(points: Sequence[Point], method: Method) -> Series:
         rounds = [p for p in own if p.bin == n]
         labels = [f"bin {n}", *(str(p.rounds) if p.pareto else "" for p in rounds[1:])]
         trails.append(tuple(_mark(p, method, label) for p, label in zip(rounds, labels, strict=True)))
-    return Series(method.name, tuple(trails))
+    return Series(f"{method.name}{words}", tuple(trails))
 
 
 def _peers(found: Frontier) -> tuple[Series, ...]:
