@@ -32,6 +32,11 @@ $(UV):
 	@$(INSTALL_THIS) $(BIN)/python -e .
 	@touch $@
 
+# Numba keeps compiled kernels beside the sources; three parallel test processes would compile each of them three times.
+.venv/kernels: device/recon/model/kernels.py device/recon/model/fused_kernels.py .venv/ready
+	@$(BIN)/python -m tests.compile_kernels
+	@touch $@
+
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
 
@@ -46,11 +51,11 @@ WORKERS := -n 3 --dist loadfile
 PAGE_WORKERS := -n 4 --dist loadfile
 
 # The page's tests come first: they take longest of all files, and wait while the others compute.
-test: .venv/ready browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
+test: .venv/kernels browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
 	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
-test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
+test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
 	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
