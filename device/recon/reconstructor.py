@@ -220,7 +220,7 @@ class Reconstructor:
 
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
-        rounds: int | None = None, quick: bool = False, joined: Image | None = None,
+        rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -229,14 +229,15 @@ class Reconstructor:
         only one. `rounds` limits the rounds of every stage. With several stages a ROUND_DONE follows each round of the
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
-        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. FrameError for another shape than
-        that of the sensor, or if too many pixels are missing (`Preprocessor`).
+        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
+        use the PSF of the picture before. FrameError for another shape than that of the sensor, or if too many pixels
+        are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
-            if stage is self._refracted[0] and not quick:
+            if stage is self._refracted[0] and not quick and refract:
                 self._estimate_refraction(run)
             if not run.has_time_for(stage):
                 break

@@ -56,6 +56,7 @@ def collect_status(
         backup_at=backup_at,
         unsaved_since=unsaved_since,
         unchecked_limits=light_limits().unchecked,
+        takes_blue_light="blue" in people.protocol.colours,
     )
 
 

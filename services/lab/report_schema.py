@@ -20,6 +20,7 @@ FILE = Path(__file__).parent / "site" / "report.schema.json"
 SECONDS: Mapping[str, str] = {
     "expose": "Lit and dark exposure; captures only.",
     "join": "Picture of each raw of a burst, their registration, and the joined frame; bursts only.",
+    "colour": "Pictures in the other colours of light, their registration, and the colour picture; captures only.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
@@ -58,6 +59,7 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
+LATER = ("frames", "channels")  # fields of `Report` that earlier releases did not write
 FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
@@ -68,6 +70,18 @@ FRAME: Mapping[str, JsonValue] = {
     },
     "weight": {"type": "number", "description": "Share of the frame in the joined frame, 0 to 1."},
     "reason": {"type": ["string", "null"], "description": "Reason why the frame is not used; null if it is."},
+}  # fmt: skip
+CHANNEL: Mapping[str, JsonValue] = {
+    "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
+    "shift_px": {
+        "type": ["array", "null"], "items": {"type": "number"}, "minItems": 2, "maxItems": 2,
+        "description": "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at "
+        "(r, c) plus this in this channel, in pixels of the raw. Null for a predicted or a missing channel.",
+    },
+    "predicted": {"type": "boolean", "description": "True if the channel was computed from the others, not measured."},
+    "reason": {
+        "type": ["string", "null"], "description": "Why the picture has not this colour; null for one that it has.",
+    },
 }  # fmt: skip
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",
@@ -124,19 +138,6 @@ FILES: Mapping[str, JsonValue] = {
     ),
     "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
     "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
-    "channels": _typed(
-        "array", "Colours of light of a colour picture, in the order in which they were given; empty for a grey one.",
-        items={"type": "object", "properties": {
-            "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
-            "shift_px": _typed(
-                ["array", "null"],
-                "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at (r, c) plus "
-                "this in this channel, in pixels of the raw. Null for a predicted channel.",
-                items={"type": "number"}, minItems=2, maxItems=2,
-            ),
-            "predicted": _typed("boolean", "True if the channel was computed from the others, not measured."),
-        }},
-    ),
 }  # fmt: skip
 CAPTURE: Mapping[str, JsonValue] = {
     "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
@@ -208,6 +209,7 @@ def report_schema() -> dict[str, JsonValue]:
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
         "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},
+        "channels": {"type": "array", "items": {"type": "object", "properties": dict(CHANNEL)}},
     }
     for name, entries in nested.items():
         properties[name] = {"description": properties[name]["description"], **entries}
@@ -216,12 +218,12 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels, bayer and channels, and the instrument the others. "
+            "given, psf_channels and bayer, the instrument the instrument the others; both write frames and channels. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",
         "properties": {**properties, **FILES, **CAPTURE},
-        "required": [one.name for one in fields(Report) if one.name != "frames"],  # earlier releases had none
+        "required": [one.name for one in fields(Report) if one.name not in LATER],
     }
 
 

@@ -96,3 +96,13 @@ def test_missing_parts_of_a_head_are_no_failure() -> None:
 def test_an_update_is_judged_by_checks_of_the_release_only() -> None:
     names = {check.name for check in run_checks(HEALTHY) if check.of_release}
     assert names == {"camera", "lamp", "calibration", "captures"}
+
+
+def test_blue_light_is_named_with_its_hazard() -> None:
+    """Only if the programme lists it."""
+    plain, blue = (
+        next(check for check in run_checks(replace(HEALTHY, takes_blue_light=on)) if check.name == "light_limits")
+        for on in (False, True)
+    )
+    assert "blue" not in plain.value
+    assert "45 times the hazard of green" in blue.value
