@@ -136,10 +136,10 @@ class CapturePipeline:
         self.reconstructor, self.live, self.bursts = reconstructor, live, bursts
         self._head, self._clock, self._feedback = head, clock, feedback
 
-    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1) -> Exposure:
+    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1, field: str | None = None) -> Exposure:
         """Return up to `count` lit frames and a dark one of an eye, as the function `expose`, with its errors."""
         begin_s, count = self._clock.now_s(), count if self.bursts is not None else 1
-        lit, dark = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count)
+        lit, dark = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, field=field)
         return Exposure(lit, dark, begin_s, self._clock.now_s() - begin_s)
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
@@ -238,18 +238,20 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 
 def expose(
-    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1
-) -> tuple[tuple[Frame, ...], Frame]:
+    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
+    field: str | None = None,
+) -> tuple[tuple[Frame, ...], Frame]:  # fmt: skip
     """Return up to `count` lit frames and a dark one; the dose counts for `eyes`, without a visit up to a lower limit.
 
-    There are fewer lit frames if the guard permits no light for so long.
+    There are fewer lit frames if the guard permits no light for so long. `field`: field of view of the programme, to
+    which a simulated eye turns.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
     """
     head.check()
     shot = ExposureSettings(head.spec.camera.exposure_s)
-    announce_eye(head, eyes)
+    announce_eye(head, eyes, field)
     head.camera.prepare(shot)
     try:
         glow = Illumination(head.spec.light.colour)
@@ -278,10 +280,13 @@ def expose_live(
     return frame, exposed_s, clock.now_s()
 
 
-def announce_eye(head: Head, eyes: tuple[Eye, ...]) -> None:
-    """Announce the eye of the next exposure to a simulated head while the lamp is off, if `eyes` has exactly one."""
+def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) -> None:
+    """Announce eye and field of view of the next exposure to a simulated head, if `eyes` has exactly one eye.
+
+    The lamp is off.
+    """
     if len(eyes) == 1:
-        head.present_eye(eyes[0])
+        head.present_eye(eyes[0], field)
 
 
 def crop_to_field(image: Image, head: Head) -> Image:

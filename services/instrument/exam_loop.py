@@ -116,7 +116,9 @@ class ExamLoop:
         self._parts.capture_journal.begin(press.journal_entry(id), press.key)
         self._events.stage(press, id, "expose")
         target = press.target
-        exposure = self._pipeline.expose(press.eye, in_visit=target.visit is not None, count=target.frames)
+        exposure = self._pipeline.expose(
+            press.eye, in_visit=target.visit is not None, count=target.frames, field=target.field
+        )
         exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
         light = self._parts.head.light.dose_report()
