@@ -173,12 +173,15 @@ class CapturePipeline:
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
         self._head, self._clock, self._feedback = head, clock, feedback
 
-    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = ()) -> Exposure:
+    def expose(
+        self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
+        field: str | None = None,
+    ) -> Exposure:  # fmt: skip
         """Return up to `count` lit frames, one in each of `colours`, and a dark one, as the function `expose`."""
         count = count if self.bursts is not None else 1
         able = () if self.colours is None else self.colours.others
         taken = [colour for colour in colours if colour in able]
-        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken)
+        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken, field=field)
         unable = {colour: NO_PSF for colour in colours if self.colours is not None and colour not in able}
         return replace(exposure, missing={**unable, **exposure.missing})
 
@@ -299,19 +302,20 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (),
+    colours: Sequence[Colour] = (), field: str | None = None,
 ) -> Exposure:  # fmt: skip
     """Return up to `count` lit frames, one in each of `colours`, and a dark one.
 
     The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
-    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept.
+    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`: field
+    of view of the programme, to which a simulated eye turns.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
     """
     head.check()
     begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)
-    announce_eye(head, eyes)
+    announce_eye(head, eyes, field)
     head.camera.prepare(shot)
     taken: dict[Colour, Frame] = {}
     missing: dict[Colour, str] = {}
@@ -352,10 +356,13 @@ def expose_live(
     return frame, exposed_s, clock.now_s()
 
 
-def announce_eye(head: Head, eyes: tuple[Eye, ...]) -> None:
-    """Announce the eye of the next exposure to a simulated head while the lamp is off, if `eyes` has exactly one."""
+def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) -> None:
+    """Announce eye and field of view of the next exposure to a simulated head, if `eyes` has exactly one eye.
+
+    The lamp is off.
+    """
     if len(eyes) == 1:
-        head.present_eye(eyes[0])
+        head.present_eye(eyes[0], field)
 
 
 def crop_to_field(image: Image, head: Head) -> Image:
