@@ -46,6 +46,7 @@ from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_pa
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
+from services.records.device_identity import DeviceIdentity, load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol
 from services.records.read_only_store import opened_store
@@ -110,6 +111,7 @@ def serve(
     clock = SystemClock()
     with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
         data = store.folder  # of a read-only store: its copy in memory
+        device = _device_of(store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "diary")))
@@ -128,12 +130,18 @@ def serve(
             backup_routes(backups, store, UsbDrives(), clock),
         ]
         names = own_host_names() + host_names
-        app = create_app(arbiter, authenticator, protocol, names, technician_routers=routers, uploader=uploader)
+        own = protocol if device is None else protocol.for_device(device.prefix)
+        app = create_app(arbiter, authenticator, own, names, technician_routers=routers, uploader=uploader)
         _log_start(app.http.version, store)
         ready()
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _device_of(store: CaptureStore) -> DeviceIdentity | None:
+    """Return the identity of this device; None on a disk that is read-only and has none: it takes no pictures."""
+    return load_or_create_device(store.folder) if store.refusal is None else read_device(store.folder)
 
 
 def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server":

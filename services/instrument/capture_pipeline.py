@@ -5,7 +5,7 @@ between two steps. One thread, the one that owns the head, calls it.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -30,7 +30,7 @@ from device.values import EYES, Calibration, ExposureSettings, Eye, Frame, Illum
 from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.records.capture import NO_METHOD, Capture
+from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import CaptureTarget
 
 log = logging.getLogger(__name__)
@@ -126,15 +126,16 @@ class CapturePipeline:
     """Steps of the captures and live pictures of one head.
 
     `reconstructor` makes the pictures of captures of one frame, `bursts` those of several (None: a press takes one
-    frame), `live` those of live pictures, whose colour may have another PSF.
+    frame), `live` those of live pictures, whose colour may have another PSF. `origin` returns the origin of a capture.
     """
 
     def __init__(
         self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
         feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
+        origin: Callable[[], RecordOrigin | None] = lambda: None,
     ) -> None:  # fmt: skip
         self.reconstructor, self.live, self.bursts = reconstructor, live, bursts
-        self._head, self._clock, self._feedback = head, clock, feedback
+        self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
 
     def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1) -> Exposure:
         """Return up to `count` lit frames and a dark one of an eye, as the function `expose`, with its errors."""
@@ -191,7 +192,7 @@ class CapturePipeline:
         """Return the record of a capture with its report, laterality estimate and shown picture."""
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = capture_report(shot, made.report, verdict, side, budget_s)
+        report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
         id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
         return CaptureRecord(capture, shot.frames, shot.dark, shown, self._head.spec.name)
@@ -208,8 +209,12 @@ class CapturePipeline:
         return jpeg, self._feedback.aim(counts, seen.exposed_s)
 
 
-def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
+def plan_pipeline(
+    head: Head, clock: Clock, plans: Path, origin: Callable[[], RecordOrigin | None] = lambda: None
+) -> CapturePipeline:
     """Return the pipeline of a head after all planning; `plans` is the folder of the FFT plans.
+
+    `origin` returns the origin of a capture, None if its device has no identity.
 
     With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose` then.
     """
@@ -223,7 +228,7 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
     feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
     is_recording = head.spec.camera.backend == "replay"  # whose next raw may show something else
     bursts = None if is_recording else BurstReconstructor(reconstructor, planner)
-    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, origin)
 
 
 def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Planner) -> int:
