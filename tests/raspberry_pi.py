@@ -24,7 +24,7 @@ KERNEL_LACKS = ("SQUASHFS_LZ4", "I2C_STUB")
 MODULES = {"I2C_CHARDEV": "i2c-dev", "SPI_SPIDEV": "spidev"}
 
 # raspberrypi/libcamera v0.7.1+rpt20260429 (26bfadc66e8d7f727a993fe58174217b8a96f7f9), src/ipa/rpi/pisp/data/NAME.json,
-# rpi.black_level, on a scale of 16 bits. A sensor without an entry has no camera helper there (src/ipa/rpi/cam_helper).
+# rpi.black_level, on a scale of 16 bits. A sensor without an entry is not in src/ipa/rpi/cam_helper there.
 BLACK_LEVELS = {
     "imx219": 4096, "imx283": 3200, "imx296": 3840, "imx477": 4096, "imx500": 4096, "imx519": 4096, "imx708": 4096,
     "ov9281": 4096,

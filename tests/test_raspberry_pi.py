@@ -96,7 +96,7 @@ def test_presets_have_the_black_level_of_libcamera() -> None:
             assert sensor.black_dn == black_dn(level, sensor.bit_depth), name
 
 
-def test_presets_without_a_camera_helper_say_so() -> None:
+def test_presets_that_libcamera_does_not_know_say_so() -> None:
     for name in known_sensors().keys() - raspberry_pi.BLACK_LEVELS.keys() - {"quantalux"}:
         assert "through V4L2 only" in text(f"device/config/sensor_presets/{name}.toml")
 
