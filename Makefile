@@ -238,7 +238,7 @@ lock: | $(UV) ## Write requirements.lock anew, the part of it that a release nee
 	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra instrument --extra test --group lock pyproject.toml -o requirements.lock
 	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
-		--constraints requirements.lock --extra instrument pyproject.toml -o systemd/image/requirements.lock
+		--constraints requirements.lock --constraints $(PI_LOCK) --extra instrument --extra board pyproject.toml -o systemd/image/requirements.lock
 	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--constraints requirements.lock --extra instrument --extra archive --extra test --group lock \
 		--group archive-test pyproject.toml -o $(ARCHIVE_LOCK)

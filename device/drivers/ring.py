@@ -50,7 +50,7 @@ class Apa102Ring:
     def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
         try:
             import spidev
-        except ImportError as error:
+        except Exception as error:  # of another numpy's compiled part: ValueError
             raise LightFault(f"spidev cannot be used: {error}", "Install python3-spidev.") from error
         self._chain, self._guardian, self._lease_s = chain, guardian, lease_s
         self._leds, self._pulse = ring(chain), pulse

@@ -5,7 +5,7 @@ between two steps. One thread, the one that owns the head, calls it.
 """
 
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -42,7 +42,7 @@ from device.values import (
 from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.records.capture import NO_METHOD, Capture
+from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS, CaptureTarget
 
 log = logging.getLogger(__name__)
@@ -162,16 +162,16 @@ class CapturePipeline:
 
     `reconstructor` makes the pictures of captures of one frame, `bursts` those of several (None: a press takes one
     frame), `live` those of live pictures, whose colour may have another PSF. `colours` solves the other colours of
-    light (None: a press takes the picture's colour only).
+    light (None: a press takes the picture's colour only). `origin` returns the origin of a capture.
     """
 
     def __init__(
         self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
         feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
-        colours: ColoursReconstructor | None = None,
+        colours: ColoursReconstructor | None = None, origin: Callable[[], RecordOrigin | None] = lambda: None,
     ) -> None:  # fmt: skip
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
-        self._head, self._clock, self._feedback = head, clock, feedback
+        self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
 
     def expose(
         self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
@@ -239,7 +239,7 @@ class CapturePipeline:
         """Return the record of a capture with its report, laterality estimate and shown picture."""
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = capture_report(shot, made.report, verdict, side, budget_s)
+        report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
         id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
         colour = made.colour if isinstance(made, ColourReconstruction) else None
@@ -257,8 +257,12 @@ class CapturePipeline:
         return jpeg, self._feedback.aim(counts, seen.exposed_s)
 
 
-def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
+def plan_pipeline(
+    head: Head, clock: Clock, plans: Path, origin: Callable[[], RecordOrigin | None] = lambda: None
+) -> CapturePipeline:
     """Return the pipeline of a head after all planning; `plans` is the folder of the FFT plans.
+
+    `origin` returns the origin of a capture, None if its device has no identity.
 
     With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose` then.
     """
@@ -286,7 +290,7 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
     elif live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
         live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
     feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
-    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, colours)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, colours, origin)
 
 
 def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Planner) -> int:
@@ -307,8 +311,8 @@ def expose(
     """Return up to `count` lit frames, one in each of `colours`, and a dark one.
 
     The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
-    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`: field
-    of view of the programme, to which a simulated eye turns.
+    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
+    field of view of the programme, to which a simulated eye turns.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.

@@ -190,6 +190,21 @@ CAPTURE: Mapping[str, JsonValue] = {
     "confirmed": _typed(
         "object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY
     ),
+    "device": _typed(
+        "object", "Origin of the capture; captures of earlier releases have none.",
+        properties={
+            "uuid": _text("UUID of the device, made with its data folder."),
+            "serial": _text("Serial number of its board."),
+            "software": _text("Version of the software."),
+            "head": _text("Name of the head."),
+            "calibration_id": _text("Identifier of the calibration."),
+            "calibrated_at": _text("Date of the calibration, ISO 8601; null for a simulated one."),
+            "clock": _text(
+                "Source of the date: network, rtc (clock of the board), browser (of a tablet), or not_set: it may be "
+                "too early."
+            ),
+        },
+    ),
     "simulated": _typed("boolean", "True if the frame shows no real eye."),
 }  # fmt: skip
 
