@@ -286,11 +286,18 @@ def _numbers(value: object) -> dict[str, float]:
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
 
 
-def _refraction(value: object) -> dict[str, float]:
-    """Return the numbers of a refraction by name; ValueError if its `sphere` is neither a number nor null."""
+def _refraction(value: object) -> dict[str, float | str | None]:
+    """Return the numbers and nulls of a refraction by name, and the text of `refused`; entries of other types are
+    omitted. ValueError if its `sphere` is neither a number nor null.
+    """
     entries = _object(value)
     _checked(entries, "sphere", _number, None)
-    return {name: one for name, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    kept: dict[str, float | str | None] = {}
+    for name, one in entries.items():
+        is_number = isinstance(one, int | float) and not isinstance(one, bool)
+        if one is None or is_number or (name == "refused" and isinstance(one, str)):
+            kept[name] = one  # type: ignore[assignment]  # narrowed by the conditions
+    return kept
 
 
 def _texts(value: object) -> tuple[str, ...]:
