@@ -14,7 +14,7 @@ Counts = NDArray[np.uint16]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-Colour = Literal["red", "green", "blue"]
+Colour = Literal["red", "green", "blue", "amber"]
 ChannelName = Literal["red", "green", "blue", "amber"]  # colours of light in a colour picture
 Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")

@@ -3,9 +3,9 @@
 Without it, each of the parallel test processes of a fresh checkout compiles the same kernels, 20 s of processor time.
 """
 
+import diffuscope
 import numpy as np
 
-import diffuscope
 from device.recon.methods import METHODS
 from tests.scenes import speckle
 
