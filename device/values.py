@@ -14,7 +14,7 @@ Counts = NDArray[np.uint16]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-Colour = Literal["red", "green", "blue"]
+Colour = Literal["red", "green", "blue", "amber"]
 ChannelName = Literal["red", "green", "blue", "amber"]  # colours of light in a colour picture
 Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
@@ -287,8 +287,8 @@ class Report:
     psf_scale: float = 1.0
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
-    refraction_dpt: dict[str, float] | None = None
-    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null if it is not known."""
+    refraction_dpt: dict[str, float | str | None] | None = None
+    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null without a known geometry."""
 
     regularisation: dict[str, Any] = field(default_factory=dict)
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""

@@ -19,6 +19,7 @@ from services.health.thresholds import (
     MAX_UNSAVED_DAYS,
     MIN_VISITS_LEFT,
 )
+from services.records.capture import ClockState
 from services.records.recovery_report import RecoveryReport
 
 
@@ -50,8 +51,9 @@ class StatusSnapshot:
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
     restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
-    `unchecked_limits`: names of the light limits that were not compared with the purchased standard.
-    `takes_blue_light`: whether the programme lists blue among its colours.
+    `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
+    `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
+    settings of the card that were not taken at the last start.
     """
 
     state: str
@@ -67,7 +69,7 @@ class StatusSnapshot:
     warmest_c: float
     computer_c: float | None
     now: datetime
-    clock_was_set: bool
+    clock: ClockState
     newest: datetime | None
     presses: Sequence[tuple[float, float]]
     torn_bytes: Sequence[int] = ()
@@ -79,6 +81,7 @@ class StatusSnapshot:
     unsaved_since: datetime | None = None
     unchecked_limits: tuple[str, ...] = ()
     takes_blue_light: bool = False
+    settings_problem: tuple[str, str] | None = None
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -195,13 +198,19 @@ def heat(facts: StatusSnapshot) -> Check:
 def clock(facts: StatusSnapshot) -> Check:
     """Check that the date is not before EARLIEST_DATE or the newest capture: pictures carry this date.
 
-    Ok but not known if the network has not set the clock.
+    Ok but not known if nothing has set the clock since the start of the computer.
     """
     earliest = thresholds.earliest_date(facts.newest)
-    how = "set by the network" if facts.clock_was_set else "never compared with another clock"
+    how = CLOCK_WORDS[facts.clock]
     value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
     ok, remedy = not thresholds.is_date_wrong(facts.now, facts.newest), "Set date and time before the next picture."
-    return Check("clock", ok, value, limit, remedy, known=facts.clock_was_set or not ok)
+    return Check("clock", ok, value, limit, remedy, known=facts.clock != "not_set" or not ok)
+
+
+CLOCK_WORDS: dict[ClockState, str] = {
+    "network": "set by the network", "rtc": "kept by the clock of the board", "browser": "set by a tablet",
+    "not_set": "time not set",
+}  # fmt: skip
 
 
 def speed(facts: StatusSnapshot) -> Check:
@@ -265,6 +274,12 @@ def light_limits(facts: StatusSnapshot) -> Check:
     return Check("light_limits", True, value + blue, limit, "", known=False)
 
 
+def settings(facts: StatusSnapshot) -> Check:
+    """Check that the last start took the file `diffuscope.toml` of the card, if it has one."""
+    message, remedy = facts.settings_problem or ("taken", "")
+    return Check("settings", facts.settings_problem is None, message, "taken at the last start", remedy)
+
+
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
@@ -273,7 +288,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
-    light_limits,
+    light_limits, settings,
 )  # fmt: skip
 
 

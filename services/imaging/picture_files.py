@@ -223,6 +223,23 @@ def _lengths(text: str, size: float) -> list[float]:
     return [*ends[1:], ends[-1] + 0.45 * size]
 
 
+def read_png(png: bytes) -> Image:
+    """Return the linear light, 0 to 1, of a picture that `to_png` wrote, float32 (rows, cols) or (rows, cols, 3).
+
+    The mark of a simulated picture is replaced by 0. FrameError for other data.
+    """
+    try:
+        with Pillow.open(BytesIO(png)) as image:
+            pixels, simulated = np.asarray(image), image.info.get("simulated") == "true"
+    except (OSError, ValueError, SyntaxError) as error:  # SyntaxError: Pillow, for a damaged PNG
+        raise FrameError(f"this is not a whole PNG: {error}") from error
+    light = from_srgb(pixels)
+    if simulated:
+        rows, cols = _band(*light.shape[:2]).shape
+        light[-rows:, :cols] = 0
+    return light
+
+
 def from_srgb(pixels: NDArray[np.uint8]) -> Image:
     """Return the linear light, 0 to 1, of 8-bit sRGB values of any shape (IEC 61966-2-1)."""
     coded = pixels.astype(np.float32) / np.float32(255)

@@ -5,7 +5,7 @@ between two steps. One thread, the one that owns the head, calls it.
 """
 
 import logging
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -42,7 +42,7 @@ from device.values import (
 from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.records.capture import NO_METHOD, Capture
+from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS, CaptureTarget
 
 log = logging.getLogger(__name__)
@@ -162,23 +162,26 @@ class CapturePipeline:
 
     `reconstructor` makes the pictures of captures of one frame, `bursts` those of several (None: a press takes one
     frame), `live` those of live pictures, whose colour may have another PSF. `colours` solves the other colours of
-    light (None: a press takes the picture's colour only).
+    light (None: a press takes the picture's colour only). `origin` returns the origin of a capture.
     """
 
     def __init__(
         self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
         feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
-        colours: ColoursReconstructor | None = None,
+        colours: ColoursReconstructor | None = None, origin: Callable[[], RecordOrigin | None] = lambda: None,
     ) -> None:  # fmt: skip
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
-        self._head, self._clock, self._feedback = head, clock, feedback
+        self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
 
-    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = ()) -> Exposure:
+    def expose(
+        self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
+        field: str | None = None,
+    ) -> Exposure:  # fmt: skip
         """Return up to `count` lit frames, one in each of `colours`, and a dark one, as the function `expose`."""
         count = count if self.bursts is not None else 1
         able = () if self.colours is None else self.colours.others
         taken = [colour for colour in colours if colour in able]
-        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken)
+        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken, field=field)
         unable = {colour: NO_PSF for colour in colours if self.colours is not None and colour not in able}
         return replace(exposure, missing={**unable, **exposure.missing})
 
@@ -236,7 +239,7 @@ class CapturePipeline:
         """Return the record of a capture with its report, laterality estimate and shown picture."""
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = capture_report(shot, made.report, verdict, side, budget_s)
+        report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
         id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
         colour = made.colour if isinstance(made, ColourReconstruction) else None
@@ -254,8 +257,12 @@ class CapturePipeline:
         return jpeg, self._feedback.aim(counts, seen.exposed_s)
 
 
-def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
+def plan_pipeline(
+    head: Head, clock: Clock, plans: Path, origin: Callable[[], RecordOrigin | None] = lambda: None
+) -> CapturePipeline:
     """Return the pipeline of a head after all planning; `plans` is the folder of the FFT plans.
+
+    `origin` returns the origin of a capture, None if its device has no identity.
 
     With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose` then.
     """
@@ -283,7 +290,7 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
     elif live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
         live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
     feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
-    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, colours)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, colours, origin)
 
 
 def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Planner) -> int:
@@ -299,19 +306,20 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (),
+    colours: Sequence[Colour] = (), field: str | None = None,
 ) -> Exposure:  # fmt: skip
     """Return up to `count` lit frames, one in each of `colours`, and a dark one.
 
     The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
-    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept.
+    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
+    field of view of the programme, to which a simulated eye turns.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
     """
     head.check()
     begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)
-    announce_eye(head, eyes)
+    announce_eye(head, eyes, field)
     head.camera.prepare(shot)
     taken: dict[Colour, Frame] = {}
     missing: dict[Colour, str] = {}
@@ -352,10 +360,13 @@ def expose_live(
     return frame, exposed_s, clock.now_s()
 
 
-def announce_eye(head: Head, eyes: tuple[Eye, ...]) -> None:
-    """Announce the eye of the next exposure to a simulated head while the lamp is off, if `eyes` has exactly one."""
+def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) -> None:
+    """Announce eye and field of view of the next exposure to a simulated head, if `eyes` has exactly one eye.
+
+    The lamp is off.
+    """
     if len(eyes) == 1:
-        head.present_eye(eyes[0])
+        head.present_eye(eyes[0], field)
 
 
 def crop_to_field(image: Image, head: Head) -> Image:

@@ -117,7 +117,11 @@ class ExamLoop:
         self._events.stage(press, id, "expose")
         target = press.target
         exposure = self._pipeline.expose(
-            press.eye, in_visit=target.visit is not None, count=target.frames, colours=target.colours
+            press.eye,
+            in_visit=target.visit is not None,
+            count=target.frames,
+            colours=target.colours,
+            field=target.field,
         )
         exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)

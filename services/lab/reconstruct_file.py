@@ -302,7 +302,7 @@ def plan_reconstructor(
     return Reconstructor(
         calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency,
         timed=options.budget_s is not None, methods=METHODS if method is None else {**METHODS, method.name: method},
-        audience=Audience.FILES,
+        audience=Audience.FILES, field_fixed=options.field_fixed,
     )  # fmt: skip
 
 

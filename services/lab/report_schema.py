@@ -23,11 +23,22 @@ SECONDS: Mapping[str, str] = {
     "colour": "Pictures in the other colours of light, their registration, and the colour picture; captures only.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
+    "cylinder": "Estimate of the cylinder, after the picture.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
 }
 REFRACTION: Mapping[str, str] = {
-    "sphere": "Mean sphere of the spectacle correction in dpt; negative for myopia.",
+    "sphere": "Mean sphere M of the spectacle correction in dpt; negative for myopia.",
     "sd": "Standard deviation of `sphere` in dpt.",
+    "j0": "Jackson cross cylinder J0 of the correction in dpt (power vector after Thibos).",
+    "j0_sd": "Standard deviation of `j0` in dpt.",
+    "j45": "Jackson cross cylinder J45 of the correction in dpt.",
+    "j45_sd": "Standard deviation of `j45` in dpt.",
+    "sphere_sc": "Sphere of the sphere-cylinder notation in dpt: M - cylinder/2.",
+    "cylinder": "Minus cylinder in dpt.",
+    "axis_deg": "Axis of the cylinder in TABO degrees, above 0 and up to 180, as the examiner sees the eye.",
+    "field_deg": "Diameter of the lit field that was found with the refraction, in degrees.",
+    "field_deg_sd": "Standard deviation of `field_deg` in degrees; 0 for a field that was held.",
+    "refused": "Reason for which there is no refraction, and every number is null; null with a refraction.",
 }
 REGULARISATION: Mapping[str, str] = {
     "tau": "Weight of the total variation (methods variation and open).",
@@ -190,8 +201,28 @@ CAPTURE: Mapping[str, JsonValue] = {
     "confirmed": _typed(
         "object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY
     ),
+    "device": _typed(
+        "object", "Origin of the capture; captures of earlier releases have none.",
+        properties={
+            "uuid": _text("UUID of the device, made with its data folder."),
+            "serial": _text("Serial number of its board."),
+            "software": _text("Version of the software."),
+            "head": _text("Name of the head."),
+            "calibration_id": _text("Identifier of the calibration."),
+            "calibrated_at": _text("Date of the calibration, ISO 8601; null for a simulated one."),
+            "clock": _text(
+                "Source of the date: network, rtc (clock of the board), browser (of a tablet), or not_set: it may be "
+                "too early."
+            ),
+        },
+    ),
     "simulated": _typed("boolean", "True if the frame shows no real eye."),
 }  # fmt: skip
+
+
+def _refraction() -> dict[str, JsonValue]:
+    """Return the schemas of the entries of a refraction: a text for `refused`, a number for the others; or null."""
+    return {name: _text(text) if name == "refused" else _figure(text) for name, text in REFRACTION.items()}
 
 
 def report_schema() -> dict[str, JsonValue]:
@@ -205,7 +236,7 @@ def report_schema() -> dict[str, JsonValue]:
             "properties": _each(SECONDS, _number),
             "additionalProperties": {"type": "number"},
         },
-        "refraction_dpt": {"type": ["object", "null"], "properties": _each(REFRACTION, _number)},
+        "refraction_dpt": {"type": ["object", "null"], "properties": _refraction()},
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
         "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},

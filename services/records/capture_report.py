@@ -18,11 +18,13 @@ from services.records.capture import (
     EyeCorrection,
     LateralityEstimate,
     PictureVerdict,
+    RecordOrigin,
 )
 from services.records.json_values import JsonObject, JsonValue
 from services.records.row_validation import one_of, parsed_json, text
 
 Value = TypeVar("Value")
+ORIGIN = ("uuid", "serial", "software", "head", "calibration_id", "calibrated_at", "clock")
 
 
 # Writer
@@ -63,7 +65,15 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
         entries["moved"] = [_correction_as_json(one) for one in report.moved]
     if report.confirmed is not None:
         entries["confirmed"] = _confirmation_as_json(report.confirmed)
+    if report.device is not None:
+        entries["device"] = origin_as_json(report.device)
     return entries
+
+
+def origin_as_json(origin: RecordOrigin) -> dict[str, JsonValue]:
+    """Return the origin of a record as a JSON object: the block `device` of reports, exports and uploads."""
+    known: dict[str, JsonValue] = {name: getattr(origin, name) for name in ORIGIN}
+    return known | dict(origin.others)
 
 
 def _frame_as_json(one: FrameUse) -> JsonValue:
@@ -110,6 +120,7 @@ def read_report(content: object) -> CaptureReport:
     """
     entries = _object(content)
     verdict, moved, confirmed = entries.get("verdict"), entries.get("moved"), entries.get("confirmed")
+    device = entries.get("device")
     report = CaptureReport(
         reconstruction=_reconstruction(entries),
         light=_dose_report(entries),
@@ -120,6 +131,7 @@ def read_report(content: object) -> CaptureReport:
         budget_s=_checked(entries, "budget_s", _number, BUDGET_S),
         moved=() if moved is None else _moves(moved),
         confirmed=_confirmation(confirmed) if isinstance(confirmed, Mapping) else None,
+        device=_origin(device) if isinstance(device, Mapping) else None,
     )
     return replace(report, others=_unwritten(entries, _known_entries(report)))
 
@@ -218,6 +230,12 @@ def _confirmation(entries: JsonObject) -> EyeConfirmation:
     return replace(confirmed, others=_unwritten(entries, _confirmation_as_json(confirmed)))
 
 
+def _origin(entries: JsonObject) -> RecordOrigin:
+    uuid, serial, software, head, id, calibrated_at, clock = (_lenient(entries, name, text, None) for name in ORIGIN)
+    origin = RecordOrigin(uuid, serial, software, head, id, calibrated_at, clock)
+    return replace(origin, others=_unwritten(entries, origin_as_json(origin)))
+
+
 def _unwritten(entries: JsonObject, written: JsonObject) -> JsonObject:
     """Return the stored entries that the writer would lose or change."""
     return {
@@ -268,11 +286,18 @@ def _numbers(value: object) -> dict[str, float]:
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
 
 
-def _refraction(value: object) -> dict[str, float]:
-    """Return the numbers of a refraction by name; ValueError if its `sphere` is neither a number nor null."""
+def _refraction(value: object) -> dict[str, float | str | None]:
+    """Return the numbers and nulls of a refraction by name, and the text of `refused`; entries of other types are
+    omitted. ValueError if its `sphere` is neither a number nor null.
+    """
     entries = _object(value)
     _checked(entries, "sphere", _number, None)
-    return {name: one for name, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    kept: dict[str, float | str | None] = {}
+    for name, one in entries.items():
+        is_number = isinstance(one, int | float) and not isinstance(one, bool)
+        if one is None or is_number or (name == "refused" and isinstance(one, str)):
+            kept[name] = one  # type: ignore[assignment]  # narrowed by the conditions
+    return kept
 
 
 def _texts(value: object) -> tuple[str, ...]:

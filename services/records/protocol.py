@@ -33,11 +33,13 @@ class Slot(Table):
 class Programme(Table):
     """Settings of the programme.
 
-    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers.
+    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers;
+    `device_in_number`: the letters of the device follow the prefix, so that no two devices give the same number.
     """
 
     vision_limit: Vision
     prefix: str = Field(pattern="^[A-Z]{0,4}$")
+    device_in_number: bool = True
     centre_phone: str | None = Field(default=None, max_length=40)
 
 
@@ -63,6 +65,13 @@ class Protocol(Table):
         if len(set(self.colours)) < len(self.colours):
             raise ValueError("a colour is listed twice; list it once")
         return self
+
+    def for_device(self, letters: str) -> Self:
+        """Return the protocol with the letters of a device behind the prefix of its numbers, if it wants them."""
+        if not self.programme.device_in_number:
+            return self
+        programme = self.programme.model_copy(update={"prefix": self.programme.prefix + letters})
+        return self.model_copy(update={"programme": programme})
 
     def slot(self, id: str) -> Slot:
         """Return the slot with that id; RecordNotFound if there is none."""

@@ -12,7 +12,7 @@ from device.light_safety.dose_report import DoseReport
 from device.values import ChannelUse, Report
 from services.lab import report_schema
 from services.lab.reconstruct_file import FileReport
-from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
+from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.records.capture_report import report_as_json
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -42,7 +42,9 @@ def test_every_key_of_every_report_has_a_description() -> None:
     assert list(described(schema)) == []
     light = DoseReport(limits_unchecked=("photochemical_dose",))
     made = Report("none", channels=(ChannelUse("green", (0.0, 0.0)),))
-    full = CaptureReport(made, light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation())
+    full = CaptureReport(
+        made, light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation(), device=RecordOrigin()
+    )
     properties = schema["properties"]
     assert isinstance(properties, dict)
     files = {one.name for one in fields(FileReport)}

@@ -145,7 +145,7 @@ class ReportAnswer(StoredPart):
     seconds: dict[str, Number]
     psf_index: int
     psf_scale: Number
-    refraction_dpt: dict[str, Number] | None
+    refraction_dpt: dict[str, Number | str | None] | None
     regularisation: dict[str, JsonValue]
     noise_dn: Number | None
     residual: Number | None
