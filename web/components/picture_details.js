@@ -8,7 +8,7 @@ const dialog = () => document.querySelector("#details");
 export const open = () => dialog()?.showModal();
 const close = () => dialog()?.close();
 
-// A predicted channel was computed from the others, one with a reason was not taken.
+// A predicted channel was computed from the others; one with a reason is not in the picture.
 function channelText({ name, predicted, reason }) {
   const colour = t(`colour.${name}`);
   if (predicted) return t("detail.channels.predicted", { colour });

@@ -181,7 +181,7 @@ export const ENGLISH = {
   "detail.frames.value": "{used} of {all} joined",
   "detail.channels": "Colours of light",
   "detail.channels.predicted": "{colour} (predicted, not measured)",
-  "detail.channels.missing": "{colour} (not taken)",
+  "detail.channels.missing": "{colour} (not in the picture)",
   "colour.red": "red",
   "colour.green": "green",
   "colour.blue": "blue",
