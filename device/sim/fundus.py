@@ -45,6 +45,13 @@ class Fundus:
     disc: tuple[float, float] | None = None
     fovea: tuple[float, float] | None = None
 
+    def plane(self, colour: Colour) -> Image:
+        """Return the reflectance in one colour; in amber the geometric mean of red and green where it was not drawn."""
+        if colour == "amber" and colour not in self.reflectance:
+            mixed: Image = np.sqrt(self.reflectance["red"] * self.reflectance["green"])
+            return mixed
+        return self.reflectance[colour]
+
 
 @dataclass(frozen=True)
 class Canvas:

@@ -121,7 +121,7 @@ class World:
 
     def truth(self, colour: Colour) -> Image:
         """Return the ground truth on the sensor grid: reflectance, float32 (rows, cols), zero outside the field."""
-        return crop_or_pad(self.retina.reflectance[colour], self.shape)
+        return crop_or_pad(self.retina.plane(colour), self.shape)
 
     def psf(self, colour: Colour) -> Image:
         """Return the noise-free PSF of a colour on the axis, with the eye's refraction, (n, n) at sensor pitch."""

@@ -19,6 +19,7 @@ from services.health.thresholds import (
     MAX_UNSAVED_DAYS,
     MIN_VISITS_LEFT,
 )
+from services.records.capture import ClockState
 from services.records.recovery_report import RecoveryReport
 
 
@@ -50,7 +51,9 @@ class StatusSnapshot:
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
     restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
-    `unchecked_limits`: names of the light limits that were not compared with the purchased standard.
+    `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
+    `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
+    settings of the card that were not taken at the last start.
     """
 
     state: str
@@ -66,7 +69,7 @@ class StatusSnapshot:
     warmest_c: float
     computer_c: float | None
     now: datetime
-    clock_was_set: bool
+    clock: ClockState
     newest: datetime | None
     presses: Sequence[tuple[float, float]]
     torn_bytes: Sequence[int] = ()
@@ -77,6 +80,8 @@ class StatusSnapshot:
     backup_at: datetime | None = None
     unsaved_since: datetime | None = None
     unchecked_limits: tuple[str, ...] = ()
+    takes_blue_light: bool = False
+    settings_problem: tuple[str, str] | None = None
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -193,13 +198,19 @@ def heat(facts: StatusSnapshot) -> Check:
 def clock(facts: StatusSnapshot) -> Check:
     """Check that the date is not before EARLIEST_DATE or the newest capture: pictures carry this date.
 
-    Ok but not known if the network has not set the clock.
+    Ok but not known if nothing has set the clock since the start of the computer.
     """
     earliest = thresholds.earliest_date(facts.newest)
-    how = "set by the network" if facts.clock_was_set else "never compared with another clock"
+    how = CLOCK_WORDS[facts.clock]
     value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
     ok, remedy = not thresholds.is_date_wrong(facts.now, facts.newest), "Set date and time before the next picture."
-    return Check("clock", ok, value, limit, remedy, known=facts.clock_was_set or not ok)
+    return Check("clock", ok, value, limit, remedy, known=facts.clock != "not_set" or not ok)
+
+
+CLOCK_WORDS: dict[ClockState, str] = {
+    "network": "set by the network", "rtc": "kept by the clock of the board", "browser": "set by a tablet",
+    "not_set": "time not set",
+}  # fmt: skip
 
 
 def speed(facts: StatusSnapshot) -> Check:
@@ -244,17 +255,29 @@ def backup(facts: StatusSnapshot) -> Check:
 BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
 
 
+BLUE_LIGHT = (
+    "; the programme takes blue light, which has 45 times the hazard of green at the same drive"  # OPTICS.md 4.4
+)
+
+
 def light_limits(facts: StatusSnapshot) -> Check:
     """Check that the light limits were compared with the purchased standard; ok but not known if not.
 
     At most half of a limit that was not compared is used (`MOST_UNCHECKED_SHARE` in device/light_safety/hazard.py).
     """
     limit = "each compared with the standard"
+    blue = BLUE_LIGHT if facts.takes_blue_light else ""
     if not facts.unchecked_limits:
-        return Check("light_limits", True, "compared with the standard", limit, "")
+        return Check("light_limits", True, "compared with the standard" + blue, limit, "")
     many = _count(len(facts.unchecked_limits), "number", "numbers")
     value = f"{many} not compared with the purchased standard, so at most half of a limit is used"
-    return Check("light_limits", True, value, limit, "", known=False)
+    return Check("light_limits", True, value + blue, limit, "", known=False)
+
+
+def settings(facts: StatusSnapshot) -> Check:
+    """Check that the last start took the file `diffuscope.toml` of the card, if it has one."""
+    message, remedy = facts.settings_problem or ("taken", "")
+    return Check("settings", facts.settings_problem is None, message, "taken at the last start", remedy)
 
 
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
@@ -265,7 +288,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
-    light_limits,
+    light_limits, settings,
 )  # fmt: skip
 
 

@@ -35,7 +35,7 @@ def captures() -> list[dict[str, Any]]:
         log.ask("GET /api/captures", f"/api/captures?before={UNKNOWN_CAPTURE}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{made['id']}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{UNKNOWN_CAPTURE}")
-        for name in ("picture.png", "raw.tiff", "dark.tiff", "report.json", "quick.jpg"):
+        for name in ("picture.png", "colour.png", "raw.tiff", "raw-red.tiff", "dark.tiff", "report.json", "quick.jpg"):
             log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/{name}")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/other.png")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/RAW.TIFF")
@@ -176,9 +176,9 @@ def exports() -> list[dict[str, Any]]:
         log.ask(copy, at, json=log.key(folder=str(device.stick)), note="a second copy")
         log.ask(copy, at, json=log.key(folder="/etc"))
         log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=str(device.stick)))
-        _montages(log)
         _diary(log)
         _backups(log)
+        _montages(log)
         return log.exchanges
 
 

@@ -15,7 +15,7 @@ SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
 HEALTHY = StatusSnapshot(
     state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
-    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
+    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock="not_set",
     newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0),
     unsaved_since=datetime(2026, 11, 14, 12, tzinfo=UTC),
 )  # fmt: skip
@@ -40,6 +40,7 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
     ("backup", {"unsaved_since": datetime(2026, 11, 14, 11, tzinfo=UTC)}),
+    ("settings", {"settings_problem": ("diffuscope.toml is not TOML", "Correct the file on the card.")}),
 ]
 
 
@@ -96,3 +97,13 @@ def test_missing_parts_of_a_head_are_no_failure() -> None:
 def test_an_update_is_judged_by_checks_of_the_release_only() -> None:
     names = {check.name for check in run_checks(HEALTHY) if check.of_release}
     assert names == {"camera", "lamp", "calibration", "captures"}
+
+
+def test_blue_light_is_named_with_its_hazard() -> None:
+    """Only if the programme lists it."""
+    plain, blue = (
+        next(check for check in run_checks(replace(HEALTHY, takes_blue_light=on)) if check.name == "light_limits")
+        for on in (False, True)
+    )
+    assert "blue" not in plain.value
+    assert "45 times the hazard of green" in blue.value

@@ -1,7 +1,7 @@
 // History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
 // on demand.
 
-import { visitZipUrl } from "../core/api.js";
+import { finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
 import { patientList } from "./home.js";
 import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
@@ -116,7 +116,7 @@ function montage({ visit }, actions, eye, { state, digest, pictures, placed }) {
       ? html`<eye-pic
           aria-label=${t("montage.name", { eye: t(`eye.${eye}`), n: used })}
           .subject=${digest}
-          .src=${actions.montageSource(visit.id, eye, digest)}
+          .src=${{ url: montagePictureUrl(visit.id, eye, digest), mark: "final" }}
           @fault=${actions.pictureFault}
         ></eye-pic>`
       : nothing}
@@ -178,9 +178,9 @@ function comparedPicture(state, actions, i) {
       aria-label=${captureLabel(state, id)}
       .head=${status}
       .subject=${id}
-      .redfree=${redfree}
+      .redfree=${redfree && !taken?.links.colour}
       .loupe=${loupe}
-      .src=${actions.finalSource(id)}
+      .src=${taken ? finalPicture(taken, redfree) : null}
       @looked=${actions.linkZoom}
       @loupe=${actions.loupeChanged}
     ></eye-pic>
