@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -173,6 +173,9 @@ bench-store: .venv/ready ## End the instrument 200 times and damage its store: w
 FRAMES ?= 60
 bench-refraction: .venv/ready ## Print error and coverage of the refraction on textbook frames; DATA=folder has photographs, FRAMES=60 of each sensor and field.
 	@$(BIN)/python -m tests.bench.refraction --data "$(DATA)" --frames $(FRAMES)
+
+bench-montage: .venv/ready ## Print the acceptance figures of the montage on photographs; DATA=folder has them.
+	@$(BIN)/python -m tests.bench.montage --data "$(DATA)"
 
 bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
 	@$(BIN)/python -m tests.bench.sides "$(DATA)"

@@ -252,6 +252,13 @@ export const ENGLISH = {
   "film.name": "{eye} · {part}",
   "film.name.n": "{eye} · {part}, picture {n}",
   "film.used": "Used",
+  "montage.computing": "Joining the pictures…",
+  "montage.none": "One picture: there is nothing to join.",
+  "montage.joined": "{n} pictures are joined to one.",
+  "montage.apart": "Not joined: the pictures show different parts of the eye.",
+  "montage.failed": "The pictures could not be joined. Look at each one.",
+  "montage.leftout": "A picture of another part is left out.",
+  "montage.name": "{eye}: {n} pictures joined to one",
 
   "link.cut": "The link broke before the answer came.",
   "link.cut.remedy": "Look at the pictures when the link is back.",
