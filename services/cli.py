@@ -150,6 +150,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
     head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
+    field_fixed: Annotated[
+        bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
+    ] = False,
     even: Annotated[
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
@@ -170,7 +173,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     options = ReconstructOptions(
         raws[0] if raws else Path(), tuple(psf or ()), None if each else output, method, budget_s, common_dark, flat,
         head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
-        parse_settings(setting or ()), parse_bayer(bayer),
+        parse_settings(setting or ()), parse_bayer(bayer), field_fixed,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
     if each:
@@ -473,20 +476,36 @@ def optics(
     eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
     pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,
     svg: Annotated[Path | None, typer.Option(help="Where to draw the light path, to scale.")] = None,
+    light: Annotated[
+        bool, typer.Option("--light", help="The chain of light from LED to electron, and its limits.")
+    ] = False,
+    frames: Annotated[int, typer.Option(min=1, max=64, help="Frames of one picture, for --light.")] = 1,
+    light_svg: Annotated[Path | None, typer.Option(help="Where to draw what limits the light.")] = None,
+    search: Annotated[
+        bool, typer.Option("--search", help="Search LEDs, ring, iris and exposure for enough light.")
+    ] = False,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
-    from services.lab import light_path_plot
+    from services.lab import head_search, light_path_plot, light_report
     from services.lab import optics_report as budget
 
     if head is not None and sensor is not None:
         raise typer.BadParameter("choose --head or --sensor, not both")
     if head is None and sensor is None:
-        if svg is not None or eye_mm is not None or pupil_mm is not None:
+        if svg or light or light_svg or search or eye_mm is not None or pupil_mm is not None:
             raise typer.BadParameter("choose --head or --sensor")
         typer.echo(budget.comparison())
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
-    typer.echo(budget.table(chosen))
+    if search:
+        typer.echo(head_search.table(chosen))
+    else:
+        typer.echo(light_report.table(chosen, frames) if light else budget.table(chosen))
+    if light_svg is not None:
+        write_or_raise(
+            light_svg, lambda: light_svg.write_text(light_report.gains_svg(chosen, frames), encoding="utf-8")
+        )
+        typer.echo(f"{light_svg}")
     if svg is not None:
         write_or_raise(svg, lambda: svg.write_text(light_path_plot.draw_light_path(chosen), encoding="utf-8"))
         typer.echo(f"{svg}")

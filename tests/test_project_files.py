@@ -372,10 +372,16 @@ MODULE = re.compile(r"-m ((?:device|services|tests|hardware)[\w.]*)")
 BINARY = {".png", ".jpg", ".npy", ".npz", ".tiff", ".gz", ".zip", ".sqlite", ".copy", ".calibration"}
 
 
+@cache
+def known_paths() -> frozenset[str]:
+    """Return every file and folder of the repository, Markdown files also without ending, as the site names pages."""
+    paths = {str(path) for file in files() for path in (Path(file), *Path(file).parents)}
+    return frozenset(paths | {file.removesuffix(".md") for file in files()} | {"web/vendor"})
+
+
 def missing_paths(name: str) -> list[str]:
     """Return the paths and `-m` modules that a file names and the repository does not have."""
-    there = {str(path) for file in files() for path in (Path(file), *Path(file).parents)} | {"web/vendor"}
-    there |= {file.removesuffix(".md") for file in files()}  # as the contents of the site name pages
+    there = known_paths()
     paths = {found.rstrip("./") for found in PATH.findall(text(name)) if not found.startswith("web/vendor/")}
     modules = {found.rstrip(".").replace(".", "/") for found in MODULE.findall(text(name))}
     missing = [path for path in paths if path not in there and not any(fnmatch(one, path) for one in there)]

@@ -52,8 +52,9 @@ class StatusSnapshot:
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
     restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
     `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
-    `settings_problem`: message and remedy of settings of the card that were not taken at the last start;
-    `throttled_bits`: state of supply and clock as the firmware of a Raspberry Pi reports it.
+    `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
+    settings of the card that were not taken at the last start; `throttled_bits`: state of supply and clock as the
+    firmware of a Raspberry Pi reports it.
     """
 
     state: str
@@ -80,6 +81,7 @@ class StatusSnapshot:
     backup_at: datetime | None = None
     unsaved_since: datetime | None = None
     unchecked_limits: tuple[str, ...] = ()
+    takes_blue_light: bool = False
     settings_problem: tuple[str, str] | None = None
     throttled_bits: int | None = None
 
@@ -255,17 +257,23 @@ def backup(facts: StatusSnapshot) -> Check:
 BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
 
 
+BLUE_LIGHT = (
+    "; the programme takes blue light, which has 45 times the hazard of green at the same drive"  # OPTICS.md 4.4
+)
+
+
 def light_limits(facts: StatusSnapshot) -> Check:
     """Check that the light limits were compared with the purchased standard; ok but not known if not.
 
     At most half of a limit that was not compared is used (`MOST_UNCHECKED_SHARE` in device/light_safety/hazard.py).
     """
     limit = "each compared with the standard"
+    blue = BLUE_LIGHT if facts.takes_blue_light else ""
     if not facts.unchecked_limits:
-        return Check("light_limits", True, "compared with the standard", limit, "")
+        return Check("light_limits", True, "compared with the standard" + blue, limit, "")
     many = _count(len(facts.unchecked_limits), "number", "numbers")
     value = f"{many} not compared with the purchased standard, so at most half of a limit is used"
-    return Check("light_limits", True, value, limit, "", known=False)
+    return Check("light_limits", True, value + blue, limit, "", known=False)
 
 
 def settings(facts: StatusSnapshot) -> Check:

@@ -59,6 +59,7 @@ def collect_status(
         backup_at=backup_at,
         unsaved_since=unsaved_since,
         unchecked_limits=light_limits().unchecked,
+        takes_blue_light="blue" in people.protocol.colours,
         settings_problem=read_settings_problem(SETTINGS_PROBLEM_FILE),
         throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
     )

@@ -22,6 +22,7 @@ from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
+from services.http.routes.montages import montage_router
 from services.http.routes.preview import preview_router
 from services.http.routes.removal import removal_routes
 from services.http.routes.status import status_router
@@ -37,6 +38,7 @@ from services.instrument.events import EventBus
 from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.pending_captures import PendingCaptures
 from services.instrument.status import read_status
+from services.instrument.visit_montage import MontageMaker
 from services.records.protocol import Protocol, load_protocol
 from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
@@ -78,13 +80,15 @@ def create_app(
     )
     alerts = AlertMonitor(sources, clock, arbiter.context.event_bus.publish)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
-    life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker)
+    montages = MontageMaker(store, lambda: arbiter.is_idle)
+    life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
     app = _http_application(life, own_host_names() if host_names is None else host_names)
     pending, controlled = PendingCaptures(), [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
     app.include_router(captures_router(store, arbiter))
     app.include_router(visits_router(visits, lease, pending, checkpoints.request), dependencies=controlled)
     app.include_router(exports_router(visits, store, usb_drives or UsbDrives()), dependencies=controlled)
+    app.include_router(montage_router(visits, montages))
     app.include_router(upload_router(worker), dependencies=controlled)
     app.include_router(status_router(arbiter, visits, lease, alerts, worker))
     lit = [Depends(acquire_lease_for_light(lease)), Depends(limit_clients(preview_limits))]
@@ -116,11 +120,15 @@ def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAP
 
 
 def _lifespan(
-    event_bus: EventBus, alerts: AlertMonitor, checkpoints: Checkpoints, upload_worker: UploadWorker | None
+    event_bus: EventBus,
+    alerts: AlertMonitor,
+    checkpoints: Checkpoints,
+    upload_worker: UploadWorker | None,
+    montages: MontageMaker,
 ) -> Lifespan:
     """Return the lifespan handler: alerts, checkpoints and upload worker start and stop with the server.
 
-    At the end it also closes the event bus.
+    At the end it also ends the montages and closes the event bus.
     """
 
     @asynccontextmanager
@@ -132,6 +140,7 @@ def _lifespan(
         yield
         if upload_worker is not None:
             upload_worker.close()
+        montages.close()
         checkpoints.close()
         alerts.close()
         event_bus.close()

@@ -9,6 +9,7 @@ from device.values import Eye, Report
 from services.records.json_values import JsonObject
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
+COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
 BUDGET_S = 5.0  # standard time budget, also of captures of earlier releases, whose report has none
 
 

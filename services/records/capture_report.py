@@ -6,10 +6,10 @@ not know, are in the `others` of the typed values. Entries that an earlier relea
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 from device.light_safety.dose_report import DoseReport
-from device.values import EYES, FrameUse, Report
+from device.values import EYES, ChannelName, ChannelUse, FrameUse, Report
 from services.records.capture import (
     BUDGET_S,
     NO_METHOD,
@@ -48,6 +48,7 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     made, light = report.reconstruction, report.light
     entries: dict[str, JsonValue] = {
         **vars(made), "warnings": list(made.warnings), "frames": [_frame_as_json(one) for one in made.frames],
+        "channels": [_channel_as_json(one) for one in made.channels],
         **vars(light), "dose_high": list(light.dose_high), "limits_unchecked": list(light.limits_unchecked),
         "visit": report.visit, "slot": report.slot, "test": report.is_test,
         "verdict": None if report.verdict is None else verdict_as_json(report.verdict),
@@ -56,6 +57,8 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     }  # fmt: skip
     if not made.frames:
         del entries["frames"]
+    if not made.channels:
+        del entries["channels"]
     if not light.limits_unchecked:
         del entries["limits_unchecked"]
     if report.moved:
@@ -76,6 +79,11 @@ def origin_as_json(origin: RecordOrigin) -> dict[str, JsonValue]:
 def _frame_as_json(one: FrameUse) -> JsonValue:
     shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
     return {"index": one.index, "used": one.used, "shift_px": shift, "weight": one.weight, "reason": one.reason}
+
+
+def _channel_as_json(one: ChannelUse) -> JsonValue:
+    shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
+    return {"name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason}
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -155,6 +163,7 @@ def _reconstruction(entries: JsonObject) -> Report:
         quality=_lenient(entries, "quality", _copied, {}),
         warnings=_lenient(entries, "warnings", _texts, ()),
         frames=_lenient(entries, "frames", _frames, ()),
+        channels=_lenient(entries, "channels", _channels, ()),
     )
 
 
@@ -168,6 +177,18 @@ def _frame(entries: JsonObject) -> FrameUse:
     index, used = _checked(entries, "index", _whole, 0), entries.get("used") is True
     shift_px, weight = _checked(entries, "shift_px", _position, None), _checked(entries, "weight", _number, 0.0)
     return FrameUse(index, used, shift_px, weight, _checked(entries, "reason", text, None))
+
+
+def _channels(value: object) -> tuple[ChannelUse, ...]:
+    if not isinstance(value, list):
+        raise ValueError("channels that are no list")
+    return tuple(_channel(_object(one)) for one in value)
+
+
+def _channel(entries: JsonObject) -> ChannelUse:
+    name = one_of(entries.get("name"), *get_args(ChannelName))
+    shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
+    return ChannelUse(name, shift_px, predicted, _checked(entries, "reason", text, None))
 
 
 def _dose_report(entries: JsonObject) -> DoseReport:
@@ -265,11 +286,18 @@ def _numbers(value: object) -> dict[str, float]:
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
 
 
-def _refraction(value: object) -> dict[str, float]:
-    """Return the numbers of a refraction by name; ValueError if its `sphere` is neither a number nor null."""
+def _refraction(value: object) -> dict[str, float | str | None]:
+    """Return the numbers and nulls of a refraction by name, and the text of `refused`; entries of other types are
+    omitted. ValueError if its `sphere` is neither a number nor null.
+    """
     entries = _object(value)
     _checked(entries, "sphere", _number, None)
-    return {name: one for name, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    kept: dict[str, float | str | None] = {}
+    for name, one in entries.items():
+        is_number = isinstance(one, int | float) and not isinstance(one, bool)
+        if one is None or is_number or (name == "refused" and isinstance(one, str)):
+            kept[name] = one  # type: ignore[assignment]  # narrowed by the conditions
+    return kept
 
 
 def _texts(value: object) -> tuple[str, ...]:

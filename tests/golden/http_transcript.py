@@ -35,7 +35,7 @@ def captures() -> list[dict[str, Any]]:
         log.ask("GET /api/captures", f"/api/captures?before={UNKNOWN_CAPTURE}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{made['id']}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{UNKNOWN_CAPTURE}")
-        for name in ("picture.png", "raw.tiff", "dark.tiff", "report.json", "quick.jpg"):
+        for name in ("picture.png", "colour.png", "raw.tiff", "raw-red.tiff", "dark.tiff", "report.json", "quick.jpg"):
             log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/{name}")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/other.png")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/RAW.TIFF")

@@ -115,3 +115,13 @@ def test_the_state_of_the_supply_is_read_from_the_firmware(
         (tmp_path / "soc@107c000000/soc@107c000000:firmware").mkdir(parents=True)
         (tmp_path / "soc@107c000000/soc@107c000000:firmware/get_throttled").write_text(content)
     assert read_throttled_bits(tmp_path) == bits
+
+
+def test_blue_light_is_named_with_its_hazard() -> None:
+    """Only if the programme lists it."""
+    plain, blue = (
+        next(check for check in run_checks(replace(HEALTHY, takes_blue_light=on)) if check.name == "light_limits")
+        for on in (False, True)
+    )
+    assert "blue" not in plain.value
+    assert "45 times the hazard of green" in blue.value

@@ -40,11 +40,9 @@ def test_the_network_is_better_than_a_tablet(root: Path) -> None:
     assert not offer_time(NOW, root)
 
 
-@pytest.mark.parametrize(
-    "now", [datetime(1970, 1, 1, tzinfo=UTC), datetime(2025, 12, 31, tzinfo=UTC), datetime.max.replace(tzinfo=UTC)]
-)
-def test_an_impossible_date_is_not_offered(root: Path, now: datetime) -> None:
-    assert not offer_time(now, root)
+@pytest.mark.parametrize("year", [1970, 2025, 2060, 9999])
+def test_an_impossible_date_is_not_offered(root: Path, year: int) -> None:
+    assert not offer_time(datetime(year, 1, 1, tzinfo=UTC), root)
 
 
 def test_a_computer_without_the_unit_is_left_alone(tmp_path: Path) -> None:

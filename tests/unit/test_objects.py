@@ -121,3 +121,20 @@ def test_shifted_photograph_is_dark_outside_its_edge(tmp_path) -> None:
     red = found.reflectance["red"][150]
     assert red[150 + round(8 * PX_PER_DEG)] == pytest.approx(1, abs=0.01)
     assert red[150 - round(12 * PX_PER_DEG)] == 0
+
+
+@pytest.mark.parametrize("eye", ["OD", "OS"])
+def test_a_turned_eye_shows_the_same_retina_and_what_is_beyond_its_field(eye) -> None:
+    sim, lens = SimSpec(object=ObjectSpec(kind="retina", haemorrhages=2)), optics(33.4)
+    turn_px = (5, -31)  # rows, columns: whole pixels, so that both are the same without interpolation
+    turn_deg = (turn_px[1] / PX_PER_DEG, turn_px[0] / PX_PER_DEG)
+    straight = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG)
+    turned = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG, turn_deg)
+    moved = np.roll(straight.reflectance["green"], turn_px, axis=(0, 1))
+    both = ndimage.binary_erosion((moved > 0) & (turned.reflectance["green"] > 0), iterations=6)
+    assert both.sum() > 0.6 * straight.field.sum()
+    # the ends of vessels at the edge of the field of the straight view are continued, which changes their taper
+    assert np.quantile(np.abs(moved - turned.reflectance["green"])[both] / moved[both], 0.99) < 0.01
+    assert (turned.reflectance["green"] > 0).sum() == (straight.reflectance["green"] > 0).sum()
+    assert straight.disc is not None
+    assert turned.disc == pytest.approx((straight.disc[0] + turn_px[0], straight.disc[1] + turn_px[1]))

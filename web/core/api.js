@@ -107,6 +107,13 @@ function parseAim(header) {
 }
 
 /** Fetch a picture and decode it. */
+/**
+ * Return the source for <eye-pic> of a capture: its picture in colour, or red-free the one in green light. A capture
+ * without a picture in colour has only the latter, and the viewer's own red-free tool.
+ */
+export const finalPicture = ({ links: { picture, colour } }, redfree) =>
+  colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
+
 export async function getBitmap(url, signal) {
   const response = await fetch(url, { signal });
   if (!response.ok) throw new Error(`picture ${response.status}`);

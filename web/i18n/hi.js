@@ -158,6 +158,7 @@ export const WORDS = {
   "result.details.warn": "विवरण: चेतावनी के साथ",
 
   "tool.plain": "जैसी ली",
+  "tool.colour": "रंगीन",
   "tool.redfree": "लाल रहित",
   "tool.loupe": "लेंस",
   "tool.brightness": "चमक",

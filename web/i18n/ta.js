@@ -167,6 +167,7 @@ export const WORDS = {
   "result.details.warn": "விவரங்கள்: எச்சரிக்கையுடன்",
 
   "tool.plain": "எடுத்தபடி",
+  "tool.colour": "வண்ணம்",
   "tool.redfree": "சிவப்பின்றி",
   "tool.loupe": "லென்ஸ்",
   "tool.brightness": "ஒளிர்வு",

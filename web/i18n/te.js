@@ -158,6 +158,7 @@ export const WORDS = {
   "result.details.warn": "వివరాలు: హెచ్చరికతో",
 
   "tool.plain": "తీసినట్టు",
+  "tool.colour": "రంగులో",
   "tool.redfree": "ఎరుపు లేకుండా",
   "tool.loupe": "భూతద్దం",
   "tool.brightness": "వెలుగు",

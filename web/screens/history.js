@@ -1,7 +1,7 @@
 // History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
 // on demand.
 
-import { visitZipUrl } from "../core/api.js";
+import { finalPicture, visitZipUrl } from "../core/api.js";
 import { patientList } from "./home.js";
 import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
@@ -158,9 +158,9 @@ function comparedPicture(state, actions, i) {
       aria-label=${captureLabel(state, id)}
       .head=${status}
       .subject=${id}
-      .redfree=${redfree}
+      .redfree=${redfree && !taken?.links.colour}
       .loupe=${loupe}
-      .src=${actions.finalSource(id)}
+      .src=${taken ? finalPicture(taken, redfree) : null}
       @looked=${actions.linkZoom}
       @loupe=${actions.loupeChanged}
     ></eye-pic>

@@ -1,41 +1,62 @@
-"""Estimation of the eye's refraction from the frame: the scale of the stored PSF with the highest likelihood.
+"""Estimation of the eye's refraction from the frame: the stretch of the stored PSF with the highest likelihood.
 
-Defocus scales the PSF about its axis (see `psf_warp`). The fine structure of |H|^2 scales inversely; it modulates the
-power spectrum of every frame. The estimate of M minimises the negative log likelihood E (`refraction_likelihood`,
-NUMERICS.md 7.1):
+Defocus and astigmatism stretch the PSF about its axis (see `psf_warp`). The fine structure of |H|^2 is stretched
+inversely; it modulates the power spectrum of every frame. The estimate minimises the negative log likelihood E over
+mean sphere M, cylinder J0, J45 and the field edge e (`refraction_likelihood`, `refraction_edge`, NUMERICS.md 7):
 
-    E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
+    E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
-|H_M|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
+|H_T|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
 the smooth part is blurred by a fixed PSF, the estimate is biased by one third towards that PSF. The smooth part itself
-(`shading`) is fitted with the stored PSF for the coarse search, and with the PSF found by it for the fine search.
+is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found for each fine search.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.psf_warp import Transform, transform
+from device.recon.estimation.refraction_edge import PARAMETERS, Candidate, Edge, EdgeLikelihood
 from device.recon.estimation.refraction_likelihood import RefractionLikelihood
+from device.recon.estimation.refraction_uncertainty import Quadratic, block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import Grid, Pair, support_radius_px
 from device.recon.model.kernels import Pixels, Places
-from device.recon.model.preprocessing import Linear
 from device.values import Calibration
 
 SPAN_DPT = 9.0
-FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of the coarse search
-LEAST_NATS = 150.0  # median minus minimum: the PSF of another head gives 110, retinas at 10 ke- at least 1200
+FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of a search over M
+COARSE_FRINGES = 0.3  # the same of the coarse search with the edge
+LEAST_NATS = 100.0  # median minus minimum of the coarse search
 LEAST_FREQUENCIES = 500
-UPPER_BIAS_DPT = 0.2  # typical difference between the upper half of the band and the whole band
-DISAGREED_DPT = 3.0  # beyond, the likelihood has several minima, and the stored PSF is used
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
-GAP_FITS = 3  # of the smooth part: the filling of a narrow gap biases M towards the PSF of the fit
-SD_FACTOR = 1.4  # for the correlation of neighbouring frequencies; with it 23 frames have z scores of rms 1.0
+ROUNDS = 4  # of smooth part, search and edge; a gap needs three, since its filling biases M towards the PSF of the fit
+SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
+CURVATURE_STEP_DPT = 0.25
+CYLINDER_STEPS_DPT = (0.5, 0.3)  # of the quadratic models in M, J0 and J45
+CYLINDERS_DPT = (0.7, 1.4)  # of the coarse search over J0 and J45
+CYLINDER_AXES = 8
+MOST_DESCENTS = 6
+MOST_CYLINDER_DPT = 3.0  # |J|
+MOST_SD_DPT = 1.5
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Cylinder of the eye as wavefront in dpt, as J0, J45 and their sds; x runs with the columns, y with the rows."""
+
+    j0_dpt: float
+    j0_sd_dpt: float
+    j45_dpt: float
+    j45_sd_dpt: float
 
 
 @dataclass(frozen=True)
@@ -44,33 +65,37 @@ class Refraction:
 
     The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
     (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
-    the coarse grid. `noise_sd_dpt` is the sd from the noise, with SD_PER_MISSING_DPT times the missing share in
-    quadrature; `disagreement_dpt` is |M of the upper half of the band - M of the full band|.
+    the coarse grid. `field_deg` is the diameter of the field found with it, with its sd; `edge_deg` the whole edge.
+    `likelihood_sd_dpt` is the part of the sd that the likelihood gives. `cylinder` is None before
+    `RefractionEstimator.add_cylinder`.
     """
 
     sphere_dpt: float
+    sd_dpt: float
     psf_scale: float
-    noise_sd_dpt: float
     nats: float
     curve: tuple[tuple[float, float], ...]
-    disagreement_dpt: float = 0.0
+    edge_deg: Edge
+    field_sd_deg: float
+    likelihood_sd_dpt: float
+    cylinder: Cylinder | None = None
 
     @property
-    def sd_dpt(self) -> float:
-        """Standard deviation of M in dpt: `noise_sd_dpt` and the excess disagreement in quadrature.
-
-        The excess is `disagreement_dpt` above UPPER_BIAS_DPT; it detects a false minimum of the likelihood.
-        """
-        more_dpt = max(0.0, self.disagreement_dpt - UPPER_BIAS_DPT)
-        return float(np.hypot(self.noise_sd_dpt, more_dpt))
+    def field_deg(self) -> float:
+        """Diameter of the lit field in degrees."""
+        return 2 * self.edge_deg.radius
 
     @property
     def in_doubt(self) -> bool:
-        """True if the stored PSF is to be used: M is not significant, or the two parts of the band disagree.
+        """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 `sd_dpt`)."""
+        return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
 
-        That is |M| < max(0.12 dpt, 2 `noise_sd_dpt`), or `disagreement_dpt` > DISAGREED_DPT.
-        """
-        return abs(self.sphere_dpt) < max(0.12, 2 * self.noise_sd_dpt) or self.disagreement_dpt > DISAGREED_DPT
+
+@dataclass(frozen=True)
+class NoRefraction:
+    """The refraction of a frame cannot be determined, for this reason (a sentence without a full stop)."""
+
+    reason: str
 
 
 def can_estimate_refraction(calibration: Calibration) -> bool:
@@ -79,22 +104,27 @@ def can_estimate_refraction(calibration: Calibration) -> bool:
 
 
 class RefractionEstimator:
-    """Estimator of the refraction, planned for one calibration and one sensor shape.
+    """Estimator of refraction and field edge, planned for one calibration and one sensor shape.
 
-    SettingError if geometry or field are unknown. `index` selects the stored PSF.
+    SettingError if geometry or field are unknown. `index` selects the stored PSF. With `edge_is_known` the edge of the
+    calibration is used as it is.
     """
 
-    def __init__(self, calibration: Calibration, shape: Pair, planner: Planner, index: int) -> None:
+    def __init__(
+        self, calibration: Calibration, shape: Pair, planner: Planner, index: int, edge_is_known: bool = False
+    ) -> None:
         geometry = calibration.geometry
         if geometry is None or not can_estimate_refraction(calibration):
             raise SettingError("a refraction needs the head's geometry and field", "Give --head HEAD.toml.")
         self.geometry = geometry
-        self.likelihood = RefractionLikelihood(calibration, geometry, shape, planner, index)
-        self._calibration, self._shape, self._index = calibration, shape, index
-        taper, bands = self.likelihood.taper, self.likelihood.bands
+        self._calibration, self._shape, self._planner, self._index = calibration, shape, planner, index
+        self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index)
+        self._edge_count = 0 if edge_is_known else None
+        taper, bands = self._edges.likelihood.taper, self._edges.likelihood.bands
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
+        self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
-        lever = bands.high / self.likelihood.grid.n * 2 * reach_px * geometry.scale_per_dpt
+        lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
 
     @cached_property
@@ -102,46 +132,126 @@ class RefractionEstimator:
         """Defect search of this calibration, for callers of `find` without a search of their own."""
         return DefectFinder(self._calibration, self._shape, self._index)
 
-    def find(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Refraction | None:
-        """Estimate the refraction of a frame (rows, cols) in counts; None if it cannot be determined.
+    @cached_property
+    def likelihood(self) -> RefractionLikelihood:
+        """Likelihood within the calibrated field edge, for tests of the head."""
+        return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index)
 
-        None: the band has fewer than LEAST_FREQUENCIES, the fitted level is not positive, the minimum is less than
-        LEAST_NATS below the median, or |M| >= SPAN_DPT. `defects` (flat indices) are left out, see `DefectFinder`.
-        """
-        likelihood = self.likelihood
-        if likelihood.bands.whole.where.size < LEAST_FREQUENCIES:
-            return None
-        frame = likelihood.frame(counts, dark, defects)
-        if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
-            return None
-        likelihood.residual(frame, 0.0)
-        noise = likelihood.noise_power(frame)
-        coarse = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole))
-        sphere_dpt = coarse.grid_search(self.step_dpt)
+    def find(
+        self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
+    ) -> Refraction | NoRefraction:
+        """Estimate M and the field edge of a frame (rows, cols) in counts; `defects` (flat indices) are left out."""
+        edges = self._edges
+        if edges.band.where.size < LEAST_FREQUENCIES:
+            return NoRefraction("the PSF passes too few frequencies")
+        frame = edges.start(counts, dark, defects)
+        if not edges.fit_smooth(self._stretch(np.zeros(1))) > 0:
+            return NoRefraction("the frame holds no light of the field")
+        edges(self._stretch(np.zeros(1)), 0)
+        edges.set_noise()
+        coarse = Search(lambda m_dpt: edges(self._stretch(np.array([m_dpt])), self._count(1)).nats)
+        m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
         if coarse.depth_nats < LEAST_NATS:
-            return None
-        sphere_dpt = coarse.descend(sphere_dpt, self.step_dpt / 2)
-        for _ in range(GAP_FITS if frame.has_gaps else 1):
-            likelihood.fit_smooth(frame, likelihood.otf(likelihood.grid, sphere_dpt))
-            fine = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole))
-            for part in (2, 4):
-                sphere_dpt = fine.descend(sphere_dpt, self.step_dpt / part)
-        if abs(sphere_dpt) >= SPAN_DPT:
-            return None
-        vertex_dpt, curvature = fine.fit_parabola(sphere_dpt, self.step_dpt / 4)
-        sd_dpt = min(SD_FACTOR * (self._spread / curvature) ** 0.5, SPAN_DPT) if curvature > 0 else SPAN_DPT
+            return NoRefraction("the frame does not show the structure of this PSF")
+        m_dpt = self._alternate(m_dpt)
+        if abs(m_dpt) >= SPAN_DPT:
+            return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
+        model = quadratic_model(self._terms, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
+        if not model.is_minimum:
+            return NoRefraction("the likelihood has no clear minimum")
+        (m_dpt,), (sd_dpt,) = model.minimum, self._sds(model)
+        likelihood_sd_dpt = float(sd_dpt)
         sd_dpt = float(np.hypot(sd_dpt, SD_PER_MISSING_DPT * frame.missing))
+        if sd_dpt > MOST_SD_DPT:
+            return NoRefraction(f"the standard deviation would be {sd_dpt:.1f} dpt")
         curve = tuple(sorted(coarse.known.items()))
-        disagreement_dpt = abs(self._minimum_of_upper_band(frame, noise, sphere_dpt) - vertex_dpt)
-        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.depth_nats, curve, disagreement_dpt)
+        edge_deg = edges.edge.scaled(1 / edges.per_deg)
+        return Refraction(
+            float(m_dpt), sd_dpt, self.scale(float(m_dpt)), coarse.depth_nats, curve, edge_deg,
+            self._field_sd_deg(model.minimum), likelihood_sd_dpt,
+        )  # fmt: skip
 
-    def _minimum_of_upper_band(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
-        """Return the minimum of the likelihood of the upper half of the band, in dpt, downhill from `sphere_dpt`."""
-        likelihood = self.likelihood
-        upper = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.upper))
-        for part in (1, 2):
-            sphere_dpt = upper.descend(sphere_dpt, self.step_dpt / part)
-        return upper.fit_parabola(sphere_dpt, self.step_dpt / 2)[0]
+    def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
+        """Estimate M, J0 and J45 of the frame for which `find` has just returned `found`."""
+        eye_dpt = self._coarse_cylinder(found.sphere_dpt)
+        for step_dpt in CYLINDER_STEPS_DPT:
+            self._edges.fit_smooth(self._stretch(eye_dpt))
+            eye_dpt = self._descend(eye_dpt, step_dpt)
+            model = quadratic_model(self._terms, eye_dpt, step_dpt, self._blocks)
+            if not model.is_minimum or np.hypot(*model.minimum[1:]) > MOST_CYLINDER_DPT:
+                return NoRefraction("the likelihood has no clear minimum with a cylinder")
+            eye_dpt = model.minimum
+            self._edges.move_edge(self._candidate(eye_dpt).step)
+        sds_dpt = self._sds(model)
+        if sds_dpt.max() > MOST_SD_DPT:
+            return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
+        m_dpt, j0_dpt, j45_dpt = (float(value) for value in eye_dpt)
+        missing_dpt = float(np.sqrt(max(found.sd_dpt**2 - found.likelihood_sd_dpt**2, 0)))
+        return replace(
+            found, sphere_dpt=m_dpt, sd_dpt=float(np.hypot(sds_dpt[0], missing_dpt)), psf_scale=self.scale(m_dpt),
+            edge_deg=self._edges.edge.scaled(1 / self._edges.per_deg), field_sd_deg=self._field_sd_deg(eye_dpt),
+            cylinder=Cylinder(j0_dpt, float(sds_dpt[1]), j45_dpt, float(sds_dpt[2])),
+        )  # fmt: skip
+
+    def _coarse_cylinder(self, m_dpt: float) -> Floats:
+        """Return M, J0 and J45 of the best candidate on circles around no cylinder."""
+        turns = 2 * np.pi * np.arange(CYLINDER_AXES) / CYLINDER_AXES
+        grid = [np.array([m_dpt, 0, 0])]
+        grid += [np.array([m_dpt, j_dpt * np.cos(t), j_dpt * np.sin(t)]) for j_dpt in CYLINDERS_DPT for t in turns]
+        return min(grid, key=lambda eye_dpt: self._candidate(eye_dpt).nats)
+
+    def _descend(self, eye_dpt: Floats, step_dpt: float) -> Floats:
+        """Return the local minimum of steps along the three axes, within MOST_DESCENTS rounds."""
+        steps = [sign * step_dpt * axis for axis in np.eye(eye_dpt.size) for sign in (-1, 1)]
+        nats = self._candidate(eye_dpt).nats
+        for _ in range(MOST_DESCENTS):
+            beside = [(self._candidate(eye_dpt + step).nats, k) for k, step in enumerate(steps)]
+            least, k = min(beside)
+            if least >= nats:
+                break
+            nats, eye_dpt = least, eye_dpt + steps[k]
+        return eye_dpt
+
+    def _alternate(self, m_dpt: float) -> float:
+        """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on."""
+        step_dpt = self.step_dpt
+        for _ in range(ROUNDS):
+            self._edges.fit_smooth(self._stretch(np.array([m_dpt])))
+            fine = Search(lambda m_dpt: self._candidate(np.array([m_dpt])).nats)
+            before_dpt = m_dpt
+            m_dpt = fine.descend(m_dpt, step_dpt)
+            m_dpt, _ = fine.fit_parabola(m_dpt, step_dpt)
+            change = self._edges.move_edge(self._candidate(np.array([m_dpt])).step)
+            step_dpt = max(step_dpt / 2, self.step_dpt / 4)
+            if change < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT:
+                break
+        return m_dpt
+
+    def _count(self, count: int) -> int:
+        return count if self._edge_count is None else self._edge_count
+
+    def _candidate(self, eye_dpt: Floats) -> Candidate:
+        return self._edges(self._stretch(eye_dpt), self._count(PARAMETERS))
+
+    def _terms(self, eye_dpt: Floats) -> tuple[float, Floats]:
+        found = self._candidate(eye_dpt)
+        return found.nats, found.terms
+
+    def _sds(self, model: Quadratic) -> Floats:
+        """Return the standard deviations of the components of the minimum, in dpt."""
+        noise, sectors = model.covariance(self._spread)
+        return np.asarray(np.sqrt(np.diag(noise) + np.diag(sectors)))
+
+    def _field_sd_deg(self, eye_dpt: Floats) -> float:
+        """Return the sd of the field's diameter for a known eye, in degrees; 0 if it was not fitted."""
+        information = self._candidate(eye_dpt).information
+        if self._count(1) == 0:
+            return 0.0
+        return float(2 * np.sqrt(np.linalg.inv(information)[0, 0]) / self._edges.per_deg)
+
+    def _stretch(self, eye_dpt: Floats) -> Transform:
+        """Return the stretch of an eye with M or with M, J0 and J45."""
+        return transform(self.geometry, *(float(value) for value in eye_dpt))
 
     def scale(self, m_dpt: float) -> float:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
@@ -149,7 +259,8 @@ class RefractionEstimator:
 
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
         """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
-        return self.likelihood.otf(grid, m_dpt)
+        otf = self._edges.likelihood.interpolated_otf
+        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
 
 
 class Search:

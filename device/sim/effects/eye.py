@@ -11,7 +11,7 @@ from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
 from device.sim.render import azimuth_and_angle
 from device.values import Image
 
-_TINT_ETA = {"red": 10.0, "green": 0.0, "blue": 5.0}  # vessels keep 1/7 and 4/5 of their green contrast
+_TINT_ETA = {"red": 10.0, "green": 0.0, "blue": 5.0, "amber": 5.0}  # vessels keep 1/7 and 4/5 of their green contrast
 _REFRACTION_ETA_PER_DPT = 3.0
 _GLASS_N = 1.517
 _CURVATURE_ETA_PER_DPT = 5.0  # of the mean over the field: its edge is blurred most, and shows it most
@@ -35,7 +35,7 @@ class Tint:
 
     def apply(self, setup: OpticalSetup) -> None:
         """Replace the object by its reflectance in this colour."""
-        setup.object = setup.subject.reflectance[setup.scene.colour]
+        setup.object = setup.subject.plane(setup.scene.colour)
 
 
 class Reflex:

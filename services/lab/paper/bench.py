@@ -15,7 +15,7 @@ from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.metrics import PictureScorer, Scores
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction import Refraction, RefractionEstimator
 from device.recon.methods import method_named
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
@@ -93,7 +93,7 @@ class Bench:
             self._refractor = take.calibration.id, found
         refractor, counts = self._refractor[1], take.staged.counts
         eye = refractor.find(counts, None, refractor.defects(counts))
-        return float("nan") if eye is None else eye.sphere_dpt
+        return eye.sphere_dpt if isinstance(eye, Refraction) else float("nan")
 
     def tikhonov(self, take: "SimulatedFrame", mu: float) -> Image:
         """Return the paper's solution for one weight mu, on the samples of the scores."""

@@ -53,8 +53,10 @@ def score_default_schedule(bench: Bench, take: SimulatedFrame, sphere_dpt: float
     `sphere_dpt` is the true sphere. The error is infinite without an estimate.
     """
     picture, report = bench.solve_default(take)
-    eye = report.refraction_dpt
-    off_sd = float("inf") if eye is None else (eye["sphere"] - sphere_dpt) / max(eye["sd"], 1e-9)
+    sphere, sd = ((report.refraction_dpt or {}).get(key) for key in ("sphere", "sd"))
+    off_sd = float("inf")
+    if isinstance(sphere, float) and isinstance(sd, float):
+        off_sd = (sphere - sphere_dpt) / max(sd, 1e-9)
     return take.score(picture).pcc, off_sd
 
 
