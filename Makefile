@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -25,6 +25,24 @@ PI_LOCK := tests/ports/emulators/requirements.lock
 
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
+
+# Debian's drivers lie behind .venv's own packages on the path, so that NumPy stays that of the lock file; those that only
+# the tests' emulators need are taken out, as they would hide Debian's.
+PI_PACKAGES := python3-picamera2 python3-libcamera python3-spidev python3-smbus2 python3-libgpiod
+PI_CONFIG := /boot/firmware/config.txt
+
+pi: ## On a Raspberry Pi: install the drivers, let .venv see them, switch SPI and I2C on; then restart.
+	@[ -f $(PI_CONFIG) ] || { echo "make pi is for Raspberry Pi OS of Debian 13: there is no $(PI_CONFIG) here"; exit 1; }
+	@sudo apt-get update -qq
+	@sudo apt-get install -y -qq --no-install-recommends $(PI_PACKAGES) python3-venv python3-dev gcc
+	@$(MAKE) .venv/ready
+	@$(BIN)/pip uninstall -qq -y picamera2 spidev smbus2
+	@echo /usr/lib/python3/dist-packages > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/debian.pth"
+	@for line in dtparam=spi=on dtparam=i2c_arm=on dtparam=strict_gpiod; do \
+		grep -qxF "$$line" $(PI_CONFIG) || echo "$$line" | sudo tee -a $(PI_CONFIG); done
+	@echo i2c-dev | sudo tee /etc/modules-load.d/diffuscope-i2c.conf >/dev/null
+	@sudo usermod -aG spi,i2c,gpio,video "$$(id -un)"
+	@echo "Restart the computer, then: $(BIN)/diffuscope doctor"
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py

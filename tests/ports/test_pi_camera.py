@@ -124,3 +124,18 @@ def test_a_stalled_camera_is_reopened_once_and_then_raises_camera_stalled(bench)
 
 def test_row_padding_does_not_reach_the_counts(bench):
     assert bench.open().expose(SHOT).counts.max() < 0xA5A5 >> 4
+
+
+def test_a_colour_sensor_where_a_monochrome_one_is_expected_is_refused(bench):
+    bench.sensor.arrangement = 0
+    with pytest.raises(CameraMismatch, match=r"has colour filters \(RGGB\)") as caught:
+        bench.open()
+    assert "bayer = true" in caught.value.remedy
+
+
+def test_an_expected_mosaic_is_read_as_the_sensor_gives_it(bench):
+    """The raw counts stay those of the sensor; `reconstruct --bayer` takes them apart."""
+    bench.sensor.arrangement = 0
+    camera = bench.open(bayer=True)
+    assert camera.facts == {"sensor": "imx296", "format": "SRGGB12", "mosaic": "RGGB"}
+    assert camera.expose(SHOT).counts.shape == camera.shape
