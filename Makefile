@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -43,6 +43,23 @@ pi: ## On a Raspberry Pi: install the drivers, let .venv see them, switch SPI an
 	@echo i2c-dev | sudo tee /etc/modules-load.d/diffuscope-i2c.conf >/dev/null
 	@sudo usermod -aG spi,i2c,gpio,video "$$(id -un)"
 	@echo "Restart the computer, then: $(BIN)/diffuscope doctor"
+
+# KiCad 9 comes from Debian 13 in a chroot of 1.5 GB, which only root can make; nothing of the tests needs it.
+GATE_ROOT := out/kicad
+
+$(GATE_ROOT)/ready:
+	@[ "$$(id -u)" = 0 ] || { echo "make gate makes a chroot, which only root can: sudo make gate"; exit 1; }
+	@command -v mmdebstrap >/dev/null || { apt-get update -qq && apt-get install -y -qq mmdebstrap >/dev/null; }
+	@rm -rf $(GATE_ROOT) && mmdebstrap --quiet --variant=minbase --include=kicad --aptopt='Apt::Install-Recommends "false"' \
+		trixie $(GATE_ROOT) http://deb.debian.org/debian
+	@touch $@
+
+gate: $(GATE_ROOT)/ready ## Check the schematic of the gate with KiCad 9 (ERC), and write netlist and drawing to out/gate; needs root.
+	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p out/gate
+	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/tmp && kicad-cli version && \
+		kicad-cli sch erc --severity-all --exit-code-violations -o erc.rpt gate.kicad_sch && \
+		kicad-cli sch export netlist -o gate.net gate.kicad_sch && kicad-cli sch export svg -o . gate.kicad_sch'
+	@cp $(GATE_ROOT)/gate/erc.rpt $(GATE_ROOT)/gate/gate.net $(GATE_ROOT)/gate/gate.svg out/gate && cat out/gate/erc.rpt
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py
