@@ -50,7 +50,7 @@ GATE_ROOT := out/kicad
 $(GATE_ROOT)/ready:
 	@[ "$$(id -u)" = 0 ] || { echo "make gate makes a chroot, which only root can: sudo make gate"; exit 1; }
 	@command -v mmdebstrap >/dev/null || { apt-get update -qq && apt-get install -y -qq mmdebstrap >/dev/null; }
-	@rm -rf $(GATE_ROOT) && mmdebstrap --quiet --variant=minbase --include=kicad --aptopt='Apt::Install-Recommends "false"' \
+	@rm -rf $(GATE_ROOT) && mkdir -p out && mmdebstrap --quiet --variant=minbase --include=kicad --aptopt='Apt::Install-Recommends "false"' \
 		trixie $(GATE_ROOT) http://deb.debian.org/debian
 	@touch $@
 
