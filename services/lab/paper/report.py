@@ -19,6 +19,7 @@ from services.lab.paper import (  # fmt: skip
     rules,
     screen,
     sensors,
+    traced,
     trainer,
 )
 from services.lab.paper.bench import Bench
@@ -26,10 +27,12 @@ from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Statu
 from services.lab.paper.style import CLAIMED, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
-ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L")
+ORDER = (
+    "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L",
+)  # fmt: skip
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
 CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
-_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
+_ALL = (first_order, traced, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }
