@@ -106,7 +106,8 @@ def run_walk(bench: Bench) -> Outcome:
         printed = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}.get(angle_deg, "")
         low, high = expected - 0.002, expected + 0.002
         said = printed if expected == 1 else ""
-        claims.append(within(f"light of a dot at {angle_deg:g} degrees", share, low, high, said, 4))
+        claim = within(f"light of a dot at {angle_deg:g} degrees", share, low, high, said, 4)
+        claims.append(claim.put_in("the walk of T, rendered").limit_from("overlap of two discs, +- 0.002 of pixels"))
         rows.append((f"{angle_deg:g}", f"{share:.4f}", f"{expected:g}", printed))
         if angle_deg >= 25:
             shown.append(plane(f"caustic at {angle_deg:g} degrees", point))
