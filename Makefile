@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -217,6 +217,9 @@ bench-sides: .venv/ready ## Print how often left and right eyes are told apart, 
 
 bench-psf: .venv/ready ## Print what the PSF consistency check finds in recordings and simulated frames; DATA=folder has recordings.
 	@$(BIN)/python -m tests.bench.psf_consistency "$(DATA)"
+
+bench-frames: .venv/ready ## Print what bursts and colours of moving photographs give; DATA=folder has the photographs.
+	@$(BIN)/python -m tests.bench.frames "$(DATA)"
 
 bench-data: .venv/ready ## Compare all methods and LenslessPiCam on the pairs of a data set; DATA=folder has it.
 	@mkdir -p out
