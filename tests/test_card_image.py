@@ -134,6 +134,6 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
     assert beside - tools <= brought
     assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
         "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
-        "diffuscope-wish.path",
+        "diffuscope-wish.path", "diffuscope-clock.path",
     }  # fmt: skip
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

@@ -117,7 +117,7 @@ class AlertMonitor:
     def _of_date(self) -> Iterator[Alert]:
         now, now_s = self._clock.wall(), self._clock.now_s()
         drift_s = (now - self._began[0]).total_seconds() - (now_s - self._began[1])
-        return alerts.date_alerts(now, self._newest(), drift_s, clock_state() == "network")
+        return alerts.date_alerts(now, self._newest(), drift_s, clock_state() in ("network", "browser"))
 
     def _newest(self) -> datetime | None:
         """Return the time of the newest capture; None without one, or if the store cannot be read."""

@@ -53,7 +53,8 @@ class StatusSnapshot:
     restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
     `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
     `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
-    settings of the card that were not taken at the last start.
+    settings of the card that were not taken at the last start; `throttled_bits`: state of supply and clock as the
+    firmware of a Raspberry Pi reports it.
     """
 
     state: str
@@ -82,6 +83,7 @@ class StatusSnapshot:
     unchecked_limits: tuple[str, ...] = ()
     takes_blue_light: bool = False
     settings_problem: tuple[str, str] | None = None
+    throttled_bits: int | None = None
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -280,6 +282,29 @@ def settings(facts: StatusSnapshot) -> Check:
     return Check("settings", facts.settings_problem is None, message, "taken at the last start", remedy)
 
 
+def power(facts: StatusSnapshot) -> Check:
+    """Check that the supply of the board was never too low since its start, and that its clock is not reduced now.
+
+    Ok but not known on another computer. Bits: `vcgencmd get_throttled` of Raspberry Pi's documentation.
+    """
+    limit = "5 V since the start, full clock"
+    if facts.throttled_bits is None:
+        return Check("power", True, "not measured", limit, "", known=False)
+    found = [(words, remedy) for bit, words, remedy in THROTTLED if facts.throttled_bits >> bit & 1]
+    value = ", ".join(words for words, _ in found) or "steady"
+    return Check("power", not found, value, limit, " ".join(dict.fromkeys(remedy for _, remedy in found)))
+
+
+SUPPLY_REMEDY = "Use the supply of the parts list (5 V, 5 A) with its own cable, and charge the battery."
+COOLING_REMEDY = "Let the device cool, and check that its fan turns."
+THROTTLED = (
+    (0, "supply too low now", SUPPLY_REMEDY),
+    (16, "supply too low since the start", SUPPLY_REMEDY),
+    (2, "clock reduced", COOLING_REMEDY),
+    (3, "close to the highest temperature", COOLING_REMEDY),
+)
+
+
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
     if error is None:
         return Check(name, True, value, limit, "", of_release)
@@ -288,7 +313,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
-    light_limits, settings,
+    light_limits, settings, power,
 )  # fmt: skip
 
 

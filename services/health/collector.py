@@ -19,6 +19,7 @@ from services.records.visit_repository import VisitRepository
 
 COMPUTER_TEMPERATURE_FILE = Path("/sys/class/thermal/thermal_zone0/temp")
 SETTINGS_PROBLEM_FILE = Path("/run/diffuscope-settings/problem.json")  # of services/identity, at the last start
+PLATFORM_DEVICES = Path("/sys/devices/platform")
 MAX_PRESSES = 100
 
 
@@ -60,7 +61,16 @@ def collect_status(
         unchecked_limits=light_limits().unchecked,
         takes_blue_light="blue" in people.protocol.colours,
         settings_problem=read_settings_problem(SETTINGS_PROBLEM_FILE),
+        throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
     )
+
+
+def read_throttled_bits(devices: Path) -> int | None:
+    """Return the state of supply and clock from the firmware's file in sysfs; None on another computer."""
+    for file in devices.glob("soc*/soc*firmware/get_throttled"):
+        with suppress(OSError, ValueError):
+            return int(file.read_text(encoding="ascii"), 16)
+    return None
 
 
 def read_settings_problem(file: Path) -> tuple[str, str] | None:

@@ -4,6 +4,7 @@ The identity is that of the data: a restored backup belongs to the new device, s
 """
 
 import json
+import logging
 import secrets
 import uuid
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from pathlib import Path
 
 from device import atomic_io
 from services.errors import StoreDamaged
+
+log = logging.getLogger(__name__)
 
 FILE = "device.json"
 BOARD_SERIAL = Path("/proc/device-tree/serial-number")  # of a Raspberry Pi
@@ -37,15 +40,21 @@ class DeviceIdentity:
 
 
 def load_or_create_device(folder: Path, board_serial: Path = BOARD_SERIAL) -> DeviceIdentity:
-    """Return the identity of the data folder; create it at the first start. StoreDamaged if the file is unreadable.
+    """Return the identity of the data folder; create it at the first start, and on another board.
 
-    `board_serial`: file with the serial number of the board. OSError if the file is absent and cannot be written.
+    A card that was copied or moved into another device has the serial number of the other board: it gets an identity
+    of its own, so that no two devices give the same numbers, and a log line reports it. `board_serial`: file with the
+    serial number of the board. StoreDamaged if the file is unreadable, OSError if it must be and cannot be written.
     """
-    if (known := read_device(folder)) is not None:
+    known, board = read_device(folder), board_serial_number(board_serial)
+    if known is not None and board in (None, known.serial):
         return known
-    made = DeviceIdentity(str(uuid.uuid4()), board_serial_number(board_serial) or secrets.token_hex(8))
-    content = json.dumps({"uuid": made.uuid, "serial": made.serial}).encode()
-    atomic_io.write_atomically(folder / FILE, content)
+    made = DeviceIdentity(str(uuid.uuid4()), board or secrets.token_hex(8))
+    content = {"uuid": made.uuid, "serial": made.serial}
+    if known is not None:
+        content["before"] = known.uuid
+        log.warning("this card was made in device %s; in board %s it is device %s", known.uuid, board, made.uuid)
+    atomic_io.write_atomically(folder / FILE, json.dumps(content).encode())
     return made
 
 

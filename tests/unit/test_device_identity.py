@@ -35,6 +35,21 @@ def test_the_identity_is_made_once_with_the_serial_number_of_the_board(tmp_path:
     assert load_or_create_device(tmp_path, NO_BOARD) == read_device(tmp_path) == made
 
 
+def test_a_copied_card_gets_an_identity_of_its_own(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Two devices with copies of one card must not give the same numbers; the other device keeps its identity."""
+    boards = [tmp_path / name for name in ("one", "two")]
+    for number, board in enumerate(boards):
+        board.write_text(f"10000000a1b2c3d{number}\0")
+    first = load_or_create_device(tmp_path, boards[0])
+    copy = load_or_create_device(tmp_path, boards[1])
+    assert (copy.serial, copy.uuid != first.uuid) == ("10000000a1b2c3d1", True)
+    assert copy.prefix != first.prefix
+    assert first.uuid in caplog.text
+    assert json.loads((tmp_path / "device.json").read_text())["before"] == first.uuid
+    assert load_or_create_device(tmp_path, boards[1]) == copy
+    assert load_or_create_device(tmp_path, NO_BOARD) == copy, "a disk that is read on a laptop stays what it is"
+
+
 def test_a_computer_without_a_board_gets_a_random_serial_number(tmp_path: Path) -> None:
     assert board_serial_number(NO_BOARD) is None
     assert re.fullmatch("[0-9a-f]{16}", load_or_create_device(tmp_path, NO_BOARD).serial)

@@ -211,7 +211,7 @@ def test_a_raw_frame_is_a_tiff_that_others_read_and_is_made_smaller() -> None:
     assert read_raw_tiff(data)[1] == RawMetadata(simulated=True)
 
 
-@pytest.mark.parametrize(("release", "files"), [("kept", 25), ("kept-r0004", 10)], ids=("kept", "kept-r0004"))
+@pytest.mark.parametrize(("release", "files"), [("kept", 30), ("kept-r0004", 10)], ids=("kept", "kept-r0004"))
 def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(release: str, files: int) -> None:
     stored = sorted((KEPT / release / "data" / "captures").glob("[0-9]*/*.tiff"))
     assert len(stored) == files
@@ -219,7 +219,8 @@ def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(
         with tifffile.TiffFile(path) as tiff:
             written = tiff.pages.first.description
         metadata = read_raw_tiff(path.read_bytes())[1]
-        assert metadata.illumination == (Illumination("green") if path.name.startswith("raw") else None)
+        glow = Illumination("red" if path.name == "raw-red.tiff" else "green")
+        assert metadata.illumination == (glow if path.name.startswith("raw") else None)
         assert metadata.id == path.parent.name
         assert metadata_text(metadata) == written
 

@@ -53,9 +53,12 @@ export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) 
   });
 }
 
-/** Request or renew the control lease, which one page holds at a time; `take` takes it from another page. */
+/**
+ * Request or renew the control lease, which one page holds at a time; `take` takes it from another page. A device whose
+ * clock is not set takes the time of this browser.
+ */
 export const requestControl = (take) =>
-  send("POST", "/api/controller", take ? { key: controllerKey(), take } : { key: controllerKey() });
+  send("POST", "/api/controller", { key: controllerKey(), now: new Date().toISOString(), ...(take && { take }) });
 
 /** Release the control lease when the page closes; a beacon is sent even after the page is gone. */
 export const releaseControl = () =>

@@ -349,4 +349,9 @@ export const WORDS = {
   "say.other": "अब दूसरी आँख।",
   "say.rest": "आँखें बंद करके आराम कीजिए।",
   "say.finished": "हो गया। धन्यवाद।",
+
+  "detail.refraction": "अपवर्तन (केवल शोध के लिए)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
+  "detail.refraction.mean": "औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
+  "detail.refraction.none": "इस तस्वीर में नापा नहीं जा सकता",
 };

@@ -361,4 +361,9 @@ export const WORDS = {
   "say.other": "இப்போது மற்றக் கண்.",
   "say.rest": "கண்களை மூடி ஓய்வெடுங்கள்.",
   "say.finished": "முடிந்தது. நன்றி.",
+
+  "detail.refraction": "ஒளிவிலகல் (ஆய்வுக்கு மட்டும்)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
+  "detail.refraction.mean": "சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
+  "detail.refraction.none": "இந்தப் படத்தில் அளக்க முடியாது",
 };

@@ -349,4 +349,9 @@ export const WORDS = {
   "say.other": "ఇప్పుడు రెండో కన్ను.",
   "say.rest": "కళ్ళు మూసుకుని విశ్రాంతి తీసుకోండి.",
   "say.finished": "అయిపోయింది. ధన్యవాదాలు.",
+
+  "detail.refraction": "వక్రీభవనం (పరిశోధన కోసం మాత్రమే)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
+  "detail.refraction.mean": "సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
+  "detail.refraction.none": "ఈ చిత్రంలో కొలవడం సాధ్యం కాదు",
 };

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import AwareDatetime, Field
 
 from services.http.schemas.captures import VerdictAnswer
 from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName, Timestamp
@@ -43,11 +43,13 @@ class SlotChoice(IdempotentRequest):
 class ControlRequest(IdempotentRequest):
     """Request body of the control lease; `key` is the secret key of the screen.
 
-    `take` takes the lease from another screen, `release` lets it expire.
+    `take` takes the lease from another screen, `release` lets it expire. `now`: time of the browser, which the device
+    takes if nothing else has set its clock.
     """
 
     take: bool = False
     release: bool = False
+    now: AwareDatetime | None = None
 
 
 class LeaseAnswer(ResponseBody):
