@@ -1,6 +1,7 @@
 """Eyes in front of a simulated head: object, optical setup and light of each eye and colour, computed once."""
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 
 import numpy as np
@@ -27,50 +28,53 @@ FIXATION_DEG: dict[str, Pair] = {"nerve": (FIELD_CENTRE_DEG[0] - DISC[0], FIELD_
 class RenderedEyes:
     """Retinas, setups and images of both eyes of a scene; `choose` selects the effects for each colour of light.
 
-    `scene` is the scene in the picture's colour, with the eye that is present first. `turn_deg` is the turn of the eye
-    from the scene's own gaze, as `turn_to` returns it.
+    `scene` is the scene in the picture's colour, with the eye that is present first. `turn_deg` is their turn from
+    the scene's own gaze, degrees right and down in the picture. What was computed for one turn is kept for the others.
     """
 
     def __init__(self, spec: InstrumentSpec, eye: Eye, choose: EffectSelector) -> None:
         self.scene = Scene(spec, spec.light.colour, eye)
-        self._choose = choose
+        self._choose, self.turn_deg = choose, STRAIGHT
         self._setups: dict[tuple[Eye, Colour, Pair], OpticalSetup] = {}
         self._rates: dict[tuple[Eye, Colour, int, Pair], Image] = {}
         self._retinas: dict[tuple[Eye, Pair], Fundus] = {}
 
-    def turn_to(self, eye: Eye, field: str | None) -> Pair:
-        """Return the turn of an eye to the fixation target of a field of view, degrees right and down in the picture.
+    def turned_to(self, eye: Eye, field: str | None) -> "RenderedEyes":
+        """Return these eyes with an eye turned to the fixation target of a field of view.
 
         None, an unknown field, a photograph and a drawing: no turn.
         """
         turn_deg = FIXATION_DEG.get(field or "", STRAIGHT) if self.scene.sim.object.kind == "retina" else STRAIGHT
-        return turn_deg if eye == "OD" else (-turn_deg[0], turn_deg[1])
+        turned = copy(self)
+        turned.turn_deg = turn_deg if eye == "OD" else (-turn_deg[0], turn_deg[1])
+        return turned
 
     @cached_property
     def plan(self) -> tuple[Decision, ...]:
         """Decision for each effect, simulated or skipped, for the picture's colour."""
         return self._choose(self.scene)
 
-    def retina(self, eye: Eye, turn_deg: Pair = STRAIGHT) -> Fundus:
+    def retina(self, eye: Eye) -> Fundus:
         """Return the object of the scene for an eye (retina, photograph or drawing), drawn once per eye and turn.
 
         It covers the whole field and may be larger than the sensor. Its rows and columns have the parity of the
         sensor's, so that the centres coincide.
         """
-        if (eye, turn_deg) not in self._retinas:
+        key = eye, self.turn_deg
+        if key not in self._retinas:
             scene, camera = self.scene, self.scene.spec.camera
             px_per_deg = scene.geometry.px_per_deg
             wide = int(np.ceil(px_per_deg * scene.optics.field_deg)) + 4
             shape = (wide + (wide - camera.rows) % 2, wide + (wide - camera.cols) % 2)
-            self._retinas[eye, turn_deg] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg, turn_deg)
-        return self._retinas[eye, turn_deg]
+            self._retinas[key] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg, self.turn_deg)
+        return self._retinas[key]
 
-    def setup(self, eye: Eye, colour: Colour, turn_deg: Pair = STRAIGHT) -> OpticalSetup:
+    def setup(self, eye: Eye, colour: Colour) -> OpticalSetup:
         """Return the optical setup of an eye in one colour with its selected effects, built once for each turn."""
-        key = eye, colour, turn_deg
+        key = eye, colour, self.turn_deg
         if key not in self._setups:
             scene = Scene(self.scene.spec, colour, eye)
-            self._setups[key] = build_setup(scene, self.retina(eye, turn_deg), self._chosen(scene))
+            self._setups[key] = build_setup(scene, self.retina(eye), self._chosen(scene))
         return self._setups[key]
 
     @cached_property
@@ -84,18 +88,18 @@ class RenderedEyes:
         step_px = step_deg * self.scene.geometry.px_per_deg
         return step_px if STEPS * step_px >= LEAST_DRIFT_PX else 0.0
 
-    def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0, turn_deg: Pair = STRAIGHT) -> Image:
+    def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
         `step`, 0 to STEPS, is the number of frames for which the eye has drifted. Computed once for each combination.
         """
-        key = eye, colour, step, turn_deg
+        key = eye, colour, step, self.turn_deg
         if key not in self._rates:
-            setup = self.setup(eye, colour, turn_deg)
+            setup = self.setup(eye, colour)
             if step > 0:
                 scene = setup.scene
                 radius_px = scene.geometry.px_per_deg * scene.half_field_deg
-                moved = moved_behind_field(self.retina(eye, turn_deg), (0.0, step * self.drift_px), radius_px)
+                moved = moved_behind_field(self.retina(eye), (0.0, step * self.drift_px), radius_px)
                 setup = build_setup(scene, moved, self._chosen(scene))
             self._rates[key] = electrons_per_s(setup)
         return self._rates[key]

@@ -293,4 +293,4 @@ def test_a_simulated_eye_turns_its_disc_into_the_middle_for_the_field_of_the_ner
 def test_a_screen_does_not_turn_to_a_fixation_target():
     screen = World(small_head(object=ObjectSpec(kind="point")), VirtualClock())
     screen.present_eye("OD", "nerve")
-    assert screen.turn_deg == (0.0, 0.0)
+    assert screen.eyes.turn_deg == (0.0, 0.0)

@@ -28,6 +28,7 @@ function storeVisit(visit) {
 export const refreshVisit = (id) => alertOnError(async () => storeVisit(await getVisit(id)));
 
 const MONTAGE_POLL_MS = 2000; // a montage takes some seconds, and waits while the camera is used
+let montagePoll = 0;
 
 /** Load the montage of each eye of the visit on the pictures screen; ask again while one is being computed. */
 export async function refreshMontages(visit) {
@@ -37,7 +38,8 @@ export async function refreshMontages(visit) {
   if (!isShown()) return;
   set({ montages: Object.freeze(Object.fromEntries(answers.filter(([, answer]) => answer))) });
   const waits = answers.some(([, answer]) => answer?.state === "computing");
-  if (waits) setTimeout(() => isShown() && refreshMontages(visit), MONTAGE_POLL_MS);
+  clearTimeout(montagePoll);
+  if (waits) montagePoll = setTimeout(() => isShown() && refreshMontages(visit), MONTAGE_POLL_MS);
 }
 
 /** Load the visits that match the query, and the counts of the day. */

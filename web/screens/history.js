@@ -111,7 +111,7 @@ function montage({ visit }, actions, eye, { state, digest, pictures, placed }) {
   const text = t(`montage.${state}`, { n: used });
   const leftOut = state === "joined" && used < pictures ? t("montage.leftout") : "";
   return html`<figure class="montage" data-eye=${eye} data-state=${state}>
-    <figcaption><b>${t(`eye.${eye}`)}</b> <span role="status">${text} ${leftOut}</span></figcaption>
+    <figcaption><b>${t(`eye.${eye}`)}</b> <span aria-live="polite">${text} ${leftOut}</span></figcaption>
     ${state === "joined"
       ? html`<eye-pic
           aria-label=${t("montage.name", { eye: t(`eye.${eye}`), n: used })}

@@ -176,8 +176,12 @@ def rotation_matrix(rotation_deg: float) -> Floats:
 
 
 def _second(surface: Floats, row: int, col: int) -> float:
-    """Return the highest correlation farther than SECOND_SAMPLES from the peak."""
-    far = surface.copy()
+    """Return the highest maximum farther than SECOND_SAMPLES from the peak, cyclic; -1 without one.
+
+    The ridge of the peak along a vessel is no second place: it has no maximum of its own.
+    """
+    size = 2 * SECOND_SAMPLES + 1
+    far = np.where(surface >= ndimage.maximum_filter(surface, size, mode="wrap"), surface, -1.0)
     reach = np.arange(-SECOND_SAMPLES, SECOND_SAMPLES + 1)
     far[np.ix_((row + reach) % surface.shape[0], (col + reach) % surface.shape[1])] = -1
     return float(far.max())
