@@ -33,9 +33,15 @@ CORRECTED = {
     "moved": [{"from_eye": "OS", "from_slot": "L-centre", "eye": "OD", "at": "2026-03-02T12:16:00+00:00", "by": None}],
     "confirmed": {"eye": "OD", "at": "2026-03-02T12:17:00+00:00", "by": "tablet 2"},
 }
+FIGURES = (
+    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
+)  # fmt: skip
+CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
+REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
     SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
-    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | REFUSED,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CYLINDER | CORRECTED,
 ]  # fmt: skip
 KEYS = sorted(RELEASES[-1])
 
