@@ -61,7 +61,8 @@ class EdgeLikelihood:
     """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape.
 
     An eye is an array of M, or of M, J0 and J45, in dpt. With `edge_is_known` the calibrated edge is kept. It holds the
-    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`.
+    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`. `band` holds the
+    frequencies.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class EdgeLikelihood:
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
         self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, SAMPLE_UM)
         self.grid = self.likelihood.grid
+        self.band: Band = self.likelihood.bands.whole
         self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)
         self.edge = self.prior.calibrated
         self._field = LitField(self.grid, self.edge, self.prior.largest_samples)
@@ -80,11 +82,6 @@ class EdgeLikelihood:
         self._flat_places = np.arange(self.band.where.size)
         self._levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
         self._noise_dn2 = 1.0
-
-    @property
-    def band(self) -> Band:
-        """Frequencies of the likelihood."""
-        return self.likelihood.bands.whole
 
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
@@ -171,5 +168,5 @@ class EdgeLikelihood:
 
     def field_edge(self, model: EdgeModel | None) -> FieldEdge:
         """Return the present edge in degrees, with the sd of the diameter from the linear model."""
-        variance = 0.0 if model is None else float(np.linalg.inv(model.matrix)[0, 0])
-        return self.prior.in_degrees(self.edge, variance)
+        radius_sd_samples = 0.0 if model is None else float(np.linalg.inv(model.matrix)[0, 0] ** 0.5)
+        return self.prior.in_degrees(self.edge, radius_sd_samples)

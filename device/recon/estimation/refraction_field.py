@@ -103,10 +103,10 @@ class EdgePrior:
         away = np.abs(edge.vector - self.calibrated.vector)[:3]
         return bool(away.max() > 0.99 * self._reach)
 
-    def in_degrees(self, edge: Edge, radius_variance: float) -> FieldEdge:
-        """Return an edge in degrees; `radius_variance` is in samples^2."""
+    def in_degrees(self, edge: Edge, radius_sd_samples: float) -> FieldEdge:
+        """Return an edge in degrees, with the standard deviation of its diameter."""
         radius, down, right, width = (edge.vector / self._per_deg).tolist()
-        return FieldEdge(2 * radius, down, right, width, 2 * radius_variance**0.5 / self._per_deg)
+        return FieldEdge(2 * radius, down, right, width, 2 * radius_sd_samples / self._per_deg)
 
 
 @dataclass(frozen=True)
