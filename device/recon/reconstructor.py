@@ -43,6 +43,8 @@ from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, w
 from device.recon.solvers.solver import Diagnostics, Solver
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
 
+CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -211,7 +213,7 @@ class Reconstructor:
                 DurationEstimate(),
                 DurationEstimate(),
             )
-        self._find_cost = self._cylinder_cost = DurationEstimate()
+        self._find_cost, self._cylinder_cost = DurationEstimate(), DurationEstimate()
         self(noise, rounds=2)
         for m_dpt in (1.0, None):
             self._refocus(m_dpt)
@@ -276,7 +278,8 @@ class Reconstructor:
 
     def _estimate_cylinder(self, run: "_Run", found: Refraction) -> None:
         """Add the cylinder to the refraction of the run, if time is left after the picture."""
-        if self.refractor is None or not run.fits(self._cylinder_cost.seconds):
+        cost_s = max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
+        if self.refractor is None or not run.fits(cost_s):
             return
         begin_s = self.clock.now_s()
         run.refraction = self.refractor.add_cylinder(found)

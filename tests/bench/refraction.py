@@ -8,7 +8,7 @@ report is scored. Exit status 1 if a line fails.
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -49,9 +49,11 @@ class Case:
     turn_deg: float = 0.0
 
 
-def cases(camera: Camera, field_deg: float, count: int, seed: int, cylinder_dpt: float = 0.0) -> Iterator[Case]:
+def cases(
+    camera: Camera, field_deg: float, count: int, seed: int, cylinder_dpt: float = 0.0, name: str = ""
+) -> Iterator[Case]:
     """Yield `count` cases, every second with an edge that deviates from the calibration."""
-    rng = np.random.default_rng((seed, camera.bits, round(10 * field_deg), round(10 * cylinder_dpt)))
+    rng = np.random.default_rng((seed, *name.encode(), camera.bits, round(10 * field_deg), round(10 * cylinder_dpt)))
     for k in range(count):
         deviations = (
             FieldEdge(field_deg - 0.2), FieldEdge(field_deg + 0.1), off_centre(field_deg, rng),
@@ -127,8 +129,14 @@ class Scored:
 
 def score(case: Case, data: Path) -> Scored:
     """Return the score of one frame."""
-    counts, calibration = expose(case, data)
-    report = Reconstructor(calibration, counts.shape, PLANNER, SystemClock(), timed=False)(counts).report.refraction_dpt
+    retina, right_deg, down_deg = scene_of(case, data)
+    counts = expose(case, retina * case.edge.light(right_deg, down_deg))
+    return scored(case, counts, calibrated(case.camera, case.field_deg, head_of(case)))
+
+
+def scored(case: Case, counts: Counts, reconstruct: Reconstructor) -> Scored:
+    """Return the score of counts that a reconstructor is given."""
+    report = reconstruct(counts).report.refraction_dpt
     assert report is not None
     refused = report["refused"]
     if isinstance(refused, str):
@@ -196,23 +204,85 @@ GROUPS = {
 }
 
 
-def expose(case: Case, data: Path) -> tuple[Counts, Calibration]:
-    """Return the counts of a case, and the calibration of its head."""
-    optics = Optics(PITCH_UM[case.camera])
-    rng = np.random.default_rng(case.seed)
-    head = int(rng.integers(1, 5))
-    psf = caustic(optics, surface(optics.pitch_um, head), Prescription.of_power_vector(*case.eye))
-    reach_deg = case.field_deg + case.edge.width_deg + 1
-    right_deg, down_deg = degrees(optics, round(reach_deg * optics.px_per_deg / 2) * 2)
-    zoom = case.zoom * case.field_deg / float(np.ptp(right_deg))
-    retina = photographed(photograph(data / "fundus" / case.photo), right_deg, down_deg, zoom, case.turn_deg, (0, 0))
-    light = blurred(retina * case.edge.light(right_deg, down_deg), psf, case.camera.shape)
-    electrons = light / light.max() * PEAK * case.camera.full_well_e * case.light
-    camera = case.camera
+def head_of(case: Case) -> int:
+    """Return the seed of the diffuser of a case, 1 to 4."""
+    return int(np.random.default_rng(case.seed).integers(1, 5))
+
+
+@cache
+def calibrated(camera: Camera, field_deg: float, head: int) -> Reconstructor:
+    """Return the reconstructor of `diffuscope reconstruct` for a head."""
+    optics = Optics(PITCH_UM[camera])
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, 2.0**camera.bits - 1)
     geometry = Geometry(optics.pitch_um, optics.distance_um, optics.magnification)
-    calibration = Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, case.field_deg)
-    return camera.read(electrons, rng), calibration
+    calibration = Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
+    return Reconstructor(calibration, camera.shape, PLANNER, SystemClock(), timed=False)
+
+
+def scene_of(case: Case, data: Path) -> tuple[Plane, Plane, Plane]:
+    """Return the retina of a case without its edge, and the field angles (right, down) in degrees."""
+    optics = Optics(PITCH_UM[case.camera])
+    reach_deg = case.edge.diameter_deg + case.edge.width_deg + 3
+    right_deg, down_deg = degrees(optics, round(reach_deg * optics.px_per_deg / 2) * 2)
+    zoom = case.zoom * case.field_deg / float(np.ptp(right_deg))
+    place = data / "fundus" / case.photo
+    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, (0, 0)), right_deg, down_deg
+
+
+def expose(case: Case, scene: Plane, exposure: float = PEAK) -> Counts:
+    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light."""
+    optics = Optics(PITCH_UM[case.camera])
+    psf = caustic(optics, surface(optics.pitch_um, head_of(case)), Prescription.of_power_vector(*case.eye))
+    light = blurred(scene, psf, case.camera.shape)
+    electrons = light / max(float(light.max()), 1e-9) * exposure * case.camera.full_well_e * case.light
+    return case.camera.read(electrons, np.random.default_rng((case.seed, 1)))
+
+
+def faults(seed: int, count: int, data: Path) -> Iterator[tuple[str, Scored]]:
+    """Yield the scores of frames that must be refused or carry their error, by kind, `count` of each."""
+    for k, case in enumerate(cases(IMX296, 33.4, count, seed, name="faults")):
+        case = replace(case, edge=FieldEdge(33.4), light=1.0)
+        retina, right_deg, down_deg = scene_of(case, data)
+        field, radius_deg = case.edge.light(right_deg, down_deg), np.hypot(right_deg, down_deg)
+        second = FieldEdge(12.0, 10.0, 0.0).light(right_deg, down_deg)
+        ring = np.exp(-(((radius_deg - 12) / 0.2) ** 2))
+        oval = FieldEdge(33.4).light(right_deg, down_deg * 1.03)
+        decentred = FieldEdge(33.4, 1.0, 0.0).light(right_deg, down_deg)
+        whole = np.ones_like(field)
+        head = head_of(case)
+        own = calibrated(IMX296, 33.4, head)
+        scenes = {
+            "uniform field": field, "empty disc": field * 1e-3 + 1, "open scene, no edge": retina * whole,
+            "half a lid": retina * field * np.where(down_deg < 0, 0.08, 1.0), "two discs": retina * (field + second),
+            "stray ring": retina * field + 0.5 * ring, "elliptical edge": retina * oval,
+            "disc 1 deg off": retina * decentred,
+        }  # fmt: skip
+        for kind, scene in scenes.items():
+            yield kind, scored(case, expose(case, scene), own)
+        lit = retina * field
+        yield "saturated edge", scored(case, expose(case, lit, 1.5), own)
+        yield "1/50 of the light", scored(case, expose(replace(case, light=0.02), lit), own)
+        yield "PSF of another head", scored(case, expose(case, lit), calibrated(IMX296, 33.4, head % 4 + 1))
+        wrong_deg = 33.4 * (1.2 if k % 2 else 0.8)
+        yield "field wrong by 20 %", scored(case, expose(case, lit), calibrated(IMX296, wrong_deg, head))
+
+
+def judge_faults(seed: int, count: int, data: Path) -> bool:
+    """Print each frame that must be refused or carry its error; return True if the lines hold."""
+    z: list[float] = []
+    refused = 0
+    for kind, one in faults(seed, count, data):
+        refused += one.refused is not None
+        if one.refused is None:
+            z.append(abs(one.errors_dpt[0] / one.sds_dpt[0]))
+        print(f"{kind}: {one.line}", flush=True)
+    beyond = [sum(value > limit for value in z) for limit in (3, 4)]
+    holds = beyond[0] <= 1 and beyond[1] == 0
+    print(
+        f"{'ok  ' if holds else 'MISS'} faults: {len(z) + refused} frames, {refused} refused, {beyond[0]} beyond 3 sd "
+        f"(at most 1), {beyond[1]} beyond 4 sd (none)", flush=True,
+    )  # fmt: skip
+    return holds
 
 
 def main() -> None:
@@ -221,17 +291,19 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with fundus/")
     parser.add_argument("--frames", type=int, default=60, help="frames of each group")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="*", choices=GROUPS, default=list(GROUPS))
+    parser.add_argument("--only", nargs="*", choices=[*GROUPS, "faults"], default=[*GROUPS, "faults"])
     arguments = parser.parse_args()
     held = []
     for name in arguments.only:
-        group = GROUPS[name]
-        scored = []
+        if name == "faults":
+            held.append(judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data))
+            continue
+        group, found = GROUPS[name], []
         for case in cases(group.camera, group.field_deg, arguments.frames, arguments.seed, group.cylinder_dpt):
-            scored.append(score(case, arguments.data))
-            print(scored[-1].line, flush=True)
+            found.append(score(case, arguments.data))
+            print(found[-1].line, flush=True)
         for k, limits in enumerate(group.limits):
-            held.append(summarise(f"{name} {('M', 'J0', 'J45')[k]}", scored, k, limits))
+            held.append(summarise(f"{name} {('M', 'J0', 'J45')[k]}", found, k, limits))
     raise SystemExit(0 if all(held) else 1)
 
 

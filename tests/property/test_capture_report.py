@@ -43,11 +43,16 @@ ORIGIN = {
         "head": "Simulated head", "calibration_id": "81d7eff650299a58", "calibrated_at": None, "clock": "not_set",
     },
 }  # fmt: skip
+FIGURES = (
+    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
+)  # fmt: skip
+CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
+REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
     SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
-    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES,
-    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | REFUSED,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER,
 ]  # fmt: skip
 KEYS = sorted(RELEASES[-1])
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from device.recon.estimation.refraction import Cylinder, NoRefraction, Refraction
-from device.recon.estimation.refraction_edge import FieldEdge
+from device.recon.estimation.refraction_field import FieldEdge
 from device.recon.estimation.refraction_notation import REFRACTION_KEYS, report_of, sphere_cylinder
 
 DPT = st.floats(-8, 8)

@@ -22,7 +22,8 @@ from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction_cylinder import find_cylinder
-from device.recon.estimation.refraction_edge import EdgeLikelihood, FieldEdge
+from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction_field import FieldEdge
 from device.recon.estimation.refraction_likelihood import RefractionLikelihood
 from device.recon.estimation.refraction_uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -39,7 +40,9 @@ LEAST_NATS = 100.0  # median minus minimum of the coarse search
 LEAST_FREQUENCIES = 500
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
 ROUNDS = 3  # of smooth part, search and edge; a gap needs them, since its filling biases M towards the PSF of the fit
+MOST_ROUNDS = 8  # while the edge moves
 SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
+MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MOST_ROUNDS the edge was not found
 CURVATURE_STEP_DPT = 0.25
 MOST_SD_DPT = 1.5
 
@@ -141,10 +144,12 @@ class RefractionEstimator:
         m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
         if coarse.depth_nats < LEAST_NATS:
             return NoRefraction("the frame does not show the structure of this PSF")
-        m_dpt = self._alternate(m_dpt)
+        m_dpt, moving_samples = self._alternate(m_dpt)
+        if moving_samples > MOVING_SAMPLES or edges.prior.is_at_end(edges.edge):
+            return NoRefraction("the edge of the lit field was not found near its calibrated place")
         if abs(m_dpt) >= SPAN_DPT:
             return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
-        model = quadratic_model(edges.terms, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
+        model = quadratic_model(edges, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
         if not model.is_minimum:
             return NoRefraction("the likelihood has no clear minimum")
         missing_dpt = SD_PER_MISSING_DPT * frame.missing
@@ -172,18 +177,22 @@ class RefractionEstimator:
             cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
         )  # fmt: skip
 
-    def _alternate(self, m_dpt: float) -> float:
-        """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on."""
+    def _alternate(self, m_dpt: float) -> tuple[float, float]:
+        """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on.
+
+        The second value is the last change of the edge in samples.
+        """
         step_dpt = self.step_dpt / 2
-        for _ in range(ROUNDS):
+        for done in range(1, MOST_ROUNDS + 1):
             self._edges.fit_smooth(np.array([m_dpt]))
             fine = Search(self._near(m_dpt))
             before_dpt, (m_dpt, _) = m_dpt, fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
             change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
             step_dpt = self.step_dpt / 4
-            if change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT:
+            is_settled = change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT
+            if is_settled or (done >= ROUNDS and change_samples < MOVING_SAMPLES):
                 break
-        return m_dpt
+        return m_dpt, change_samples
 
     def _near(self, m_dpt: float) -> Callable[[float], float]:
         """Return the likelihood of M with the linear model of the edge around `m_dpt`."""

@@ -31,7 +31,7 @@ def find_cylinder(edges: EdgeLikelihood, m_dpt: float, blocks: NDArray[np.int64]
     eye_dpt = min(first, key=lambda eye_dpt: edges.near(eye_dpt, model).nats)
     for step_dpt in STEPS_DPT:
         edges.fit_smooth(eye_dpt)
-        found = quadratic_model(edges.terms, _descend(edges, eye_dpt, step_dpt), step_dpt, blocks)
+        found = quadratic_model(edges, _descend(edges, eye_dpt, step_dpt), step_dpt, blocks)
         eye_dpt = found.minimum
         if not found.is_minimum or np.hypot(*eye_dpt[1:]) > MOST_CYLINDER_DPT:
             return None

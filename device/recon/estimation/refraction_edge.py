@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.estimation.psf_warp import transform
-from device.recon.estimation.refraction_field import Edge, LitField
+from device.recon.estimation.refraction_field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
 from device.recon.estimation.refraction_likelihood import SMEAR, TURNS, Band, RefractionLikelihood
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -27,27 +27,9 @@ from device.recon.model.preprocessing import Linear
 from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
-MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
-FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
-PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sd of radius, centre (down, right) and width around the calibrated edge
-LARGEST_STEP_DEG = 0.3  # of one iteration: the linear model holds within the structure of the caustic
 PARAMETERS = 4
 
 Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FieldEdge:
-    """Lit disc: diameter, centre (down, right of the sensor's) and full width of its cosine ramp, in degrees.
-
-    `diameter_sd_deg` is the standard deviation of the diameter for a known eye; 0 if the edge was not estimated.
-    """
-
-    diameter_deg: float
-    down_deg: float
-    right_deg: float
-    width_deg: float
-    diameter_sd_deg: float
 
 
 @dataclass(frozen=True)
@@ -79,7 +61,8 @@ class EdgeLikelihood:
     """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape.
 
     An eye is an array of M, or of M, J0 and J45, in dpt. With `edge_is_known` the calibrated edge is kept. It holds the
-    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`.
+    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`. `band` holds the
+    frequencies.
     """
 
     def __init__(
@@ -91,26 +74,19 @@ class EdgeLikelihood:
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
         self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, SAMPLE_UM)
         self.grid = self.likelihood.grid
-        self._per_deg = geometry.px_per_deg / self.grid.n
-        self._calibrated = Edge(calibration.field_deg / 2 * self._per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * self._per_deg)
-        self._edge = self._calibrated
-        largest_samples = self._calibrated.radius_samples + MARGIN_DEG * self._per_deg
-        self._field = LitField(self.grid, self._calibrated, largest_samples)
-        self._prior = np.asarray(PRIOR_DEG) * self._per_deg
+        self.band: Band = self.likelihood.bands.whole
+        self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)
+        self.edge = self.prior.calibrated
+        self._field = LitField(self.grid, self.edge, self.prior.largest_samples)
         self._moved_objects: list[Spectrum] = []
         self._flat_places = np.arange(self.band.where.size)
         self._levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
         self._noise_dn2 = 1.0
 
-    @property
-    def band(self) -> Band:
-        """Frequencies of the likelihood."""
-        return self.likelihood.bands.whole
-
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
         self._frame = self.likelihood.frame(counts, dark, defects)
-        self._edge = self._calibrated
+        self.edge = self.prior.calibrated
         return self._frame
 
     def set_noise(self, eye_dpt: Floats) -> None:
@@ -122,7 +98,7 @@ class EdgeLikelihood:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
         stretch = transform(self.likelihood.geometry, *eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
-        smooth = self._field.fit(self._frame, otf, self._edge)
+        smooth = self._field.fit(self._frame, otf, self.edge)
         self.likelihood.set_smooth(self._frame, smooth.image, smooth.stray_dn, otf)
         self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
         return smooth.level_dn
@@ -132,11 +108,6 @@ class EdgeLikelihood:
         rest, otf, level = self._residual(eye_dpt)
         nats, count = self._nats(rest, otf), min(most, self._count)
         return self._minimised(rest, otf, self._edge_model(level, count)) if count else self._candidate(nats)
-
-    def terms(self, eye_dpt: Floats) -> tuple[float, Floats]:
-        """Return the likelihood of an eye with its best edge, and its part of each frequency, (K,)."""
-        found = self(eye_dpt)
-        return found.nats, found.terms
 
     def edge_model(self, eye_dpt: Floats) -> EdgeModel | None:
         """Return the linear model of the edge around a candidate, for `near`; None for a known edge."""
@@ -163,13 +134,13 @@ class EdgeLikelihood:
         spectra = (self.likelihood.spectrum_of(part).ravel()[self.band.where] for part in self._moved_objects[:count])
         moved = np.stack([np.float32(level) * spectrum for spectrum in spectra])
         weighted = np.asarray(moved.conj() / self._spectrum(), np.complex64)
-        matrix = (weighted @ moved.T).real.astype(np.float64) + np.diag(self._prior[:count] ** -2)
+        matrix = (weighted @ moved.T).real.astype(np.float64) + np.diag(self.prior.precision[:count])
         return EdgeModel(moved, weighted, matrix)
 
     def _minimised(self, rest: Spectrum, otf: Spectrum, model: EdgeModel) -> Candidate:
         count = len(model.moved)
-        penalty = self._prior[:count] ** -2
-        away = (self._edge.vector - self._calibrated.vector)[:count]
+        penalty = self.prior.precision[:count]
+        away = (self.edge.vector - self.prior.calibrated.vector)[:count]
         step = np.linalg.solve(model.matrix, (model.weighted @ rest).real - penalty * away).astype(np.float64)
         nats = self._nats(rest - step.astype(np.float32) @ model.moved, otf)
         return replace(self._candidate(nats + float(penalty @ (away + step) ** 2)), step=step)
@@ -192,19 +163,10 @@ class EdgeLikelihood:
 
     def move_edge(self, step: Floats) -> float:
         """Move the first parameters of the edge by `step` (samples), within their range; return the largest change."""
-        if step.size == 0:
-            return 0.0
-        largest, reach = LARGEST_STEP_DEG * self._per_deg, MARGIN_DEG * self._per_deg
-        wanted = self._edge.vector
-        wanted[: len(step)] += np.clip(step, -largest, largest)
-        middle = self._calibrated.vector[:3]
-        found = np.append(np.clip(wanted[:3], middle - reach, middle + reach), np.clip(wanted[3], 1.0, 2 * reach))
-        change = float(np.abs(found - self._edge.vector).max())
-        self._edge = Edge(*found)
-        return change
+        before, self.edge = self.edge, self.prior.moved(self.edge, step)
+        return float(np.abs(self.edge.vector - before.vector).max())
 
     def field_edge(self, model: EdgeModel | None) -> FieldEdge:
         """Return the present edge in degrees, with the sd of the diameter from the linear model."""
-        radius, down, right, width = self._edge.vector / self._per_deg
-        variance = 0.0 if model is None else np.linalg.inv(model.matrix)[0, 0] / self._per_deg**2
-        return FieldEdge(2 * radius, down, right, width, 2 * float(np.sqrt(variance)))
+        radius_sd_samples = 0.0 if model is None else float(np.linalg.inv(model.matrix)[0, 0] ** 0.5)
+        return self.prior.in_degrees(self.edge, radius_sd_samples)

@@ -16,6 +16,10 @@ from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import LEAST_GOOD, Linear
 from device.values import Image
 
+MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
+FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
+PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sd of radius, centre (down, right) and width around the calibrated edge
+LARGEST_STEP_DEG = 0.3  # of one iteration: the linear model holds within the structure of the caustic
 LEAST_WEIGHT = 0.03  # of the brightest block, added for the read noise
 
 Floats = NDArray[np.float64]
@@ -57,6 +61,52 @@ class Edge:
         radius = np.hypot(rows - np.float32(self.down_samples), cols - np.float32(self.right_samples))
         width = np.float32(max(self.width_samples, 1.0))
         return np.clip((np.float32(self.radius_samples) - radius) / width + np.float32(0.5), 0, 1), radius, width
+
+
+@dataclass(frozen=True)
+class FieldEdge:
+    """Lit disc: diameter, centre (down, right of the sensor's) and full width of its cosine ramp, in degrees.
+
+    `diameter_sd_deg` is the standard deviation of the diameter for a known eye; 0 if the edge was not estimated.
+    """
+
+    diameter_deg: float
+    down_deg: float
+    right_deg: float
+    width_deg: float
+    diameter_sd_deg: float
+
+
+class EdgePrior:
+    """Calibrated edge with its uncertainty and range, for a field in degrees and a scale in samples per degree.
+
+    `calibrated` is the first edge, `precision` the inverse variance of each parameter around it, `largest_samples` the
+    largest radius.
+    """
+
+    def __init__(self, field_deg: float, per_deg: float) -> None:
+        self._per_deg, self._reach = per_deg, MARGIN_DEG * per_deg
+        self.calibrated = Edge(field_deg / 2 * per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * per_deg)
+        self.precision: Floats = (np.asarray(PRIOR_DEG) * per_deg) ** -2
+        self.largest_samples = self.calibrated.radius_samples + self._reach
+
+    def moved(self, edge: Edge, step: Floats) -> Edge:
+        """Return an edge whose first parameters are moved by `step` (samples), within their range."""
+        wanted, largest = edge.vector, LARGEST_STEP_DEG * self._per_deg
+        wanted[: step.size] += np.clip(step, -largest, largest)
+        middle = self.calibrated.vector[:3]
+        radius, down, right = np.clip(wanted[:3], middle - self._reach, middle + self._reach).tolist()
+        return Edge(radius, down, right, float(np.clip(wanted[3], 1.0, 2 * self._reach)))
+
+    def is_at_end(self, edge: Edge) -> bool:
+        """Return True if radius or centre of the edge are at the end of their range."""
+        away = np.abs(edge.vector - self.calibrated.vector)[:3]
+        return bool(away.max() > 0.99 * self._reach)
+
+    def in_degrees(self, edge: Edge, radius_sd_samples: float) -> FieldEdge:
+        """Return an edge in degrees, with the standard deviation of its diameter."""
+        radius, down, right, width = (edge.vector / self._per_deg).tolist()
+        return FieldEdge(2 * radius, down, right, width, 2 * radius_sd_samples / self._per_deg)
 
 
 @dataclass(frozen=True)

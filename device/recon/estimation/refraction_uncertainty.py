@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.estimation.refraction_edge import Candidate
 from device.recon.estimation.refraction_likelihood import RINGS, Band
 
 SD_FACTOR = 1.4  # for the correlation of neighbouring frequencies; with it 23 frames have z scores of rms 1.0
 SECTORS, RING_GROUPS = 6, 5
 
 Floats = NDArray[np.float64]
-Terms = Callable[[Floats], tuple[float, Floats]]  # point -> negative log likelihood, and its part of each frequency
 
 
 @dataclass(frozen=True)
@@ -57,22 +57,25 @@ def block_of_frequency(band: Band) -> NDArray[np.int64]:
     return np.asarray(sector * RING_GROUPS + band.ring * RING_GROUPS // RINGS, np.int64)
 
 
-def quadratic_model(value: Terms, at: Floats, step: float, blocks: NDArray[np.int64]) -> Quadratic:
+def quadratic_model(
+    value: Callable[[Floats], Candidate], at: Floats, step: float, blocks: NDArray[np.int64]
+) -> Quadratic:
     """Fit a quadratic to the likelihood at `at`, at +-`step` along each axis, and at one point of each pair of axes."""
     size = at.size
-    nats, _ = value(at)
+    nats = value(at).nats
     unit = np.eye(size) * step
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
     slopes = np.zeros((SECTORS * RING_GROUPS, size))
     above = np.zeros(size)
     for k in range(size):
-        (low, low_terms), (high, high_terms) = value(at - unit[k]), value(at + unit[k])
-        above[k] = high
-        gradient[k], hessian[k, k] = (high - low) / (2 * step), (high - 2 * nats + low) / step**2
-        slopes[:, k] = np.bincount(blocks, high_terms - low_terms, len(slopes)) / (2 * step)
+        low, high = value(at - unit[k]), value(at + unit[k])
+        above[k] = high.nats
+        gradient[k] = (high.nats - low.nats) / (2 * step)
+        hessian[k, k] = (high.nats - 2 * nats + low.nats) / step**2
+        slopes[:, k] = np.bincount(blocks, high.terms - low.terms, len(slopes)) / (2 * step)
     for k in range(size):
         for other in range(k):
-            corner, _ = value(at + unit[k] + unit[other])
+            corner = value(at + unit[k] + unit[other]).nats
             hessian[k, other] = hessian[other, k] = (corner - above[k] - above[other] + nats) / step**2
     if np.linalg.eigvalsh(hessian)[0] <= 0:
         return Quadratic(at, hessian, slopes, is_minimum=False)
