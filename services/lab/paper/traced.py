@@ -86,6 +86,7 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
         .limit_from("the paper's least"),
         below("walk at 15 degrees over its margin", relay.walk_mm(15) / margin_mm, 0.25, "without shift", 2),
         above("iris lit at 25 degrees", relay.lit_share(25), 0.999, "fully", 4).limit_from("the paper's"),
+        above("iris lit at 25.6 degrees, edge of the paper's 51.2", relay.lit_share(25.64), 0.95, "> 25: changes", 3),
         within("the paper's 25 degrees, among built relays' limit", 25.0, *built.filled_deg, "25", 1).limit_from(
             MONTE_CARLO
         ),
