@@ -10,7 +10,7 @@ from device.values import Image
 from services.lab.paper.bench import Bench, SimulatedFrame
 from services.lab.paper.edges import edge_signs
 from services.lab.paper.outcome import Experiment, Figure, Outcome, Table, above, below, within
-from services.lab.paper.pictures import compared, cutline
+from services.lab.paper.pictures import compared, cutline, raw_cutlines
 from services.lab.paper.screen import DOT_MU, apply_floor, find_dots
 
 MOVED_DEG = degrees(atan(4 / 25))  # 4 mm in the focal plane of a 25 mm lens
@@ -59,6 +59,7 @@ def run_rulers(bench: Bench) -> Outcome:
     shown = (
         *compared(sparse, {f"paper's solver, mu {mu:.0e}": white}, "white ruler"),
         *compared(dense, {f"paper's solver, mu {mu:.0e}": black, "flat-sub": flat, "ours": ours}, "black ruler"),
+        raw_cutlines({"white ruler": sparse, "black ruler": dense}, -1.6, "The raw frames, as measured (figure 4b)"),
         cutline(sparse, -1.6, {"paper's solver": white}, "White ruler, across the ticks"),
         cutline(dense, -1.6, {"paper's solver": black, "ours": ours}, "Black ruler, across the ticks"),
     )

@@ -29,6 +29,7 @@ DRAWN_DEG = {0.0: "s1", 15.0: "s0", 25.0: "s2", 30.0: "s3"}
 SCALE, LEFT, AXIS, WIDE, TALL = 5.0, 40.0, 190.0, 1180, 370
 PAPER_RING_MM, PAPER_CONE_DEG = 9.5, 24.75
 PAIR = "1 % of the maker, and a gap of 0 to 1 mm"
+GUESSED = "tolerances are our estimates"
 MONTE_CARLO = f"95 % of {DRAWS} relays drawn within tolerances"
 NOTES = (
     "Radii, thicknesses and glasses are the makers' (hardware/optics.toml). The paper gives neither the orientation of "
@@ -86,13 +87,18 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
         .limit_from("the paper's least"),
         below("walk at 15 degrees over its margin", relay.walk_mm(15) / margin_mm, 0.25, "without shift", 2),
         above("iris lit at 25 degrees", relay.lit_share(25), 0.999, "fully", 4).limit_from("the paper's"),
-        within("the paper's 25 degrees, among built relays' limit", 25.0, *built.filled_deg, "25", 1).limit_from(
-            MONTE_CARLO
+        above("iris lit at 25.6 degrees, edge of the paper's 51.2", relay.lit_share(25.64), 0.95, "", 3).ours(
+            "nothing is lost"
         ),
+        within("the paper's 25 degrees, among built relays' limit", 25.0, *built.filled_deg, "25", 1)
+        .adapted(GUESSED)
+        .limit_from(MONTE_CARLO),
         attempted("iris lit at 30 degrees", relay.lit_share(30), 0.053, 0.073, "6.3 %", 3)
         .because("the nominal layout is ours; an eye 0.6 mm farther off gives 6.3 %")
         .limit_from("the paper's value +- 0.01"),
-        within("the paper's 6.3 %, among built relays", 0.063, *built.lit_at_30, "6.3 %", 3).limit_from(MONTE_CARLO),
+        within("the paper's 6.3 %, among built relays", 0.063, *built.lit_at_30, "6.3 %", 3)
+        .adapted(GUESSED)
+        .limit_from(MONTE_CARLO),
         below("error of s = (f1/f2) f_d theta/2 at 25 degrees", abs(linear), 0.01, "the formula", 4),
         above("error of the tangent instead", abs(tangent), 0.02, "", 4),
     )

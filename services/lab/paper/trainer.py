@@ -11,13 +11,14 @@ from device.recon.estimation.psf_warp import transform, warped
 from device.values import Image
 from services.lab.paper.bench import DETAIL_DEG, Bench, SimulatedFrame
 from services.lab.paper.outcome import Claim, Experiment, Outcome, Table, above, below, within
-from services.lab.paper.pictures import compared, cutline, trend
+from services.lab.paper.pictures import compared, cutline, psf_cutlines, trend
 
 EYES_DPT = (-4.0, -2.0, 0.0, 2.0, 4.0)
 PSFS_DPT = (-7.619, -4.0, -2.0, 0.0, 2.0, 4.0, 5.517)  # wavefronts of the screen at 21 and 29 mm: 1/s - 1/f
 SCALES = np.linspace(0.985, 1.015, 13)
 DEFAULT_SCHEDULE = "the instrument's ladder"
 ADAPTED = "a drawn retina instead of the HEINE trainer"
+IRIS_PX = 317  # half of the iris in pixels of the paper: the part of a PSF that is drawn
 NEAR_DEG, MARGIN = 12.0, 0.05  # region in which the scales of two pictures are compared
 
 
@@ -133,6 +134,7 @@ def _eyes_claims(eyes: Eyes, at_rest: float, sizes: Sequence[float]) -> tuple[Cl
 def run_psfs(bench: Bench) -> Outcome:
     """Solve the frame of a relaxed eye with PSFs of other eyes, as they are and rescaled to the relaxed eye."""
     paper, flat, back, shipped, off_sd, pictures = {}, {}, {}, {}, {}, {}
+    points: dict[str, Image] = {}
     for m_dpt in PSFS_DPT:
         bench.progress(f"S6: a PSF of {m_dpt:+g} dpt")
         take = bench.expose("paper_heine", {"sim.calibration.m_dpt": m_dpt})
@@ -144,6 +146,8 @@ def run_psfs(bench: Bench) -> Outcome:
         shipped[m_dpt], off_sd[m_dpt] = score_default_schedule(bench, take, -undone_dpt)
         if m_dpt in (PSFS_DPT[0], PSFS_DPT[-1]):
             pictures[f"PSF of {m_dpt:+.1f} dpt"] = picture
+        if m_dpt in (PSFS_DPT[0], 0.0, PSFS_DPT[-1]):
+            points[f"{m_dpt:+.1f} dpt"] = take.calibration.psfs[0].pixels
     falling = [flat[a] - flat[b] for a, b in ((0.0, 2.0), (2.0, 4.0), (4.0, 5.517), (0.0, -2.0), (-2.0, -4.0),
                                                (-4.0, -7.619))]  # fmt: skip
     restored = max(back[0.0] - back[m] for m in PSFS_DPT)
@@ -160,6 +164,7 @@ def run_psfs(bench: Bench) -> Outcome:
     )
     shown = (
         *compared(take, pictures),
+        psf_cutlines(points, IRIS_PX // bench.merged, "The aberrated PSFs (figure 5c)"),
         trend("Likeness to the truth over the PSF's refraction", "a relaxed eye; stretched back: the paper's solver",
               "wavefront M of the PSF's eye, dpt", "PCC",
               {"paper's solver": paper, "stretched back": back, "flat-sub": flat, "the instrument's ladder": shipped}),
