@@ -7,8 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from device.clock import SystemClock
+from device.config.device_nodes import GPIO, I2C, SPI
 from device.config.head_file import load_head
-from device.drivers.device_nodes import GPIO, I2C, SPI
 from device.drivers.no_light import NoLight
 from device.errors import LightFault, SpecError
 from device.head import is_simulated, kind_of, open_head
