@@ -52,7 +52,7 @@ class PiCamera(RetryingCamera):
     ) -> None:
         try:
             from picamera2 import MappedArray, Picamera2
-        except ImportError as error:
+        except (ImportError, ValueError) as error:  # ValueError: a module of Debian built for another NumPy
             raise CameraMissing(
                 f"picamera2 cannot be imported: {error}",
                 "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them: make pi.",
