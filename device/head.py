@@ -49,7 +49,7 @@ from device.values import Calibration, Eye
 LEASE_MARGIN_S = 0.05  # so that the guard's timer ends first; the guardian process acts only if the timer fails
 
 
-def no_repositioning(eye: Eye) -> None:
+def no_repositioning(eye: Eye, field: str | None = None) -> None:
     """Do nothing: `present_eye` of a head without simulated camera, which the operator positions by hand."""
 
 
@@ -69,7 +69,7 @@ class Head:
     button: Button | None = None
     resources: ExitStack = field(default_factory=ExitStack)  # closes the opened parts in reverse order
     provenance: Provenance | None = None
-    present_eye: Callable[[Eye], None] = no_repositioning
+    present_eye: Callable[[Eye, str | None], None] = no_repositioning
 
     @property
     def kind(self) -> str:
@@ -386,10 +386,10 @@ def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
 def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
     spec, calibration = opening.spec, opening.calibration()
-    facing: Callable[[Eye], None] = no_repositioning
+    facing: Callable[[Eye, str | None], None] = no_repositioning
     if spec.camera.backend == "sim":
         facing = opening.world.present_eye
-        facing("OD")  # traces the light now, not while a lamp is on
+        facing("OD", None)  # traces the light now, not while a lamp is on
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None

@@ -150,6 +150,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
     head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
+    field_fixed: Annotated[
+        bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
+    ] = False,
     even: Annotated[
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
@@ -170,7 +173,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     options = ReconstructOptions(
         raws[0] if raws else Path(), tuple(psf or ()), None if each else output, method, budget_s, common_dark, flat,
         head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
-        parse_settings(setting or ()), parse_bayer(bayer),
+        parse_settings(setting or ()), parse_bayer(bayer), field_fixed,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
     if each:

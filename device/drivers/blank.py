@@ -1,6 +1,7 @@
 """Stand-alone program that turns the ring of LEDs off, APA102 or TLC5971, with the standard library only.
 
-    python3 -I -S blank.py --device /dev/spidev0.0            now; for systemd's ExecStopPost= and for every boot
+    python3 -I -S blank.py --device /dev/spidev0.0            now; for systemd's ExecStopPost=
+    python3 -I -S blank.py --device /dev/spidev0.0 --insist   for every boot: again for 10 s if the bus fails
     python3 -I -S blank.py --device /dev/spidev0.0 --guard    when its parent ends, or a lease expires
 
 The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
@@ -101,9 +102,11 @@ def main() -> int:
     parser.add_argument("--leds", type=int, default=LEDS, help="how many APA102 LEDs the chain has")
     parser.add_argument("--chip", choices=("apa102", "tlc5971", "any"), default="any", help="what the chain is made of")
     parser.add_argument("--guard", action="store_true", help="darken when the parent ends or a lease runs out")
+    parser.add_argument("--insist", action="store_true", help="try again for 10 s if the bus fails")
     arguments = parser.parse_args()
     try:
-        (guard if arguments.guard else blank)(arguments.device, arguments.leds, arguments.chip)
+        darken = guard if arguments.guard else blank_with_retries if arguments.insist else blank
+        darken(arguments.device, arguments.leds, arguments.chip)
     except OSError as error:
         sys.stderr.write(f"{arguments.device} cannot be darkened: {error}\n")
         return 1

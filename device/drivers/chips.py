@@ -24,7 +24,7 @@ class I2cBus:
     def __init__(self, device: str) -> None:
         try:
             from smbus2 import SMBus, i2c_msg
-        except ImportError as error:
+        except Exception as error:  # of another numpy's compiled part: ValueError
             raise BusFault(
                 f"smbus2 cannot be used: {error}", "Install it: sudo apt install python3-smbus2, then make pi."
             ) from error

@@ -13,7 +13,7 @@ class SpiBus:
     def __init__(self, device: str) -> None:
         try:
             import spidev
-        except ImportError as error:
+        except Exception as error:  # of another numpy's compiled part: ValueError
             raise LightFault(
                 f"spidev cannot be used: {error}", "Install it: sudo apt install python3-spidev, then make pi."
             ) from error

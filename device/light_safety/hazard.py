@@ -236,14 +236,22 @@ class Hazard:
 
     def refuse(self, glow: Illumination) -> None:
         """Raise LightLimit, with the permitted level, if an illumination exceeds any of the three irradiance limits."""
+        times = self._times(glow)
+        if times > 1:
+            raise LightLimit(
+                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
+                f"Dim it to {100 * self.highest_level(glow.colour):g} % or less, or have the head's light measured.",
+            )
+
+    def highest_level(self, colour: Colour) -> float:
+        """Return the highest level of a colour within the three irradiance limits, at most 1, in steps of 0.001."""
+        return min(1.0, floor(1000 / self._times(Illumination(colour))) / 1000)
+
+    def _times(self, glow: Illumination) -> float:
+        """Return the largest irradiance over its limit."""
         limits = self.limits
-        times = max(
+        return max(
             self.photochemical_w_per_cm2(glow) / limits.photochemical_w_per_cm2,
             self.thermal_w_per_cm2(glow) / limits.thermal_w_per_cm2,
             self.waist_w_per_cm2(glow) / limits.waist_w_per_cm2,
         )
-        if times > 1:
-            raise LightLimit(
-                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
-                f"Dim it to {floor(1000 * glow.level / times) / 10:g} % or less, or have the head's light measured.",
-            )

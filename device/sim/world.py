@@ -8,7 +8,7 @@ import numpy as np
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
-from device.sim.eyes import STEPS, EffectSelector, RenderedEyes
+from device.sim.eyes import STEPS, STRAIGHT, EffectSelector, RenderedEyes
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, decide
@@ -28,7 +28,8 @@ FELLOW_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 class World:
     """Shared state of a simulated head: retina, eye, diffuser, lamp, calibration target and faults.
 
-    `eye` is the present one of `eyes`; a test may assign the eyes of another scene. A procedural left retina is the
+    `eye` is the present one of `eyes`, turned by `turn_deg` to its fixation target; a test may assign the eyes of
+    another scene. A procedural left retina is the
     mirror image of a right one; a photograph is not mirrored. `choose` selects the effects for each colour of light.
     `ambient_e_per_s` is ambient light in addition to the scene's. `target` is the light of a calibration target
     (`calibration_targets.py`), electrons per second (rows, cols): it replaces the eye, does not depend on the lamp, and
@@ -50,6 +51,7 @@ class World:
         self.spec, self.clock, self.eye = spec, clock, eye
         self.eyes = RenderedEyes(spec, eye, choose)
         self.scene: Scene = self.eyes.scene
+        self.turn_deg = STRAIGHT
         self.ambient_e_per_s = ambient_e_per_s
         self.illumination: Illumination | None = None
         self.target: Image | None = None
@@ -69,17 +71,18 @@ class World:
             )
         return part in self.faults
 
-    def present_eye(self, eye: Eye) -> None:
+    def present_eye(self, eye: Eye, field: str | None = None) -> None:
         """Present an eye to the head, with the fault "eye.other" the fellow eye; a calibration target stays in place.
 
-        The light of this eye is computed now for the picture's and the aiming colour, not later while the lamp is lit:
-        with drift for each step of a burst.
+        The eye turns to the fixation target of a field of view; None: it looks straight on. Its light is computed now
+        for the picture's and the aiming colour, not later while the lamp is lit: with drift for each step of a burst.
         """
         self.eye = FELLOW_EYE[eye] if self.has_fault("eye.other") else eye
+        self.turn_deg = self.eyes.turn_to(self.eye, field)
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
         for step in range(1, STEPS + 1) if self.eyes.drift_px else ():
-            self.eyes.electrons_per_s(self.eye, self.spec.light.colour, step)
+            self.eyes.electrons_per_s(self.eye, self.spec.light.colour, step, self.turn_deg)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -110,11 +113,11 @@ class World:
     @property
     def retina(self) -> Fundus:
         """Object of the scene for the present eye, see `RenderedEyes.retina`."""
-        return self.eyes.retina(self.eye)
+        return self.eyes.retina(self.eye, self.turn_deg)
 
     def setup(self, colour: Colour) -> OpticalSetup:
         """Return the optical setup of the present eye for one colour, with its selected effects."""
-        return self.eyes.setup(self.eye, colour)
+        return self.eyes.setup(self.eye, colour, self.turn_deg)
 
     def truth(self, colour: Colour) -> Image:
         """Return the ground truth on the sensor grid: reflectance, float32 (rows, cols), zero outside the field."""
@@ -130,7 +133,7 @@ class World:
         float32 (rows, cols), computed once per eye and colour. Without stray light and uneven response the green peak
         reaches `sim.peak_e` in `camera.exposure_s`.
         """
-        return self.eyes.electrons_per_s(self.eye, colour)
+        return self.eyes.electrons_per_s(self.eye, colour, 0, self.turn_deg)
 
     def electrons(self, exposure_s: float) -> Image:
         """Return the expected electrons of an exposure, (rows, cols): of the target, else of eye, lamp and ambient."""
@@ -143,7 +146,7 @@ class World:
         if glow is None:
             return np.broadcast_to(unlit_e, self.shape)
         step = self.lit_frames % (STEPS + 1) if self.eyes.drift_px and glow.colour == self.spec.light.colour else 0
-        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step)
+        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step, self.turn_deg)
         if self.has_fault("eye.closed"):
             returned = np.full(self.shape, np.mean(returned), np.float32)
         return returned * np.float32(glow.level * exposure_s) + unlit_e

@@ -30,6 +30,7 @@ class Sensor:
         self.held = False
         self.frames = 0
         self.shortest_frame_us = 2000
+        self.lowest_gain = 1.0
         self._coming: deque[dict[str, float]] = deque()
         self._now: dict[str, float] = {}
 
@@ -87,7 +88,8 @@ class Sensor:
         counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.scene.seed, self.frames), None)
         self._write(counts, fd, stream)
         return {
-            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": 1.0, "DigitalGain": 1.0,
+            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": self.lowest_gain,
+            "DigitalGain": 1.0,
             "FrameDuration": int((self._free_s - begin_s) * 1e6),
             "SensorBlackLevels": (int(self.world.spec.camera.black_dn) << (SHARE_16 - self.bits),) * 4,
         }  # fmt: skip
