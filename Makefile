@@ -70,7 +70,7 @@ $(GATE_ROOT)/ready:
 
 gate: $(GATE_ROOT)/ready ## Check the schematic of the gate with KiCad 9 (ERC), and write netlist and drawing to out/gate; needs root.
 	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p out/gate
-	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/tmp && kicad-cli version && \
+	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/ && kicad-cli version && \
 		kicad-cli sch erc --severity-all --exit-code-violations -o erc.rpt gate.kicad_sch && \
 		kicad-cli sch export netlist -o gate.net gate.kicad_sch && kicad-cli sch export svg -o . gate.kicad_sch'
 	@cp $(GATE_ROOT)/gate/erc.rpt $(GATE_ROOT)/gate/gate.net $(GATE_ROOT)/gate/gate.svg out/gate && cat out/gate/erc.rpt

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from device.clock import Clock
-from device.drivers.device_nodes import I2C
+from device.config.device_nodes import I2C
 from device.errors import BusFault, MemoryDamaged
 from device.values import BatteryState, HeadIdentity
 

@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from device.config.device_nodes import SPI
 from device.drivers.blank import SPEED_HZ
-from device.drivers.device_nodes import SPI
 from device.errors import LightFault
 
 

@@ -6,7 +6,7 @@ together. It is `photon_budget` taken apart, times the share of the ring that th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi, prod, radians, sin, tan
+from math import pi, prod, radians, sin, sqrt, tan
 from typing import Literal
 
 import numpy as np
@@ -64,6 +64,11 @@ def simulated(factors: Sequence[Factor], draws: int = DRAWS, seed: int = 0) -> S
     logs = rng.standard_normal((draws, len(factors))) @ spreads
     low, median, high = np.quantile(product(factors) * np.exp(logs), (0.05, 0.5, 0.95))
     return Spread(float(median), float(low), float(high))
+
+
+def log_sd(factors: Sequence[Factor]) -> float:
+    """Return the standard deviation of the logarithm of the product of independent factors."""
+    return sqrt(sum(factor.spread**2 for factor in factors))
 
 
 def possible_gains(factors: Sequence[Factor]) -> dict[Cause, float]:

@@ -14,8 +14,8 @@ from typing import Literal
 from pydantic import BaseModel
 
 from device.clock import Clock
+from device.config.device_nodes import GPIO, I2C, SPI, STRICT_GPIO, NodeKind
 from device.config.head_file import InstrumentSpec
-from device.drivers.device_nodes import GPIO, I2C, SPI, STRICT_GPIO, NodeKind
 from device.head import probe
 
 CONFIG = "boot/firmware/config.txt"

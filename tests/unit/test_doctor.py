@@ -7,10 +7,12 @@ import pytest
 from typer.testing import CliRunner
 
 from device.clock import SystemClock
+from device.config.device_nodes import GPIO, I2C, SPI
 from device.config.head_file import load_head
-from device.drivers.device_nodes import GPIO, I2C, SPI
+from device.drivers.chips import I2cBus
 from device.drivers.no_light import NoLight
-from device.errors import LightFault, SpecError
+from device.drivers.spi_bus import SpiBus
+from device.errors import HardwareError, LightFault, SpecError
 from device.head import is_simulated, kind_of, open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.values import Illumination
@@ -63,6 +65,15 @@ def test_present_buses_are_well_and_each_kind_names_its_group(machine: Machine) 
         assert f"usermod -aG {kind.group} " in (kind.remedy("/dev/x", errno.EACCES) or "")
         assert "Another program" in (kind.remedy("/dev/x", errno.EBUSY) or "")
         assert kind.remedy("/dev/x", errno.EIO) is None
+
+
+def test_a_driver_whose_device_is_missing_names_the_cause() -> None:
+    """Not `call the technician` alone, whichever buses this computer has."""
+    for open_bus, kind in ((lambda: SpiBus("/dev/spidev9.9"), SPI), (lambda: I2cBus("/dev/i2c-99"), I2C)):
+        with pytest.raises(HardwareError, match="cannot be opened") as caught:
+            open_bus()
+        assert kind.switch is not None
+        assert kind.switch in caught.value.remedy or "This computer has" in caught.value.remedy
 
 
 def test_the_gate_of_a_real_ring_is_asked_for(machine: Machine) -> None:
