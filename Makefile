@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-kills bench-store bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -39,6 +39,41 @@ $(UV):
 
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
+
+# Debian's drivers lie behind .venv's own packages on the path, so that NumPy stays that of the lock file; those that only
+# the tests' emulators need are taken out, as they would hide Debian's.
+PI_PACKAGES := python3-picamera2 python3-libcamera python3-spidev python3-smbus2 python3-libgpiod
+PI_CONFIG := /boot/firmware/config.txt
+
+pi: ## On a Raspberry Pi: install the drivers, let .venv see them, switch SPI and I2C on; then restart.
+	@[ -f $(PI_CONFIG) ] || { echo "make pi is for Raspberry Pi OS of Debian 13: there is no $(PI_CONFIG) here"; exit 1; }
+	@sudo apt-get update -qq
+	@sudo apt-get install -y -qq --no-install-recommends $(PI_PACKAGES) python3-venv python3-dev gcc
+	@$(MAKE) .venv/ready
+	@$(BIN)/pip uninstall -qq -y picamera2 spidev smbus2
+	@echo /usr/lib/python3/dist-packages > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/debian.pth"
+	@for line in dtparam=spi=on dtparam=i2c_arm=on dtparam=strict_gpiod; do \
+		grep -qxF "$$line" $(PI_CONFIG) || echo "$$line" | sudo tee -a $(PI_CONFIG); done
+	@echo i2c-dev | sudo tee /etc/modules-load.d/diffuscope-i2c.conf >/dev/null
+	@sudo usermod -aG spi,i2c,gpio,video "$$(id -un)"
+	@echo "Restart the computer, then: $(BIN)/diffuscope doctor"
+
+# KiCad 9 comes from Debian 13 in a chroot of 1.5 GB, which only root can make; nothing of the tests needs it.
+GATE_ROOT := out/kicad
+
+$(GATE_ROOT)/ready:
+	@[ "$$(id -u)" = 0 ] || { echo "make gate makes a chroot, which only root can: sudo make gate"; exit 1; }
+	@command -v mmdebstrap >/dev/null || { apt-get update -qq && apt-get install -y -qq mmdebstrap >/dev/null; }
+	@rm -rf $(GATE_ROOT) && mkdir -p out && mmdebstrap --quiet --variant=minbase --include=kicad --aptopt='Apt::Install-Recommends "false"' \
+		trixie $(GATE_ROOT) http://deb.debian.org/debian
+	@touch $@
+
+gate: $(GATE_ROOT)/ready ## Check the schematic of the gate with KiCad 9 (ERC), and write netlist and drawing to out/gate; needs root.
+	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p out/gate
+	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/tmp && kicad-cli version && \
+		kicad-cli sch erc --severity-all --exit-code-violations -o erc.rpt gate.kicad_sch && \
+		kicad-cli sch export netlist -o gate.net gate.kicad_sch && kicad-cli sch export svg -o . gate.kicad_sch'
+	@cp $(GATE_ROOT)/gate/erc.rpt $(GATE_ROOT)/gate/gate.net $(GATE_ROOT)/gate/gate.svg out/gate && cat out/gate/erc.rpt
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py
@@ -174,11 +209,17 @@ FRAMES ?= 60
 bench-refraction: .venv/ready ## Print error and coverage of the refraction on textbook frames; DATA=folder has photographs, FRAMES=60 of each sensor and field.
 	@$(BIN)/python -m tests.bench.refraction --data "$(DATA)" --frames $(FRAMES)
 
+bench-montage: .venv/ready ## Print the acceptance figures of the montage on photographs; DATA=folder has them.
+	@$(BIN)/python -m tests.bench.montage --data "$(DATA)"
+
 bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
 	@$(BIN)/python -m tests.bench.sides "$(DATA)"
 
 bench-psf: .venv/ready ## Print what the PSF consistency check finds in recordings and simulated frames; DATA=folder has recordings.
 	@$(BIN)/python -m tests.bench.psf_consistency "$(DATA)"
+
+bench-frames: .venv/ready ## Print what bursts and colours of moving photographs give; DATA=folder has the photographs.
+	@$(BIN)/python -m tests.bench.frames "$(DATA)"
 
 bench-data: .venv/ready ## Compare all methods and LenslessPiCam on the pairs of a data set; DATA=folder has it.
 	@mkdir -p out

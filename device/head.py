@@ -26,6 +26,7 @@ from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
 from device.drivers.gpio import InputLine, OutputLine
 from device.drivers.guardian import Guardian
 from device.drivers.heartbeat import Heartbeat
+from device.drivers.no_light import NoLight
 from device.drivers.pi_camera import PiCamera
 from device.drivers.probe import ProbeFinding, probe_parts
 from device.drivers.ring import Apa102Ring, LedRing, Tlc5971Ring
@@ -139,6 +140,11 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
     if spec.calibration is not None:
         kept = Archive(spec.calibration.archive).load()
         spec = with_led_radiometry(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
+    if spec.light.backend == "none":
+        raise SpecError(
+            f"{spec.name} has no lamp, so it takes no pictures of eyes",
+            "Take frames in the light that is there: diffuscope frame --head HEAD -o raw.tiff (hardware/bench.md).",
+        )
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with HeadOpener(spec, clock, allocator) as opening:
@@ -198,6 +204,8 @@ class HeadOpener:
         """Return the lamp without light guard; a real one with `chain`, if given, instead of the head file's LEDs."""
         if self.spec.light.backend == "sim":
             return SimLight(self.world)
+        if self.spec.light.backend == "none":
+            return NoLight()
         ring = self._ring(chain)
         self.resources.callback(ring.close)
         return MirroredLight(ring, self.world) if self.spec.camera.backend == "sim" else ring
@@ -348,12 +356,13 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
         )
 
 
-def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Iterator[ProbeFinding]:
+def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None, *, leds: bool = True) -> Iterator[ProbeFinding]:
     """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
 
-    A HardwareError of a part becomes a finding and is not raised. The lamp is dark at the end.
+    Without `leds` the lamp stays dark. A HardwareError of a part becomes a finding and is not raised. The lamp is dark
+    at the end.
     """
-    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator))
+    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator), leds=leds)
 
 
 @contextmanager

@@ -34,6 +34,7 @@ class CameraSpec(Table):
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
     device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
     row_us: float = Field(default=30.0, gt=0, le=1000)
+    bayer: bool = False  # colour filters before the pixels; the driver refuses a sensor with filters otherwise
     upright: bool = False  # checked by hand: pictures are upright and not mirrored (hardware/assembly.md)
 
     @model_validator(mode="before")

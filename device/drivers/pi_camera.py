@@ -56,7 +56,7 @@ class PiCamera(RetryingCamera):
         except Exception as error:  # of another numpy's compiled part: ValueError
             raise CameraMissing(
                 f"picamera2 cannot be imported: {error}",
-                "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them.",
+                "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them: make pi.",
             ) from error
         self._library, self._mapped = Picamera2, MappedArray
         super().__init__(spec, light, simulated)
@@ -64,12 +64,14 @@ class PiCamera(RetryingCamera):
         self._device: Any = None
         self._layout: RawLayout
         self._gain = 1.0  # lowest of the sensor, at least 1: an IMX708 begins at 1.123
+        self._mosaic = "R"
         self.open(ExposureSettings(spec.exposure_s))
 
     @property
     def facts(self) -> dict[str, str]:
-        """Return the sensor's name and the granted raw format by the keys `sensor` and `format`, for a technician."""
-        return {"sensor": str(self._spec.sensor), "format": self._layout.name}
+        """Return `sensor` and the granted raw `format`, for a technician; and `mosaic` of a sensor with filters."""
+        facts = {"sensor": str(self._spec.sensor), "format": self._layout.name}
+        return facts if self._mosaic == "R" else {**facts, "mosaic": self._mosaic.removeprefix("S")}
 
     # Opening
 
@@ -85,7 +87,8 @@ class PiCamera(RetryingCamera):
     def _start(self, exposure_s: float) -> None:
         device = self._device = self._library(self._camera_index(), allocator=self._allocator)
         spec, size = self._spec, (self._spec.cols, self._spec.rows)
-        mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        mosaic = self._mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        self._refuse_unexpected_mosaic(mosaic)
         asked = device.create_video_configuration(
             main={"size": (min(MAIN[0], size[0] & ~1), min(MAIN[1], size[1] & ~1))},
             raw={"format": f"{mosaic}{spec.bit_depth}", "size": size},
@@ -97,6 +100,16 @@ class PiCamera(RetryingCamera):
         self._layout = self._granted_layout(device.camera_configuration())
         device.start()
         log.info("%s: raw %s", spec.sensor, device.camera_configuration()["raw"])
+
+    def _refuse_unexpected_mosaic(self, mosaic: str) -> None:
+        """Raise CameraMismatch for colour filters that the head file does not expect: counts would not be grey."""
+        if mosaic != "R" and not self._spec.bayer:
+            raise CameraMismatch(
+                f"the {self._spec.sensor} has colour filters ({mosaic.removeprefix('S')}); this head needs the "
+                "monochrome version",
+                "Fit the monochrome version. For a bench write bayer = true under [camera], and reconstruct with "
+                "--bayer.",
+            )
 
     def _camera_index(self) -> int:
         """Return the index of the first camera with the sensor of the head file; CameraMissing or CameraMismatch."""

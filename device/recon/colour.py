@@ -21,7 +21,8 @@ RGB: tuple[ChannelName, ...] = ("red", "green", "blue")  # channels of the pictu
 FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
 BAND_PER_PX = (0.01, 0.12)
 GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
-LEAST_SD = 6.0  # as in `burst`
+GUIDED_SHARE = 0.5  # of the filtered picture; the rest keeps what green does not show
+LEAST_SD = 8.0  # of the correlation: all wrong registrations had 6.5 or less, all right ones 10 or more
 
 # Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over four
 # photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3).
@@ -53,7 +54,7 @@ def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) ->
     shifts, doubtful = register_colours(pictures, reference, field, n)
     on_grid = {name: moved_back(picture, np.ones_like(picture), shifts[name])[0] for name, picture in pictures.items()}
     guided = {
-        name: picture if name == reference else guided_filter(picture, on_grid[reference], field)
+        name: picture if name == reference else _with_guide(picture, on_grid[reference], field)
         for name, picture in on_grid.items()
     }
     red = guided.get("red", guided.get("amber", guided[reference]))
@@ -89,6 +90,12 @@ def register_colours(
             found = Registration((found.shift_px[0] + rest[0], found.shift_px[1] + rest[1]), 1.0, 0.0)
         shifts[name] = found.shift_px
     return shifts, tuple(doubtful)
+
+
+def _with_guide(picture: Image, guide: Image, field: Image) -> Image:
+    """Return the mean of a picture and its guided filter, by GUIDED_SHARE (NUMERICS.md 10.2)."""
+    share = np.float32(GUIDED_SHARE)
+    return share * guided_filter(picture, guide, field) + (1 - share) * picture
 
 
 def guided_filter(picture: Image, guide: Image, field: Image) -> Image:

@@ -77,9 +77,14 @@ class ColourReconstructor:
         reasons = dict(missing or {})
         for colour, counts in frames.items():
             try:
-                pictures[colour] = yield from run.solve(colour, counts, dark, made.report.psf_scale)
-            except (FrameError, _NoTime) as error:
-                reasons[colour] = str(error)
+                solved = yield from run.solve(colour, counts, dark, made.report.psf_scale)
+            except FrameError as error:
+                reasons[colour] = error.message
+                continue
+            if solved is None:
+                reasons[colour] = NO_TIME
+            else:
+                pictures[colour] = solved
         gone = tuple(ChannelUse(colour, None, reason=reason) for colour, reason in reasons.items())
         if len(pictures) == 1:
             yield replace(made, report=replace(made.report, channels=(ChannelUse("green", (0.0, 0.0)), *gone)))
@@ -118,10 +123,6 @@ class ColourReconstructor:
         stage.refocus(otf, scale)
 
 
-class _NoTime(Exception):
-    """The rest of the time budget is too short for another colour."""
-
-
 class _Run:
     """State of one picture: the time that the other colours have taken, and the deadline, which pauses move."""
 
@@ -136,17 +137,19 @@ class _Run:
             yield from self._passed_on(step)
         raise AssertionError("a reconstruction ends with a picture")
 
-    def solve(self, colour: Colour, counts: Pixels, dark: Pixels | None, scale: float) -> Generator[Step, None, Image]:
+    def solve(
+        self, colour: Colour, counts: Pixels, dark: Pixels | None, scale: float
+    ) -> Generator[Step, None, Image | None]:
         """Yield a pause after each round of one colour, and return its picture; its PSF is stretched by `scale`.
 
-        _NoTime if no time is left, FrameError for a useless frame.
+        None if no time is left for it. FrameError for a useless frame.
         """
         owner = self._owner
         one, join_s = owner.others[colour], owner.join_cost.seconds
         first = one.stages[0]
         if not self._fits(join_s + first.start_cost.seconds + first.finish_cost.seconds):
             owner.join_cost.halve_maximum()
-            raise _NoTime(NO_TIME)
+            return None
         begin_s = owner.clock.now_s()
         owner.refocus(colour, scale)
         deadline = None if self._deadline is None else self._deadline.later(-join_s)

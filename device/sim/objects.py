@@ -42,7 +42,8 @@ def draw_object(
     what, gaze = scene.object, scene.eye.gaze_deg
     at_deg = (what.at_deg[0] + gaze[0] + turn_deg[0], what.at_deg[1] + gaze[1] + turn_deg[1])
     if what.kind in ("retina", "image"):
-        return _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
+        found = _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
+        return found if what.cut_deg is None else _cut(found, what.cut_deg, px_per_deg)
     _refuse_drawing_beyond_field(what, scene.eye.focal_length_um, optics.field_deg, at_deg)
     outside = {"dots": _dots, "ruler": _ruler, "point": _disc}[what.kind](what)
     plane = _coverage(outside, scene.eye.focal_length_um, shape, px_per_deg, at_deg)
@@ -109,7 +110,7 @@ def _picture(
     """
     what = scene.object
     if what.image is not None:
-        return photograph(what.image, shape, px_per_deg, wide_deg)
+        return photograph(what.image, shape, px_per_deg, wide_deg, None if what.cut_deg is None else what.cut_deg[0])
     return fundus(
         shape, px_per_deg, wide_deg, scene.seed % 2**32, eye=eye, haemorrhages=what.haemorrhages,
         microaneurysms=what.microaneurysms, exudates=what.exudates,
@@ -134,6 +135,18 @@ def _crop_to_field(found: Fundus, shape: tuple[int, int], radius_px: float, move
     planes = {colour: (shifted(plane) * edge).astype(np.float32) for colour, plane in found.reflectance.items()}
     vessels = None if found.vessels is None else (shifted(found.vessels.astype(np.float32)) > 0.5) & field
     return Fundus(planes, field, vessels, place(found.disc), place(found.fovea))
+
+
+def _cut(found: Fundus, cut_deg: Pair, px_per_deg: float) -> Fundus:
+    """Return an object cut to a centred rectangle (right, down) with an edge of one pixel."""
+    sides = [
+        np.clip(px_per_deg * side / 2 + 0.5 - np.abs(np.arange(n) - (n - 1) / 2), 0, 1).astype(np.float32)
+        for n, side in zip(found.field.shape, reversed(cut_deg), strict=True)
+    ]
+    window = sides[0][:, None] * sides[1][None, :]
+    kept = found.field & (window > 0.5)
+    planes = {colour: plane * window for colour, plane in found.reflectance.items()}
+    return Fundus(planes, kept, None if found.vessels is None else found.vessels & kept, found.disc, found.fovea)
 
 
 def _soft_field(shape: tuple[int, int], radius_px: float) -> Image:

@@ -75,10 +75,7 @@ def create_app(
     visits, lease = VisitRepository(store.engine, protocol or load_protocol(), clock), ControlLease(clock)
     queue, pack = UploadQueue(store.engine, clock), archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
-    sources = AlertSources(
-        lambda: read_status(arbiter), store, visits, lambda: lease.holder, None if worker is None else queue
-    )
-    alerts = AlertMonitor(sources, clock, arbiter.context.event_bus.publish)
+    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
     montages = MontageMaker(store, lambda: arbiter.is_idle)
     life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
@@ -100,6 +97,15 @@ def create_app(
         app.include_router(router, dependencies=[Depends(login_required(authenticator))])
     add_page_routes(app)
     return Application(app, visits, lease, alerts, worker)
+
+
+def _alert_monitor(
+    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None
+) -> AlertMonitor:
+    """Return the monitor of the alerts of an application; `queue` None: nothing is uploaded."""
+    context = arbiter.context
+    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue)
+    return AlertMonitor(sources, context.clock, context.event_bus.publish)
 
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]

@@ -235,7 +235,7 @@ def read_png(png: bytes) -> Image:
         raise FrameError(f"this is not a whole PNG: {error}") from error
     light = from_srgb(pixels)
     if simulated:
-        rows, cols = _band(*light.shape[:2]).shape
+        rows, cols = _band(*light.shape[:2], MARK, _LETTER_RATIO).shape
         light[-rows:, :cols] = 0
     return light
 

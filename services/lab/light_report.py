@@ -135,17 +135,17 @@ def gains_svg(design: Design, frames: int = 1) -> str:
     """Return bars, logarithmic from 1 to 100, of the possible gains of light by cause, and the light itself, as SVG."""
     factors = chain(design, frames=frames)
     gains = {cause: gain for cause, gain in possible_gains(factors).items() if gain > 1}
-    spread, scale, y = simulated(factors), (WIDE - LEFT - 70) / log10(100), 78.0
+    spread, scale, y = simulated(factors), (WIDE - LEFT - 70) / log10(100), 92.0
     light = f"{spread.median:.0f} electrons in a cell of 10 um, 90 % between {spread.low:.0f} and {spread.high:.0f}"
-    parts = [text(16, 28, "Times more light if this were ideal", "title"),
-             text(16, 50, f"{design.title}: {light}", "small quiet")]  # fmt: skip
+    parts = [text(16, 28, "Times more light if this were ideal", "title"), text(16, 48, design.title, "small quiet"),
+             text(16, 64, light, "small quiet")]  # fmt: skip
     for cause, gain in gains.items():
         long = max(1.0, scale * log10(min(gain, 100.0)))
         parts.append(text(LEFT - 8, y + 5, cause, "small", "end"))
         parts.append(f'<rect class="mark s1" x="{LEFT}" y="{y - 8:.1f}" width="{long:.1f}" height="16"/>')
         parts.append(text(LEFT + long + 8, y + 5, f"x {gain:.1f}", "small"))
         y += BAR
-    parts.append(line(LEFT, 64, LEFT, y - 10, "frame"))
+    parts.append(line(LEFT, 78, LEFT, y - 10, "frame"))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDE} {y:.0f}" role="img" '
         f'aria-label="Possible gains of light by cause"><style>{STYLE}</style>'

@@ -75,9 +75,9 @@ def test_sphere_and_field_edge_are_found_together(estimator: RefractionEstimator
     assert isinstance(found, Refraction)
     assert abs(found.sphere_dpt - 2.5) < 3 * found.sd_dpt
     assert found.sd_dpt < 0.35
-    assert found.field_deg == pytest.approx(edge.diameter_deg, abs=0.1)
-    assert (found.edge_deg.right, found.edge_deg.down) == pytest.approx((edge.right_deg, edge.down_deg), abs=0.06)
-    assert found.edge_deg.width == pytest.approx(edge.width_deg, abs=0.5)
+    assert found.edge.diameter_deg == pytest.approx(edge.diameter_deg, abs=0.1)
+    assert (found.edge.right_deg, found.edge.down_deg) == pytest.approx((edge.right_deg, edge.down_deg), abs=0.06)
+    assert found.edge.width_deg == pytest.approx(edge.width_deg, abs=0.5)
 
 
 def test_the_cylinder_is_reported_on_the_axis_of_the_correcting_lens(estimator: RefractionEstimator) -> None:

@@ -131,3 +131,18 @@ def test_a_sensor_whose_lowest_gain_is_above_one_gives_frames(bench):
     """Defect 13: an IMX708 begins at 1.123, which was never the gain that was asked for."""
     bench.sensor.lowest_gain = IMX708_LOWEST_GAIN
     assert bench.open().expose(SHOT).counts.mean() > 0
+
+
+def test_a_colour_sensor_where_a_monochrome_one_is_expected_is_refused(bench):
+    bench.sensor.arrangement = 0
+    with pytest.raises(CameraMismatch, match=r"has colour filters \(RGGB\)") as caught:
+        bench.open()
+    assert "bayer = true" in caught.value.remedy
+
+
+def test_an_expected_mosaic_is_read_as_the_sensor_gives_it(bench):
+    """The raw counts stay those of the sensor; `reconstruct --bayer` takes them apart."""
+    bench.sensor.arrangement = 0
+    camera = bench.open(bayer=True)
+    assert camera.facts == {"sensor": "imx296", "format": "SRGGB12", "mosaic": "RGGB"}
+    assert camera.expose(SHOT).counts.shape == camera.shape

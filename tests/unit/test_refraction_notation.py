@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from device.recon.estimation.refraction import Cylinder, NoRefraction, Refraction
-from device.recon.estimation.refraction_edge import Edge
+from device.recon.estimation.refraction_edge import FieldEdge
 from device.recon.estimation.refraction_notation import REFRACTION_KEYS, report_of, sphere_cylinder
 
 DPT = st.floats(-8, 8)
 
 
 def found(m_dpt: float, cylinder: Cylinder | None) -> Refraction:
-    return Refraction(m_dpt, 0.1, 1 - 0.003375 * m_dpt, 900.0, (), Edge(16.7, 0, 0, 0.3), 0.02, 0.1, cylinder)
+    return Refraction(m_dpt, 0.1, 1 - 0.003375 * m_dpt, 900.0, (), FieldEdge(33.4, 0, 0, 0.3, 0.02), 0.0, cylinder)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,16 @@ function channelText({ name, predicted, reason }) {
   return reason ? t("detail.channels.missing", { colour }) : colour;
 }
 
+const signed = (dpt) => `${dpt < 0 ? "−" : "+"}${number(Math.abs(dpt), 2)}`;
+
+/** Return the refraction of a report as text: sphere / cylinder x axis, or the mean sphere of a report without a cylinder. */
+export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylinder, axis_deg: axis, refused = null }) {
+  if (refused !== null || sphere == null || sd == null) return t("detail.refraction.none");
+  const mean = { mean: signed(sphere), sd: number(sd, 2) };
+  if (cylinder == null) return t("detail.refraction.mean", mean);
+  return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
+}
+
 export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
   const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
@@ -26,6 +36,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
     ["stopped", report.stopped],
     ...(frames.length ? [["frames", t("detail.frames.value", { used, all: frames.length })]] : []),
     ...(channels.length ? [["channels", channels.map(channelText).join(", ")]] : []),
+    ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
     ["calibration", calibration],
     ["id", id],

@@ -29,6 +29,9 @@ async function requestJson(path, options) {
 export const getStatus = () => requestJson("/api/status");
 export const getProtocol = () => requestJson("/api/protocol");
 export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
+const montageUrl = (visit, eye) => `/api/visits/${encodeURIComponent(visit)}/montage/${encodeURIComponent(eye)}`;
+export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));
+export const montagePictureUrl = (visit, eye, digest) => `${montageUrl(visit, eye)}/picture.png?${digest}`;
 export const getVisits = (query) => requestJson(`/api/visits?${new URLSearchParams(query)}`);
 export const getCapture = (id) => requestJson(`/api/captures/${encodeURIComponent(id)}`);
 export const getOutbox = () => requestJson("/api/outbox");

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.psf_warp import Transform, transform
-from device.recon.estimation.refraction_edge import PARAMETERS, Candidate, Edge, EdgeLikelihood
+from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.refraction_cylinder import find_cylinder
+from device.recon.estimation.refraction_edge import EdgeLikelihood, FieldEdge
 from device.recon.estimation.refraction_likelihood import RefractionLikelihood
-from device.recon.estimation.refraction_uncertainty import Quadratic, block_of_frequency, quadratic_model
+from device.recon.estimation.refraction_uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import Grid, Pair, support_radius_px
@@ -33,17 +34,13 @@ from device.values import Calibration
 SPAN_DPT = 9.0
 FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of a search over M
 COARSE_FRINGES = 0.3  # the same of the coarse search with the edge
+COARSE_PARAMETERS = 1  # of the edge in the coarse search: the radius
 LEAST_NATS = 100.0  # median minus minimum of the coarse search
 LEAST_FREQUENCIES = 500
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
-ROUNDS = 4  # of smooth part, search and edge; a gap needs three, since its filling biases M towards the PSF of the fit
+ROUNDS = 3  # of smooth part, search and edge; a gap needs them, since its filling biases M towards the PSF of the fit
 SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
 CURVATURE_STEP_DPT = 0.25
-CYLINDER_STEPS_DPT = (0.5, 0.3)  # of the quadratic models in M, J0 and J45
-CYLINDERS_DPT = (0.7, 1.4)  # of the coarse search over J0 and J45
-CYLINDER_AXES = 8
-MOST_DESCENTS = 6
-MOST_CYLINDER_DPT = 3.0  # |J|
 MOST_SD_DPT = 1.5
 
 Floats = NDArray[np.float64]
@@ -65,9 +62,8 @@ class Refraction:
 
     The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
     (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
-    the coarse grid. `field_deg` is the diameter of the field found with it, with its sd; `edge_deg` the whole edge.
-    `likelihood_sd_dpt` is the part of the sd that the likelihood gives. `cylinder` is None before
-    `RefractionEstimator.add_cylinder`.
+    the coarse grid. `edge` is the edge of the lit field that was found with M.
+    `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`.
     """
 
     sphere_dpt: float
@@ -75,15 +71,9 @@ class Refraction:
     psf_scale: float
     nats: float
     curve: tuple[tuple[float, float], ...]
-    edge_deg: Edge
-    field_sd_deg: float
-    likelihood_sd_dpt: float
+    edge: FieldEdge
+    missing_sd_dpt: float
     cylinder: Cylinder | None = None
-
-    @property
-    def field_deg(self) -> float:
-        """Diameter of the lit field in degrees."""
-        return 2 * self.edge_deg.radius
 
     @property
     def in_doubt(self) -> bool:
@@ -118,8 +108,7 @@ class RefractionEstimator:
             raise SettingError("a refraction needs the head's geometry and field", "Give --head HEAD.toml.")
         self.geometry = geometry
         self._calibration, self._shape, self._planner, self._index = calibration, shape, planner, index
-        self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index)
-        self._edge_count = 0 if edge_is_known else None
+        self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index, edge_is_known)
         taper, bands = self._edges.likelihood.taper, self._edges.likelihood.bands
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
@@ -141,117 +130,65 @@ class RefractionEstimator:
         self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
     ) -> Refraction | NoRefraction:
         """Estimate M and the field edge of a frame (rows, cols) in counts; `defects` (flat indices) are left out."""
-        edges = self._edges
+        edges, relaxed = self._edges, np.zeros(1)
         if edges.band.where.size < LEAST_FREQUENCIES:
             return NoRefraction("the PSF passes too few frequencies")
         frame = edges.start(counts, dark, defects)
-        if not edges.fit_smooth(self._stretch(np.zeros(1))) > 0:
+        if not edges.fit_smooth(relaxed) > 0:
             return NoRefraction("the frame holds no light of the field")
-        edges(self._stretch(np.zeros(1)), 0)
-        edges.set_noise()
-        coarse = Search(lambda m_dpt: edges(self._stretch(np.array([m_dpt])), self._count(1)).nats)
+        edges.set_noise(relaxed)
+        coarse = Search(lambda m_dpt: edges(np.array([m_dpt]), COARSE_PARAMETERS).nats)
         m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
         if coarse.depth_nats < LEAST_NATS:
             return NoRefraction("the frame does not show the structure of this PSF")
         m_dpt = self._alternate(m_dpt)
         if abs(m_dpt) >= SPAN_DPT:
             return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
-        model = quadratic_model(self._terms, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
+        model = quadratic_model(edges.terms, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
         if not model.is_minimum:
             return NoRefraction("the likelihood has no clear minimum")
-        (m_dpt,), (sd_dpt,) = model.minimum, self._sds(model)
-        likelihood_sd_dpt = float(sd_dpt)
-        sd_dpt = float(np.hypot(sd_dpt, SD_PER_MISSING_DPT * frame.missing))
+        missing_dpt = SD_PER_MISSING_DPT * frame.missing
+        (m_dpt,), (sd_dpt,) = model.minimum, np.hypot(model.sds(self._spread), missing_dpt)
         if sd_dpt > MOST_SD_DPT:
             return NoRefraction(f"the standard deviation would be {sd_dpt:.1f} dpt")
+        edge = edges.field_edge(edges.edge_model(model.minimum))
         curve = tuple(sorted(coarse.known.items()))
-        edge_deg = edges.edge.scaled(1 / edges.per_deg)
         return Refraction(
-            float(m_dpt), sd_dpt, self.scale(float(m_dpt)), coarse.depth_nats, curve, edge_deg,
-            self._field_sd_deg(model.minimum), likelihood_sd_dpt,
-        )  # fmt: skip
+            float(m_dpt), float(sd_dpt), self.scale(float(m_dpt)), coarse.depth_nats, curve, edge, missing_dpt
+        )
 
     def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
         """Estimate M, J0 and J45 of the frame for which `find` has just returned `found`."""
-        eye_dpt = self._coarse_cylinder(found.sphere_dpt)
-        for step_dpt in CYLINDER_STEPS_DPT:
-            self._edges.fit_smooth(self._stretch(eye_dpt))
-            eye_dpt = self._descend(eye_dpt, step_dpt)
-            model = quadratic_model(self._terms, eye_dpt, step_dpt, self._blocks)
-            if not model.is_minimum or np.hypot(*model.minimum[1:]) > MOST_CYLINDER_DPT:
-                return NoRefraction("the likelihood has no clear minimum with a cylinder")
-            eye_dpt = model.minimum
-            self._edges.move_edge(self._candidate(eye_dpt).step)
-        sds_dpt = self._sds(model)
+        model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
+        if model is None:
+            return NoRefraction("the likelihood has no clear minimum with a cylinder")
+        sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
         if sds_dpt.max() > MOST_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
-        m_dpt, j0_dpt, j45_dpt = (float(value) for value in eye_dpt)
-        missing_dpt = float(np.sqrt(max(found.sd_dpt**2 - found.likelihood_sd_dpt**2, 0)))
+        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = model.minimum.tolist(), sds_dpt.tolist()
         return replace(
-            found, sphere_dpt=m_dpt, sd_dpt=float(np.hypot(sds_dpt[0], missing_dpt)), psf_scale=self.scale(m_dpt),
-            edge_deg=self._edges.edge.scaled(1 / self._edges.per_deg), field_sd_deg=self._field_sd_deg(eye_dpt),
-            cylinder=Cylinder(j0_dpt, float(sds_dpt[1]), j45_dpt, float(sds_dpt[2])),
+            found, sphere_dpt=m_dpt, sd_dpt=sd_dpt, psf_scale=self.scale(m_dpt),
+            edge=self._edges.field_edge(self._edges.edge_model(model.minimum)),
+            cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
         )  # fmt: skip
-
-    def _coarse_cylinder(self, m_dpt: float) -> Floats:
-        """Return M, J0 and J45 of the best candidate on circles around no cylinder."""
-        turns = 2 * np.pi * np.arange(CYLINDER_AXES) / CYLINDER_AXES
-        grid = [np.array([m_dpt, 0, 0])]
-        grid += [np.array([m_dpt, j_dpt * np.cos(t), j_dpt * np.sin(t)]) for j_dpt in CYLINDERS_DPT for t in turns]
-        return min(grid, key=lambda eye_dpt: self._candidate(eye_dpt).nats)
-
-    def _descend(self, eye_dpt: Floats, step_dpt: float) -> Floats:
-        """Return the local minimum of steps along the three axes, within MOST_DESCENTS rounds."""
-        steps = [sign * step_dpt * axis for axis in np.eye(eye_dpt.size) for sign in (-1, 1)]
-        nats = self._candidate(eye_dpt).nats
-        for _ in range(MOST_DESCENTS):
-            beside = [(self._candidate(eye_dpt + step).nats, k) for k, step in enumerate(steps)]
-            least, k = min(beside)
-            if least >= nats:
-                break
-            nats, eye_dpt = least, eye_dpt + steps[k]
-        return eye_dpt
 
     def _alternate(self, m_dpt: float) -> float:
         """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on."""
-        step_dpt = self.step_dpt
+        step_dpt = self.step_dpt / 2
         for _ in range(ROUNDS):
-            self._edges.fit_smooth(self._stretch(np.array([m_dpt])))
-            fine = Search(lambda m_dpt: self._candidate(np.array([m_dpt])).nats)
-            before_dpt = m_dpt
-            m_dpt = fine.descend(m_dpt, step_dpt)
-            m_dpt, _ = fine.fit_parabola(m_dpt, step_dpt)
-            change = self._edges.move_edge(self._candidate(np.array([m_dpt])).step)
-            step_dpt = max(step_dpt / 2, self.step_dpt / 4)
-            if change < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT:
+            self._edges.fit_smooth(np.array([m_dpt]))
+            fine = Search(self._near(m_dpt))
+            before_dpt, (m_dpt, _) = m_dpt, fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
+            change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
+            step_dpt = self.step_dpt / 4
+            if change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT:
                 break
         return m_dpt
 
-    def _count(self, count: int) -> int:
-        return count if self._edge_count is None else self._edge_count
-
-    def _candidate(self, eye_dpt: Floats) -> Candidate:
-        return self._edges(self._stretch(eye_dpt), self._count(PARAMETERS))
-
-    def _terms(self, eye_dpt: Floats) -> tuple[float, Floats]:
-        found = self._candidate(eye_dpt)
-        return found.nats, found.terms
-
-    def _sds(self, model: Quadratic) -> Floats:
-        """Return the standard deviations of the components of the minimum, in dpt."""
-        noise, sectors = model.covariance(self._spread)
-        return np.asarray(np.sqrt(np.diag(noise) + np.diag(sectors)))
-
-    def _field_sd_deg(self, eye_dpt: Floats) -> float:
-        """Return the sd of the field's diameter for a known eye, in degrees; 0 if it was not fitted."""
-        information = self._candidate(eye_dpt).information
-        if self._count(1) == 0:
-            return 0.0
-        return float(2 * np.sqrt(np.linalg.inv(information)[0, 0]) / self._edges.per_deg)
-
-    def _stretch(self, eye_dpt: Floats) -> Transform:
-        """Return the stretch of an eye with M or with M, J0 and J45."""
-        return transform(self.geometry, *(float(value) for value in eye_dpt))
+    def _near(self, m_dpt: float) -> Callable[[float], float]:
+        """Return the likelihood of M with the linear model of the edge around `m_dpt`."""
+        model = self._edges.edge_model(np.array([m_dpt]))
+        return lambda near_dpt: self._edges.near(np.array([near_dpt]), model).nats
 
     def scale(self, m_dpt: float) -> float:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""

@@ -4,27 +4,26 @@ A cropped sensor shows only the inner part of the PSF of a point at the field ed
 another refraction: 0.1 deg costs 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. The edge is therefore not
 taken from the calibration. For each candidate eye T the likelihood of `refraction` is minimised over the edge e:
 
-    E(T) = min over e of  sum over f of  log S + |R_T - sum_k e_k R_T,k|^2 / S  +  |e / PRIOR|^2
+    E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_calibrated) / PRIOR|^2
 
-R_T,k is the tapered spectrum of the derivative of smooth object times edge with respect to e_k (radius, centre, width),
+R_T,k is the tapered spectrum of the derivative of smooth part times edge with respect to e_k (radius, centre, width),
 blurred by the candidate's PSF. It is a generalised least-squares step with the spectrum S of the retina's detail as
-covariance; the steps are repeated with the smooth object fitted anew within the edge found (NUMERICS.md 7.5).
+covariance; the steps are repeated with the smooth part fitted within the edge found (NUMERICS.md 7.5).
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft as scipy_fft
 
-from device.recon.estimation.psf_warp import Transform
+from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.refraction_field import Edge, LitField
 from device.recon.estimation.refraction_likelihood import SMEAR, TURNS, Band, RefractionLikelihood
-from device.recon.estimation.shading import BLOCK, RIDGE, STRAY_RIDGE, blocks, zernike_modes
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.grid import Pair
 from device.recon.model.kernels import Pixels, Places
-from device.recon.model.preprocessing import LEAST_GOOD, Linear
+from device.recon.model.preprocessing import Linear
 from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
@@ -38,45 +37,29 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Edge:
-    """Lit disc: radius, centre (down, right of the sensor's) and full width of its cosine ramp, in samples or degrees.
+class FieldEdge:
+    """Lit disc: diameter, centre (down, right of the sensor's) and full width of its cosine ramp, in degrees.
 
-    The light is one half at the radius. A width below one sample counts as one sample.
+    `diameter_sd_deg` is the standard deviation of the diameter for a known eye; 0 if the edge was not estimated.
     """
 
-    radius: float
-    down: float
-    right: float
-    width: float
+    diameter_deg: float
+    down_deg: float
+    right_deg: float
+    width_deg: float
+    diameter_sd_deg: float
 
-    @property
-    def vector(self) -> Floats:
-        """The four parameters as an array."""
-        return np.array([self.radius, self.down, self.right, self.width])
 
-    def scaled(self, factor: float) -> "Edge":
-        """Return the edge in another unit."""
-        return Edge(*(self.vector * factor))
+@dataclass(frozen=True)
+class EdgeModel:
+    """Linear model of the edge around one candidate: spectra of the derivatives, (k, K), and their covariance model.
 
-    def light(self, rows: Image, cols: Image) -> Image:
-        """Return the share of the light at positions relative to the sensor's centre, 0 to 1."""
-        share: Image = 0.5 - 0.5 * np.cos(np.pi * self._ramp(rows, cols)[0])
-        return share.astype(np.float32)
+    `weighted` is the conjugate of `moved` over the spectrum S; `matrix` the information of the k parameters.
+    """
 
-    def derivatives(self, rows: Image, cols: Image) -> tuple[Image, ...]:
-        """Return the derivatives of `light` with respect to the four parameters."""
-        ramp, radius, width = self._ramp(rows, cols)
-        slope = np.float32(0.5 * np.pi) * np.sin(np.pi * ramp) / width
-        outward = 1 / np.maximum(radius, 1)
-        return (
-            slope, slope * (rows - self.down) * outward, slope * (cols - self.right) * outward,
-            slope * (0.5 - ramp),
-        )  # fmt: skip
-
-    def _ramp(self, rows: Image, cols: Image) -> tuple[Image, Image, np.float32]:
-        radius = np.hypot(rows - np.float32(self.down), cols - np.float32(self.right))
-        width = np.float32(max(self.width, 1.0))
-        return np.clip((np.float32(self.radius) - radius) / width + np.float32(0.5), 0, 1), radius, width
+    moved: Spectrum
+    weighted: Spectrum
+    matrix: Floats
 
 
 @dataclass(frozen=True)
@@ -84,157 +67,144 @@ class Candidate:
     """Likelihood of one candidate eye with its best edge.
 
     `nats` is the negative log likelihood (up to a constant) with the penalty of the edge, `terms` its part of each
-    frequency, (K,), `step` the change of the edge in samples, `information` its matrix (inverse covariance).
+    frequency, (K,), `step` the best change of the first parameters of the edge in samples.
     """
 
     nats: float
     terms: Floats
     step: Floats
-    information: Floats
 
 
 class EdgeLikelihood:
-    """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape."""
+    """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape.
 
-    def __init__(self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int) -> None:
+    An eye is an array of M, or of M, J0 and J45, in dpt. With `edge_is_known` the calibrated edge is kept. It holds the
+    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`.
+    """
+
+    def __init__(
+        self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int,
+        edge_is_known: bool,
+    ) -> None:  # fmt: skip
         assert calibration.field_deg is not None
+        self._count = 0 if edge_is_known else PARAMETERS
         wide = replace(calibration, field_deg=calibration.field_deg + 2 * MARGIN_DEG)
         self.likelihood = RefractionLikelihood(wide, geometry, shape, planner, index, SAMPLE_UM)
         self.grid = self.likelihood.grid
-        self.per_deg = geometry.px_per_deg / self.grid.n
-        self.calibrated = Edge(calibration.field_deg / 2, 0.0, 0.0, FIRST_WIDTH_DEG).scaled(self.per_deg)
-        self.edge = self.calibrated
-        self._prior = np.asarray(PRIOR_DEG) * self.per_deg
-        self._place_box()
-        radius = self.calibrated.radius
-        self._modes = np.stack([mode.ravel() for mode in zernike_modes(self._rows / radius, self._cols / radius)])
-        self._objects: list[Spectrum] = [np.zeros(0, np.complex64)] * PARAMETERS
+        self._per_deg = geometry.px_per_deg / self.grid.n
+        self._calibrated = Edge(calibration.field_deg / 2 * self._per_deg, 0.0, 0.0, FIRST_WIDTH_DEG * self._per_deg)
+        self._edge = self._calibrated
+        largest_samples = self._calibrated.radius_samples + MARGIN_DEG * self._per_deg
+        self._field = LitField(self.grid, self._calibrated, largest_samples)
+        self._prior = np.asarray(PRIOR_DEG) * self._per_deg
+        self._moved_objects: list[Spectrum] = []
         self._flat_places = np.arange(self.band.where.size)
         self._levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
-        self.noise_dn2 = 1.0
+        self._noise_dn2 = 1.0
 
     @property
     def band(self) -> Band:
         """Frequencies of the likelihood."""
         return self.likelihood.bands.whole
 
-    def _place_box(self) -> None:
-        """Set the box of blocks around the largest field: its samples on the torus, and their positions."""
-        starts, sizes = [], []
-        reach = self.calibrated.radius + MARGIN_DEG * self.per_deg + 2
-        for at, middle in zip(self.grid.at, self.grid.centre, strict=True):
-            low = int(np.floor((middle - reach - at) / BLOCK)) * BLOCK + at
-            starts.append(low)
-            sizes.append(int(np.ceil((middle + reach - low) / BLOCK)) * BLOCK)
-        indices = [np.arange(low, low + size) for low, size in zip(starts, sizes, strict=True)]
-        self._box = np.ix_(*(index % size for index, size in zip(indices, self.grid.shape, strict=True)))
-        self._coarse_box = np.ix_(*(
-            np.arange(size // BLOCK) + (low - at) // BLOCK
-            for low, size, at in zip(starts, sizes, self.grid.at, strict=True)
-        ))  # fmt: skip
-        rows, cols = (
-            index.astype(np.float32) - np.float32(middle)
-            for index, middle in zip(indices, self.grid.centre, strict=True)
-        )
-        self._rows, self._cols = (np.ascontiguousarray(x) for x in np.broadcast_arrays(rows[:, None], cols[None]))
-
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
-        self.frame = self.likelihood.frame(counts, dark, defects)
-        self.edge = self.calibrated
-        self.noise_dn2 = 1.0
-        return self.frame
+        self._frame = self.likelihood.frame(counts, dark, defects)
+        self._edge = self._calibrated
+        return self._frame
 
-    def set_noise(self) -> None:
-        """Set the noise from the sensor's gain, or from the last residual."""
-        self.noise_dn2 = self.likelihood.noise_power(self.frame)
+    def set_noise(self, eye_dpt: Floats) -> None:
+        """Set the noise from the sensor's gain, or from the residual of this candidate."""
+        self.likelihood.residual_of(self._frame, transform(self.likelihood.geometry, *eye_dpt))
+        self._noise_dn2 = self.likelihood.noise_power(self._frame)
 
-    def fit_smooth(self, stretch: Transform) -> float:
-        """Fit the smooth object within the present edge for the PSF with this stretch; return its mean level in DN."""
+    def fit_smooth(self, eye_dpt: Floats) -> float:
+        """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
+        stretch = transform(self.likelihood.geometry, *eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
-        light = self.edge.light(self._rows, self._cols)
-        coefficients, stray = self._fit(self._seen_blocks(otf, light))
-        smooth = (coefficients[: len(self._modes)].astype(np.float32) @ self._modes).reshape(light.shape)
-        image = np.zeros(self.grid.shape, np.float32)
-        image[self._box] = smooth * light
-        self.likelihood.set_smooth(self.frame, image, stray, otf)
-        fft = self.likelihood.model.fft
-        for k, derivative in enumerate(self.edge.derivatives(self._rows, self._cols)):
-            fft.space[:] = 0
-            fft.space[self._box] = smooth * derivative
-            self._objects[k] = fft.forward().copy()
-        return float(coefficients[0])
+        smooth = self._field.fit(self._frame, otf, self._edge)
+        self.likelihood.set_smooth(self._frame, smooth.image, smooth.stray_dn, otf)
+        self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
+        return smooth.level_dn
 
-    def _seen_blocks(self, otf: Spectrum, light: Image) -> Image:
-        """Return modes times light, blurred, as means over the blocks of the window, (modes, blocks)."""
-        rows, cols = (size // BLOCK for size in self.grid.shape)
-        high, wide = (size // BLOCK for size in self.grid.window)
-        box = (light.shape[0] // BLOCK, BLOCK, light.shape[1] // BLOCK, BLOCK)
-        lit = (self._modes * light.ravel()).reshape(len(self._modes), *box).mean(axis=(2, 4))
-        torus = np.zeros((len(lit), rows, cols), np.float32)
-        down, right = self._coarse_box
-        torus[:, down % rows, right % cols] = lit
-        low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
-        seen: Image = scipy_fft.irfft2(scipy_fft.rfft2(torus) * low, (rows, cols))[:, :high, :wide]
-        return np.ascontiguousarray(seen.reshape(len(lit), -1))
+    def __call__(self, eye_dpt: Floats, most: int = PARAMETERS) -> Candidate:
+        """Return the likelihood of an eye, minimised over the parameters of the edge, of which the first `most`."""
+        rest, otf, level = self._residual(eye_dpt)
+        nats, count = self._nats(rest, otf), min(most, self._count)
+        return self._minimised(rest, otf, self._edge_model(level, count)) if count else self._candidate(nats)
 
-    def _fit(self, seen: Image) -> tuple[Floats, float]:
-        """Return the coefficients of the modes, and the stray light in DN, by weighted ridge regression."""
-        brightest = float(seen[0].max())
-        every = np.vstack([seen, np.full_like(seen[:1], brightest)])
-        share = blocks(self.frame.good, BLOCK).ravel()
-        share[share < LEAST_GOOD] = 0
-        light = blocks(self.frame.y * self.frame.good, BLOCK).ravel()
-        means = np.divide(light, share, out=np.zeros_like(light), where=share > 0)
-        weighted = every * (share / (np.maximum(seen[0], 0) / brightest + 0.03))
-        normal = (weighted @ every.T).astype(np.float64)
-        ridge = np.full(len(every), RIDGE)
-        ridge[-1] = STRAY_RIDGE
-        coefficients = np.linalg.solve(normal + np.diag(ridge * np.diag(normal)), weighted @ means)
-        return coefficients, float(coefficients[-1]) * brightest
+    def terms(self, eye_dpt: Floats) -> tuple[float, Floats]:
+        """Return the likelihood of an eye with its best edge, and its part of each frequency, (K,)."""
+        found = self(eye_dpt)
+        return found.nats, found.terms
 
-    def __call__(self, stretch: Transform, count: int = PARAMETERS) -> Candidate:
-        """Return the likelihood of an eye, minimised over the first `count` parameters of the edge."""
-        likelihood, band = self.likelihood, self.band
-        level = likelihood.residual_of(self.frame, stretch)[0]
+    def edge_model(self, eye_dpt: Floats) -> EdgeModel | None:
+        """Return the linear model of the edge around a candidate, for `near`; None for a known edge."""
+        rest, otf, level = self._residual(eye_dpt)
+        self._nats(rest, otf)
+        return self._edge_model(level, self._count) if self._count else None
+
+    def near(self, eye_dpt: Floats, model: EdgeModel | None) -> Candidate:
+        """Return the likelihood of an eye near the candidate of `model`, minimised over the edge of that model."""
+        rest, otf, _ = self._residual(eye_dpt)
+        return self._candidate(self._nats(rest, otf)) if model is None else self._minimised(rest, otf, model)
+
+    def _residual(self, eye_dpt: Floats) -> tuple[Spectrum, Spectrum, float]:
+        """Return residual and OTF at the band's frequencies, (K,), and the scale of the smooth part."""
+        band, likelihood = self.band, self.likelihood
+        stretch = transform(likelihood.geometry, *eye_dpt)
+        level, _ = likelihood.residual_of(self._frame, stretch)
         rest = likelihood.fft.spectrum.ravel()[band.where]
         otf = likelihood.interpolated_otf.at_frequencies(band.rows, band.cols, band.share, self.grid.n, stretch)
-        nats = self._nats(rest, otf)
-        step, information = np.zeros(PARAMETERS), np.zeros((PARAMETERS, PARAMETERS))
-        if count:
-            moved = np.stack(
-                [np.float32(level) * likelihood.spectrum_of(part).ravel()[band.where] for part in self._objects[:count]]
-            )
-            weighted = moved.conj() / self._spectrum()
-            penalty = 1 / self._prior[:count] ** 2
-            away = (self.edge.vector - self.calibrated.vector)[:count]
-            matrix = (weighted @ moved.T).real.astype(np.float64) + np.diag(penalty)
-            found = np.linalg.solve(matrix, (weighted @ rest).real - penalty * away)
-            nats = self._nats(rest - found.astype(np.float32) @ moved, otf) + float(penalty @ (away + found) ** 2)
-            step[:count], information[:count, :count] = found, matrix
-        model = self._spectrum()
-        return Candidate(nats, (np.log(model) + band.energy / model).astype(np.float64), step, information)
+        return rest, otf, level
+
+    def _edge_model(self, level: float, count: int) -> EdgeModel:
+        """Return the linear model of the edge around the candidate of the last residual and likelihood."""
+        spectra = (self.likelihood.spectrum_of(part).ravel()[self.band.where] for part in self._moved_objects[:count])
+        moved = np.stack([np.float32(level) * spectrum for spectrum in spectra])
+        weighted = np.asarray(moved.conj() / self._spectrum(), np.complex64)
+        matrix = (weighted @ moved.T).real.astype(np.float64) + np.diag(self._prior[:count] ** -2)
+        return EdgeModel(moved, weighted, matrix)
+
+    def _minimised(self, rest: Spectrum, otf: Spectrum, model: EdgeModel) -> Candidate:
+        count = len(model.moved)
+        penalty = self._prior[:count] ** -2
+        away = (self._edge.vector - self._calibrated.vector)[:count]
+        step = np.linalg.solve(model.matrix, (model.weighted @ rest).real - penalty * away).astype(np.float64)
+        nats = self._nats(rest - step.astype(np.float32) @ model.moved, otf)
+        return replace(self._candidate(nats + float(penalty @ (away + step) ** 2)), step=step)
 
     def _nats(self, rest: Spectrum, otf: Spectrum) -> float:
+        """Return the negative log likelihood of a residual; the levels, energies and powers of the band are kept."""
         band = self.band
         return fused_kernels.negative_log_likelihood(
-            rest[None], otf, self._flat_places, band.ring, self.noise_dn2, SMEAR, TURNS, self._levels, band.energy,
+            rest[None], otf, self._flat_places, band.ring, self._noise_dn2, SMEAR, TURNS, self._levels, band.energy,
             band.power,
         )  # fmt: skip
 
+    def _candidate(self, nats: float) -> Candidate:
+        model = self._spectrum()
+        return Candidate(nats, (np.log(model) + self.band.energy / model).astype(np.float64), np.zeros(0))
+
     def _spectrum(self) -> Image:
         """Return the model S of the last likelihood, (K,)."""
-        return np.asarray(self.band.power * self._levels[self.band.ring] + self.noise_dn2, np.float32)
+        return np.asarray(self.band.power * self._levels[self.band.ring] + self._noise_dn2, np.float32)
 
     def move_edge(self, step: Floats) -> float:
-        """Move the edge by `step` (samples), within its range; return the largest change in samples."""
-        largest = LARGEST_STEP_DEG * self.per_deg
-        wanted = self.edge.vector + np.clip(step, -largest, largest)
-        reach = MARGIN_DEG * self.per_deg
-        low = self.calibrated.vector - np.array([reach, reach, reach, np.inf])
-        high = self.calibrated.vector + np.array([reach, reach, reach, np.inf])
-        low[3], high[3] = 1.0, 2 * reach
-        found = np.clip(wanted, low, high)
-        change = float(np.abs(found - self.edge.vector).max())
-        self.edge = Edge(*found)
+        """Move the first parameters of the edge by `step` (samples), within their range; return the largest change."""
+        if step.size == 0:
+            return 0.0
+        largest, reach = LARGEST_STEP_DEG * self._per_deg, MARGIN_DEG * self._per_deg
+        wanted = self._edge.vector
+        wanted[: len(step)] += np.clip(step, -largest, largest)
+        middle = self._calibrated.vector[:3]
+        found = np.append(np.clip(wanted[:3], middle - reach, middle + reach), np.clip(wanted[3], 1.0, 2 * reach))
+        change = float(np.abs(found - self._edge.vector).max())
+        self._edge = Edge(*found)
         return change
+
+    def field_edge(self, model: EdgeModel | None) -> FieldEdge:
+        """Return the present edge in degrees, with the sd of the diameter from the linear model."""
+        radius, down, right, width = self._edge.vector / self._per_deg
+        variance = 0.0 if model is None else np.linalg.inv(model.matrix)[0, 0] / self._per_deg**2
+        return FieldEdge(2 * radius, down, right, width, 2 * float(np.sqrt(variance)))

@@ -106,6 +106,11 @@ class GapTreatment:
     narrow: Mask | None = None
     filling: Image | None = None
 
+    @property
+    def known_weights(self) -> Image:
+        """The weights, 0 in the narrow gaps."""
+        return self.weights if self.narrow is None else self.weights * ~self.narrow
+
 
 class RefractionLikelihood:
     """Negative log likelihood of a mean sphere M for PSF `index` of one calibration, and one sensor shape."""
@@ -162,22 +167,25 @@ class RefractionLikelihood:
         """
         self.model.refocus(otf)
         self._shading.refocus()
-        level, stray = self._shading.fit(frame, self._smooth)
-        self.keep_object(frame, stray)
+        smooth = np.zeros(self.grid.shape, np.float32)
+        level, stray = self._shading.fit(frame, smooth)
+        self.set_smooth(frame, smooth, stray, otf)
         return level
 
     def set_smooth(self, frame: Linear, smooth: Image, stray: float, otf: Spectrum) -> None:
-        """Set the smooth object (grid, before the blur by `otf`) that `residual` subtracts; `stray` is in DN."""
-        self.model.otf = otf
-        self._smooth[:] = smooth
-        self.keep_object(frame, stray)
+        """Set the smooth object (grid, before the blur by `otf`) that `residual` subtracts; `stray` is in DN.
 
-    def keep_object(self, frame: Linear, stray: float) -> None:
-        """Keep the spectrum of the smooth object, and continue the detail of the frame into narrow gaps."""
-        self.model.fft.space[:] = self._smooth
-        self._object[:] = self.model.fft.forward()
+        The detail of the frame is continued into narrow gaps.
+        """
+        self.model.otf, self._smooth = otf, smooth
+        self._object = self.object_spectrum(smooth)
         if self._gaps.narrow is not None:
             self._fill_narrow_gaps(frame, stray, self._gaps.narrow)
+
+    def object_spectrum(self, image: Image) -> Spectrum:
+        """Return the spectrum of an object on the grid as a new array."""
+        self.model.fft.space[:] = image
+        return self.model.fft.forward().copy()
 
     def _fill_narrow_gaps(self, frame: Linear, stray: float, narrow: Mask) -> None:
         """Set the filling of the gaps to the detail around narrow gaps, continued into them; 0 elsewhere.
@@ -207,7 +215,7 @@ class RefractionLikelihood:
         self.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
         smooth = self._seen(self._object)
         level, stray = flat_fit(kernels.flat_fit_sums(frame.y, smooth, frame.good))
-        kernels.residual(frame.y, smooth, self._known_weights, level, stray, (0, 0), self.fft.space)
+        kernels.residual(frame.y, smooth, self._gaps.known_weights, level, stray, (0, 0), self.fft.space)
         if self._gaps.filling is not None:
             self.fft.space += self._gaps.filling
         self.fft.forward()
@@ -215,7 +223,7 @@ class RefractionLikelihood:
 
     def spectrum_of(self, part: Spectrum) -> Spectrum:
         """Return the tapered spectrum of an object (its spectrum on the grid) through the PSF of the last residual."""
-        np.multiply(self._seen(part), self._known_weights, out=self.fft.space)
+        np.multiply(self._seen(part), self._gaps.known_weights, out=self.fft.space)
         return self.fft.forward()
 
     def _seen(self, part: Spectrum) -> Image:
@@ -223,12 +231,6 @@ class RefractionLikelihood:
         fft = self.model.fft
         np.multiply(part, self._otf, out=fft.spectrum)
         return fft.inverse()[self.grid.slices]
-
-    @property
-    def _known_weights(self) -> Image:
-        """Taper of the window, 0 in the narrow gaps."""
-        gaps = self._gaps
-        return gaps.weights if gaps.narrow is None else gaps.weights * ~gaps.narrow
 
     def negative_log_likelihood(self, frame: Linear, noise_dn2: float, m_dpt: float, part: Band) -> float:
         """Return the negative log likelihood (nats, up to a constant) of the candidate M over `part` of the band.

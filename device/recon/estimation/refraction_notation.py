@@ -45,7 +45,7 @@ def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]
         return report | {"refused": found.reason}
     report |= {
         "sphere": -found.sphere_dpt, "sd": found.sd_dpt,
-        "field_deg": found.field_deg, "field_deg_sd": found.field_sd_deg,
+        "field_deg": found.edge.diameter_deg, "field_deg_sd": found.edge.diameter_sd_deg,
     }  # fmt: skip
     if (cylinder := found.cylinder) is not None:
         lens = sphere_cylinder(-found.sphere_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)

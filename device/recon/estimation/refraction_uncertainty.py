@@ -44,6 +44,11 @@ class Quadratic:
         scatter = centred.T @ centred * len(centred) / (len(centred) - 1)
         return np.asarray(SD_FACTOR**2 * spread * inverse), np.asarray(inverse @ scatter @ inverse)
 
+    def sds(self, spread: float) -> Floats:
+        """Return the standard deviations of the components of the minimum, (d,); `spread` is that of the taper."""
+        noise, sectors = self.covariance(spread)
+        return np.asarray(np.sqrt(np.diag(noise) + np.diag(sectors)))
+
 
 def block_of_frequency(band: Band) -> NDArray[np.int64]:
     """Return the block of each frequency, (K,), 0 to SECTORS * RING_GROUPS - 1."""

@@ -17,6 +17,7 @@ EYES_DPT = (-4.0, -2.0, 0.0, 2.0, 4.0)
 PSFS_DPT = (-7.619, -4.0, -2.0, 0.0, 2.0, 4.0, 5.517)  # wavefronts of the screen at 21 and 29 mm: 1/s - 1/f
 SCALES = np.linspace(0.985, 1.015, 13)
 DEFAULT_SCHEDULE = "the instrument's ladder"
+ADAPTED = "a drawn retina instead of the HEINE trainer"
 NEAR_DEG, MARGIN = 12.0, 0.05  # region in which the scales of two pictures are compared
 
 
@@ -189,12 +190,12 @@ EXPERIMENTS = (
     Experiment(
         "S5", "Eyes out of focus, PSF at rest",
         "Frames of an eye from -4 to +4 dpt are solved with the one PSF of 0 dpt.",
-        "Figure 5b; \"no significant degradation of image quality\" within 4 dpt.", run_eyes,
+        "Figure 5b; \"no significant degradation of image quality\" within 4 dpt.", run_eyes, ADAPTED,
     ),
     Experiment(
         "S6", "PSFs out of focus, eye at rest",
         "The frame of a relaxed eye is solved with PSFs of screens 4 mm too near and too far.",
-        "Figure 5c; \"slight degradation\" at -5.5 and +7.6 dpt.", run_psfs,
+        "Figure 5c; \"slight degradation\" at -5.5 and +7.6 dpt.", run_psfs, ADAPTED,
     ),
     Experiment(
         "S9", "The sensor half a millimetre farther", "The PSF was taken at 6.0 mm, the frame at 6.5 mm.",

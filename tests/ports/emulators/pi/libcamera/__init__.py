@@ -92,7 +92,7 @@ class Camera:
 
     @property
     def properties(self):
-        arrangement = properties.draft.ColorFilterArrangementEnum.MONO
+        arrangement = properties.draft.ColorFilterArrangementEnum(self.sensor.arrangement)
         return {
             properties.Model: self.sensor.model, properties.Location: 2, properties.Rotation: 0,
             properties.PixelArraySize: self.sensor.size, properties.ColorFilterArrangement: arrangement,
