@@ -25,6 +25,7 @@ import services.errors
 from device.config.head_file import load_head
 from device.drivers.pi_camera import FRAME_TIMEOUT_S, OPEN_TIMEOUT_S
 from services.cli import app
+from services.health import clock_request
 from services.http.connection_limits import ConnectionLimits
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import BEAT_S
@@ -509,15 +510,20 @@ def test_page_updater_and_systemd_use_the_same_folders() -> None:
     state, wishes = str(UpdateSettings().folder), str(UpdateSettings().wishes)
     instrument = unit_of("systemd/diffuscope.service")["Service"]
     assert f"--updates {state} --wishes {wishes}" in instrument["ExecStart"]
-    assert instrument["ReadWritePaths"] == f"-{wishes} -{state}/{TABLET} -/media"
+    clock = "/run/diffuscope-clock"  # where the page leaves the time of a tablet
+    assert instrument["ReadWritePaths"] == f"-{clock} -{wishes} -{state}/{TABLET} -/media"
     assert unit_of("systemd/diffuscope-wish.path")["Path"]["PathExists"] == f"{wishes}/{REQUEST_FILE}"
     assert unit_of("systemd/diffuscope-wish.service")["Service"]["ReadWritePaths"] == wishes
     made = [line.split() for line in text("systemd/diffuscope.tmpfiles").splitlines() if line.startswith("d ")]
     shared = ["2770", "root", "diffuscope-update", "-"]
     own = ["0711", "root", "root", "-"]
-    assert made == [["d", wishes, *shared], ["d", state, *own], ["d", f"{state}/{TABLET}", *shared]]
-    assert "\ng diffuscope-update -\n" in text("systemd/diffuscope.sysusers")
-    assert "diffuscope-update" in instrument["SupplementaryGroups"].split()
+    offered = ["d", clock, "2770", "root", "diffuscope-clock", "-"]
+    assert made == [["d", wishes, *shared], offered, ["d", state, *own], ["d", f"{state}/{TABLET}", *shared]]
+    assert unit_of("systemd/diffuscope-clock.path")["Path"]["PathExists"] == f"/{clock_request.REQUEST}"
+    assert f"/{clock_request.REQUEST}".startswith(f"{clock}/")
+    for group in ("diffuscope-clock", "diffuscope-update"):
+        assert f"\ng {group} -\n" in text("systemd/diffuscope.sysusers")
+        assert group in instrument["SupplementaryGroups"].split()
 
 
 def test_an_update_on_trial_times_out_and_rolls_back() -> None:

@@ -5,12 +5,12 @@ The journal records the time before and after; every later record has the source
 """
 
 import sys
-import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
 from device import atomic_io
+from device.clock import Clock, SystemClock, set_system_clock
 from services.health.clock_source import BROWSER_SOURCE, clock_state
 from services.health.thresholds import EARLIEST_DATE
 
@@ -30,8 +30,8 @@ def offer_time(now: datetime, root: Path = Path("/")) -> bool:
     return True
 
 
-def take_request(set_time: Callable[[float], None], root: Path = Path("/")) -> str:
-    """Set the clock as requested by `set_time` (Unix time in s), and return a sentence for the journal.
+def take_request(set_clock: Callable[[datetime], None], clock: Clock, root: Path = Path("/")) -> str:
+    """Set the clock as requested, by `set_clock`, and return a sentence for the journal.
 
     The request is removed first, so that an invalid one is not repeated. Nothing is set if the clock has a source now.
     """
@@ -40,11 +40,11 @@ def take_request(set_time: Callable[[float], None], root: Path = Path("/")) -> s
     now = datetime.fromisoformat(content.decode("ascii"))
     if clock_state(root) != "not_set" or not EARLIEST_DATE <= now < LATEST_DATE:
         return f"The time of a tablet, {now}, is not needed"
-    before = datetime.now(UTC)
-    set_time(now.timestamp())
+    before = clock.wall()
+    set_clock(now)
     (root / BROWSER_SOURCE).write_text(f"{before.isoformat()} {now.isoformat()}\n", encoding="ascii")
     return f"The clock was set by a tablet, from {before} to {now}"
 
 
 if __name__ == "__main__":
-    sys.stdout.write(take_request(lambda now_s: time.clock_settime(time.CLOCK_REALTIME, now_s)) + "\n")
+    sys.stdout.write(take_request(set_system_clock, SystemClock()) + "\n")

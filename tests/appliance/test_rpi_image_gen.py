@@ -87,7 +87,7 @@ def test_the_hook_before_the_image_lays_out_the_card(plan: Path, tmp_path: Path)
     folders = {
         "IGTOP": TREE, "SRCROOT": CARD, "IGconf_image_assetdir": CARD / "image",
         "IGconf_target_path": tmp_path / "root",
-        "IGconf_device_assetdir": TREE / "device/pi5", "IGconf_image_outputdir": tmp_path / "out",
+        "IGconf_device_assetdir": TREE / "device" / "pi5", "IGconf_image_outputdir": tmp_path / "out",
     }  # fmt: skip
     run("bash", "bin/runner", "pre-image", plan, **{name: str(folder) for name, folder in folders.items()})
     assert (tmp_path / "out/genimage.cfg").read_text() == (CARD / "image/genimage.cfg").read_text()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from device.clock import VirtualClock
 from services.health.clock_request import REQUEST, offer_time, take_request
 from services.health.clock_source import clock_state
 
@@ -19,10 +20,10 @@ def root(tmp_path: Path) -> Path:
 
 
 def test_a_device_without_a_clock_takes_the_time_of_a_tablet_once(root: Path) -> None:
-    taken: list[float] = []
+    taken: list[datetime] = []
     assert offer_time(NOW, root)
-    assert "set by a tablet" in take_request(taken.append, root)
-    assert taken == [NOW.timestamp()]
+    assert "set by a tablet" in take_request(taken.append, VirtualClock(), root)
+    assert taken == [NOW]
     assert clock_state(root) == "browser"
     assert not offer_time(NOW + timedelta(hours=1), root), "a second tablet may be wrong"
     assert not (root / REQUEST).exists()
@@ -33,8 +34,8 @@ def test_the_network_is_better_than_a_tablet(root: Path) -> None:
     assert offer_time(NOW, root)
     (root / "run/systemd/timesync").mkdir(parents=True)
     (root / "run/systemd/timesync/synchronized").touch()
-    taken: list[float] = []
-    assert "not needed" in take_request(taken.append, root)
+    taken: list[datetime] = []
+    assert "not needed" in take_request(taken.append, VirtualClock(), root)
     assert not taken
     assert clock_state(root) == "network"
     assert not offer_time(NOW, root)
@@ -54,5 +55,5 @@ def test_a_computer_without_the_unit_is_left_alone(tmp_path: Path) -> None:
 def test_an_invalid_request_is_removed_and_sets_nothing(root: Path, content: str) -> None:
     (root / REQUEST).write_text(content)
     with pytest.raises((ValueError, TypeError)):
-        take_request(lambda _: pytest.fail("the clock was set"), root)
+        take_request(lambda _: pytest.fail("the clock was set"), VirtualClock(), root)
     assert not (root / REQUEST).exists()
