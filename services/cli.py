@@ -422,13 +422,12 @@ def frontier(
     request = measured.FrontierRequest(
         scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, resources.fft_plans()
     )
-    if data is None:
-        typer.echo(measured.table(measured.frontier(request, _progress)))
-    else:
-        wanted = frontier_pairs.dataset_request(request, data, limit)
-        with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
-            found = frontier_pairs.frontier_of_dataset(wanted, peer, _progress)
-        typer.echo(frontier_pairs.dataset_table(found))
+    wanted = None if data is None else frontier_pairs.dataset_request(request, data, limit)
+    with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
+        if wanted is None:
+            typer.echo(measured.table(measured.frontier(request, _progress, peer)))
+        else:
+            typer.echo(frontier_pairs.dataset_table(frontier_pairs.frontier_of_dataset(wanted, peer, _progress)))
     typer.echo(f"{json_file}, {plot}")
 
 

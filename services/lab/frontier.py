@@ -30,6 +30,7 @@ from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
 from device.sim.scene_files import simulate_exposure
 from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.measured_frontier import MeasuredFrontier
+from services.lab.frontier_light import LightCase, light_case, measure_light
 from services.lab.frontier_oracle import best_mus
 from services.lab.frontier_plot import draw_frontier
 from services.lab.frontier_result import (
@@ -37,11 +38,14 @@ from services.lab.frontier_result import (
     Choice,
     FrameSize,
     Frontier,
+    LightPoint,
     Machine,
+    PeerPoint,
     Point,
     ScoredRegion,
     frontier_text,
 )
+from services.lab.peers import LenslessPeer
 from services.lab.reconstruct_file import require_writable, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_calibration, load_raw, name_of
 
@@ -77,7 +81,7 @@ class Case:
     """One frame with its truth: the data in memory before a timed run.
 
     `vessels` is the mask of the vessels, None if unknown. `registered`: the truth has its own origin, and one common
-    shift registers all pictures with it.
+    shift registers all pictures with it. `light`: bursts of a scene, None if they are not measured.
     """
 
     name: str
@@ -86,6 +90,7 @@ class Case:
     vessels: Mask | None
     calibration: Calibration
     registered: bool
+    light: LightCase | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,15 +98,16 @@ class Case:
         return self.counts.shape[0], self.counts.shape[1]
 
 
-def frontier(request: FrontierRequest, progress: ProgressCallback) -> Frontier:
+def frontier(request: FrontierRequest, progress: ProgressCallback, peer: LenslessPeer | None = None) -> Frontier:
     """Measure the frontier, write the JSON file and the plot, and return the result.
 
-    `progress` is called with one line per step. SettingError for invalid options; StoreError for an unwritable file.
+    A `peer` solves the same frame. `progress` is called with one line per step. SettingError for invalid options;
+    StoreError for an unwritable file.
     """
     _refuse_invalid(request)
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
     methods = available_methods()
-    found = measure_frontier(_case(request), request.plans, request.budget_s, request.repeats, progress, methods)
+    found = measure_frontier(_case(request), request.plans, request.budget_s, request.repeats, progress, methods, peer)
     text = frontier_text(found)
     write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
     picture = draw_frontier(found, methods)
@@ -111,9 +117,12 @@ def frontier(request: FrontierRequest, progress: ProgressCallback) -> Frontier:
 
 def measure_frontier(
     case: Case, plans: Path, budget_s: float, repeats: int, progress: ProgressCallback,
-    methods: Mapping[str, Method] = METHODS,
+    methods: Mapping[str, Method] = METHODS, peer: LenslessPeer | None = None,
 ) -> Frontier:  # fmt: skip
-    """Measure every point of one case with each of `methods`, and the instrument's choice within `budget_s`."""
+    """Measure every point of one case with each of `methods`, and the instrument's choice within `budget_s`.
+
+    A `peer` solves the same frame; the bursts of a case that has them follow.
+    """
     bench = _Bench(case, Planner(plans), SystemClock(), progress, methods)
     points, choice = bench.measure(budget_s, repeats)
     front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
@@ -133,13 +142,16 @@ def measure_frontier(
         budget_s=budget_s,
         choice=choice,
         dominated=tuple(method for method in methods if method not in kept),
+        peers=() if peer is None else bench.peer_points(peer),
+        light=bench.light_points(),
     )
 
 
-def scene_case(spec: InstrumentSpec) -> Case:
-    """Return one exposure of a simulated head, with its truth."""
+def scene_case(spec: InstrumentSpec, bursts: bool = False) -> Case:
+    """Return one exposure of a simulated head, with its truth; with `bursts` the frames of its bursts, too."""
     scene = simulate_exposure(spec)
-    return Case(spec.name, scene.counts, scene.truth, scene.vessels, scene.calibration, False)
+    light = light_case(spec) if bursts else None
+    return Case(spec.name, scene.counts, scene.truth, scene.vessels, scene.calibration, False, light)
 
 
 def measure_scene(
@@ -185,6 +197,13 @@ def table(found: Frontier) -> str:
         f"{choice.rounds} rounds: {choice.psnr_db:.2f} dB in {choice.solve_s:.3f} s, "
         f"{choice.db_below_edge:.2f} dB below the edge; and {choice.refract_s:.3f} s for the eye's refraction"
     )
+    for peer in found.peers:
+        lines.append(f"  {peer.name}: {peer.psnr_db:.2f} dB in {peer.seconds:.3f} s")
+    for one in found.light:
+        lines.append(
+            f"  {one.frames} frames ({one.used} used), {one.dose_j_per_cm2:.2g} J/cm2: {one.psnr_db:.2f} dB in "
+            f"{one.seconds_median:.3f} s; linear bound {one.bound_psnr_db:.2f} dB"
+        )
     return "\n".join(lines)
 
 
@@ -238,6 +257,24 @@ class _Bench:
         return best_mus(
             case.counts, case.calibration, self.planner, case.truth, self.inside, bins, self.judge, self.moved
         )
+
+    def light_points(self) -> tuple[LightPoint, ...]:
+        """Return the bursts of the case; none if it has no frames for them."""
+        case = self.case
+        if case.light is None:
+            return ()
+        return measure_light(
+            case.light, self.instrument, self.planner, self.clock, case.truth, self.judge, self.progress
+        )
+
+    def peer_points(self, peer: LenslessPeer) -> tuple[PeerPoint, ...]:
+        """Return the pictures of a peer, scored as ours are."""
+        found = []
+        for one in peer(self.case.counts, self.case.calibration.psfs[0].pixels):
+            scores = self.judge(self.moved(_grey(one.picture)))
+            self.progress(f"{one.name}: {one.seconds:.3f} s, {scores.psnr_db:.2f} dB")
+            found.append(PeerPoint(one.name, one.seconds, scores.pcc, scores.psnr_db, scores.ssim))
+        return tuple(found)
 
     def measure(self, budget_s: float, repeats: int) -> tuple[tuple[Point, ...], Choice]:
         """Return every point, and the instrument's choice within `budget_s`."""
@@ -372,7 +409,7 @@ def _refuse_invalid(request: FrontierRequest) -> None:
 
 def _case(request: FrontierRequest) -> Case:
     if request.scene is not None:
-        return scene_case(load_head(request.scene))
+        return scene_case(load_head(request.scene), bursts=True)
     assert request.raw is not None
     assert request.psf is not None
     assert request.truth is not None

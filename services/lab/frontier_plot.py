@@ -1,4 +1,4 @@
-"""SVG plot of a frontier measurement: PSNR against run time of every method, bin and number of rounds."""
+"""SVG plot of a frontier measurement: PSNR against run time of every method, bin, number of rounds, and burst."""
 
 from collections.abc import Mapping, Sequence
 from math import log10
@@ -14,19 +14,26 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> s
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
     seconds = [p.seconds_median for p in points] + [choice.solve_s, budget_s]
     worths = [p.psnr_db for p in points] + [choice.psnr_db]
+    for one in found.light:
+        seconds.append(one.seconds_median)
+        worths += [one.psnr_db, one.bound_psnr_db]
+    seconds += [one.seconds for one in found.peers]
+    worths += [one.psnr_db for one in found.peers]
     y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
     plot = Plot(
-        title=f"What accuracy costs in time: {found.scene}",
+        title=f"What accuracy costs in time{' and light' if found.light else ''}: {found.scene}",
         subtitle=_subtitle(found),
         description=_description(found, edge),
         x=time_axis(seconds, "from counts in memory to the picture on the sensor grid, refraction apart"),
         y=y,
         series=tuple(
             _series(points, method) for method in methods.values() if any(p.method == method.name for p in points)
-        ),
+        )
+        + _peers(found)
+        + _light(found),
         edge=tuple(edge),
         limit=(budget_s, f"budget {budget_s:g} s"),
-        ring=(choice.solve_s, choice.psnr_db, "the instrument's choice"),
+        ring=(choice.solve_s, choice.psnr_db, "chosen" if found.light else "the instrument's choice"),
         right=_correlations(y.low, y.high, found.region.truth_variance),
         right_title="the same as correlation (PCC)",
     )
@@ -45,11 +52,17 @@ def _subtitle(found: Frontier) -> str:
 def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
     choice = found.choice
     best = ", ".join(f"{value:.1f} dB in {seconds * 1e3:.0f} ms" for seconds, value in edge)
+    bursts = ", ".join(
+        f"{one.frames} frames {one.psnr_db:.1f} dB (linear bound {one.bound_psnr_db:.1f}) for "
+        f"{one.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
+        for one in found.light
+    )
     return (
         f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
         f"truth. The best within each time: {best}. Within {found.budget_s:g} s the instrument chooses "
         f"{choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.psnr_db:.1f} dB in "
         f"{choice.solve_s * 1e3:.0f} ms, and looks for the eye's refraction in {choice.refract_s * 1e3:.0f} ms."
+        + (f" More light, refraction included: {bursts}." if bursts else "")
     )
 
 
@@ -66,7 +79,33 @@ def _series(points: Sequence[Point], method: Method) -> Series:
         rounds = [p for p in own if p.bin == n]
         labels = [f"bin {n}", *(str(p.rounds) if p.pareto else "" for p in rounds[1:])]
         trails.append(tuple(_mark(p, method, label) for p, label in zip(rounds, labels, strict=True)))
-    return Series(f"{method.name} (rounds)", tuple(trails))
+    return Series(method.name, tuple(trails))
+
+
+def _peers(found: Frontier) -> tuple[Series, ...]:
+    """Return the marks of other people's solvers."""
+    marks = tuple(
+        Mark(one.seconds, one.psnr_db, one.name.split(", ")[-1].removesuffix(" rounds"),
+             f"{one.name}: {one.seconds:.2f} s, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}", 0.9)
+        for one in found.peers
+    )  # fmt: skip
+    return (Series("LenslessPiCam", (marks,)),) if marks else ()
+
+
+def _light(found: Frontier) -> tuple[Series, ...]:
+    """Return the bursts, and over or under each the bound of a linear filter with as much light."""
+    if not found.light:
+        return ()
+    bursts, bounds = [], []
+    for one in found.light:
+        words = f"{one.frames} frame{'s' if one.frames > 1 else ''}"
+        dose = f"{one.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
+        spent = f"{words}, {dose}: {one.seconds_median * 1e3:.0f} ms"
+        bursts.append(Mark(one.seconds_median, one.psnr_db, f"{words}, {dose}", f"{spent}, {one.psnr_db:.2f} dB"))
+        bounds.append(
+            Mark(one.seconds_median, one.bound_psnr_db, "", f"{spent}, linear bound {one.bound_psnr_db:.2f} dB", 0.7)
+        )
+    return Series("burst", (tuple(bursts),)), Series("linear bound", (tuple(bounds),))
 
 
 def _mark(point: Point, method: Method, label: str) -> Mark:

@@ -64,6 +64,38 @@ class Point:
 
 
 @dataclass(frozen=True)
+class LightPoint:
+    """Burst of `frames` frames as the instrument solves it, with its dose, median time and scores.
+
+    `used`: frames that entered the picture. `dose_j_per_cm2`: retinal dose of all frames, weighted with the
+    photochemical hazard; in the worst case where the head's light is not measured. `bound_psnr_db`: of the oracle's
+    Wiener filter on a frame of a still eye with as much light.
+    """
+
+    frames: int
+    used: int
+    dose_j_per_cm2: float
+    seconds_median: float
+    pcc: float
+    psnr_db: float
+    ssim: float
+    highpass_pcc: float
+    vessel_contrast: float | None
+    bound_psnr_db: float
+
+
+@dataclass(frozen=True)
+class PeerPoint:
+    """Picture of a peer on the same frame: its name with version and rounds, time in seconds and scores."""
+
+    name: str
+    seconds: float
+    pcc: float
+    psnr_db: float
+    ssim: float
+
+
+@dataclass(frozen=True)
 class BestMu:
     """Best mu of a method at one bin, selected by the truth, and its scores."""
 
@@ -107,7 +139,8 @@ class Frontier:
     """Points of one scene on one machine, and the instrument's choice within `budget_s` seconds.
 
     `versions`: of the program and its libraries, by name. `timing` and `edge` describe times and Pareto front in words.
-    `best_mu` is empty for a colour frame. `dominated`: methods without a point on the Pareto front.
+    `best_mu` is empty for a colour frame. `dominated`: methods without a point on the Pareto front. `light`: bursts of
+    a scene, from one frame on; empty for a recorded frame. `peers`: other people's solvers on the same frame.
     """
 
     machine: Machine
@@ -123,6 +156,8 @@ class Frontier:
     budget_s: float
     choice: Choice
     dominated: tuple[str, ...]
+    light: tuple[LightPoint, ...] = ()
+    peers: tuple[PeerPoint, ...] = ()
 
 
 def frontier_text(found: Frontier) -> str:

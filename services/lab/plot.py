@@ -14,7 +14,7 @@ STYLE = """
   text { fill: #1d2330; font: 14px system-ui, -apple-system, "Segoe UI", "Noto Sans", Arial, sans-serif; }
   .title { font-size: 20px; font-weight: 600; } .small { font-size: 12px; } .quiet { fill: #59606d; }
   .s0 { --ink: #8a5a00; } .s1 { --ink: #0067a3; } .s2 { --ink: #00795c; } .s3 { --ink: #a8327f; }
-  .s4 { --ink: #555b66; }
+  .s4 { --ink: #555b66; } .s5 { --ink: #5b3fc4; } .s6 { --ink: #b3471e; } .s7 { --ink: #3f6d12; }
   .mark { fill: var(--ink); stroke: #ffffff; stroke-width: 1.2; }
   .trail { fill: none; stroke: var(--ink); opacity: .55; } .line { opacity: .9; stroke-width: 1.5; }
   .label { fill: var(--ink); paint-order: stroke; stroke: #ffffff; stroke-width: 4px; stroke-linejoin: round; }
@@ -25,10 +25,11 @@ STYLE = """
     .ground { fill: #12161d; } .frame { stroke: #7a818d; } .grid { stroke: #272d37; }
     text { fill: #eceff4; } .quiet { fill: #a9b1bf; } .mark, .label { stroke: #12161d; }
     .s0 { --ink: #f0b14a; } .s1 { --ink: #6cbcf5; } .s2 { --ink: #4fd1a5; } .s3 { --ink: #f18fcb; }
-    .s4 { --ink: #b6bdc9; }
+    .s4 { --ink: #b6bdc9; } .s5 { --ink: #b3a2ff; } .s6 { --ink: #ff9d76; } .s7 { --ink: #a6d86b; }
     .edge, .ring { stroke: #eceff4; } .limit { stroke: #ff8a80; } .limit-word { fill: #ff8a80; }
   }
 """
+KINDS = 8  # of marks and colours
 LETTER_PX, LINE_PX = 6.6, 13.0  # width of a letter and height of a line of a 12 px label
 Box = tuple[float, float, float, float]
 
@@ -209,7 +210,7 @@ def _limit(plot: Plot) -> list[str]:
 def _series(plot: Plot) -> list[str]:
     out = []
     for k, series in enumerate(plot.series):
-        out.append(f'<g class="s{k % 5}">')
+        out.append(f'<g class="s{k % KINDS}">')
         for trail in series.trails:
             places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
             if len(places) > 1:
@@ -226,12 +227,18 @@ def _series(plot: Plot) -> list[str]:
     return out
 
 
+# Corners, direction of the first one and size of the marks after the circle.
+OUTLINES = (
+    (4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3), (5, -pi / 2, 1.2), (6, 0, 1.15), (3, 0, 1.3),
+)  # fmt: skip
+
+
 def _shape(k: int, x: float, y: float, r: float) -> str:
-    """Return the start tag of a mark of series `k`: circle, square, triangle, diamond or inverted triangle."""
-    if k % 5 == 0:
+    """Return the start tag of a mark of series `k`: circle, square, triangle, diamond or another polygon."""
+    if k % KINDS == 0:
         d = f"M {x - r:.1f} {y:.1f} a {r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0 a {r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0 Z"
         return f'<path class="mark" d="{d}">'
-    corners, turn, grow = ((4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3))[k % 5 - 1]
+    corners, turn, grow = OUTLINES[k % KINDS - 1]
     around = [turn + 2 * pi * c / corners for c in range(corners)]
     places = " L ".join(f"{x + grow * r * cos(a):.1f} {y + grow * r * sin(a):.1f}" for a in around)
     return f'<path class="mark" d="M {places} Z">'
@@ -249,15 +256,18 @@ def _legend(plot: Plot) -> list[str]:
     """Return one row above the frame: shape and name of each series, then the Pareto edge and the ring."""
     out, at = [], float(LEFT + 6)
     for k, series in enumerate(plot.series):
-        out += [f'<g class="s{k % 5}">{_shape(k, at, TOP - 20, 6.0)}</path></g>', text(at + 13, TOP - 15, series.name)]
-        at += 13 + 7.4 * len(series.name) + 16
+        out += [
+            f'<g class="s{k % KINDS}">{_shape(k, at, TOP - 20, 6.0)}</path></g>',
+            text(at + 11, TOP - 16, series.name, "small"),
+        ]
+        at += 11 + LETTER_PX * len(series.name) + 14
     if plot.edge:
-        out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 31, TOP - 15, "Pareto edge")]
-        at += 31 + 7.4 * 11 + 14
+        out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 30, TOP - 16, "Pareto edge", "small")]
+        at += 30 + LETTER_PX * 11 + 12
     if plot.ring is not None:
         out += [
             f'<circle class="ring" cx="{at + 8:.1f}" cy="{TOP - 20}" r="8"/>',
-            text(at + 24, TOP - 15, plot.ring[2]),
+            text(at + 22, TOP - 16, plot.ring[2], "small"),
         ]
     return out
 
@@ -276,7 +286,7 @@ def _labels(plot: Plot) -> list[str]:
             place = _free_position(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
             if place is not None:
                 taken.append(place)
-                out.append(f'<g class="s{k % 5}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
+                out.append(f'<g class="s{k % KINDS}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
     return out
 
 

@@ -16,7 +16,9 @@ from tests.bench import timing
 from tests.bench.moving_eye import (
     BLACK_DN,
     FIELDS,
+    IMX296,
     PAPER,
+    SensorCase,
     calibrated,
     counted,
     exposed,
@@ -28,6 +30,7 @@ from tests.bench.moving_eye import (
 
 PEAK_E, DRIFT_PX, MOST = 15000.0, 2.5, 8
 COUNTS = (2, 4, 8)
+DIM_E, FAR_PX = 500.0, (0, 8, 15, 30)
 SIX = ("06_dr a", "07_h b", "09_g a", "cc0 a", "01L", "05R")
 PLANNER, CLOCK = Planner(Path.home() / ".cache" / "diffuscope"), SystemClock()
 Places = list[tuple[float, float]]
@@ -40,30 +43,32 @@ def solved(counts: Counts | Image, calibration: Calibration) -> Image:
     return Reconstructor(calibration, shape, PLANNER, CLOCK, (last,), timed=False)(counts).picture
 
 
-def drift(seed: int) -> Places:
+def drift(seed: int, count: int = MOST) -> Places:
     """Return the places of an eye that drifts DRIFT_PX a frame and axis at random, from (0, 0) on."""
-    steps = np.random.default_rng(seed).normal(0, DRIFT_PX, (MOST, 2))
+    steps = np.random.default_rng(seed).normal(0, DRIFT_PX, (count, 2))
     steps[0] = 0
     return [(float(r), float(c)) for r, c in np.cumsum(steps, axis=0)]
 
 
-def scored() -> Mask:
+def scored(sensor: SensorCase = PAPER) -> Mask:
     """Return the part of the field that all frames share, (rows, cols)."""
-    centre = ((PAPER.rows - 1) / 2, (PAPER.cols - 1) / 2)
-    return disc(PAPER.shape, centre, field_px(PAPER) / 2 - 24) > 0.5
+    centre = ((sensor.rows - 1) / 2, (sensor.cols - 1) / 2)
+    return disc(sensor.shape, centre, field_px(sensor) / 2 - 24) > 0.5
 
 
-def scorer(truth: Image) -> PictureScorer:
+def scorer(truth: Image, sensor: SensorCase = PAPER) -> PictureScorer:
     """Return the scorer within the field that all frames share."""
-    return PictureScorer(truth, scored(), 32.0)
+    return PictureScorer(truth, scored(sensor), 32.0)
 
 
-def frames(plane: Image, places: Places, psf: Image, seed: int) -> tuple[list[Counts], Image]:
+def frames(
+    plane: Image, places: Places, psf: Image, seed: int, sensor: SensorCase = PAPER, peak_e: float = PEAK_E
+) -> tuple[list[Counts], Image]:
     """Return a frame of each place, and the light of a still eye in one frame in electrons."""
-    still = exposed(retina(plane, PAPER), psf)
-    scale = np.float32(PEAK_E / still.max())
-    lights = [exposed(retina(plane, PAPER, one), psf) * scale for one in places]
-    return [counted(light, PAPER, seed + k) for k, light in enumerate(lights)], still * scale
+    still = exposed(retina(plane, sensor), psf)
+    scale = np.float32(peak_e / still.max())
+    lights = [exposed(retina(plane, sensor, one), psf) * scale for one in places]
+    return [counted(light, sensor, seed + k) for k, light in enumerate(lights)], still * scale
 
 
 def bursts(folder: Path, names: Sequence[str] = SIX) -> list[list[float]]:
@@ -92,6 +97,63 @@ def bursts(folder: Path, names: Sequence[str] = SIX) -> list[list[float]]:
         timing.row(name, one_db, *cells, off)
     timing.row("mean", None, *np.mean(gains, axis=0))
     return gains
+
+
+def dim_bursts(folder: Path, names: Sequence[str] = SIX) -> None:
+    """Print PCC of 1, 8 and 16 frames of a brightest pixel of DIM_E electrons on a cropped sensor (IMX296)."""
+    calibration, psf = calibrated(IMX296, "green"), wave_psf(IMX296, "green")
+    joiner = BurstJoiner(calibration, IMX296.shape, PLANNER, CLOCK)
+    timing.head(f"IMX296, {DIM_E:g} e- a frame, {DRIFT_PX} px", "1 PCC", "8 PCC", "16 PCC", "px rms", "used")
+    found = []
+    for k, name in enumerate(names):
+        file, place = FIELDS[name]
+        plane = photograph(folder / file, place, IMX296)[..., 1]
+        places = drift(60 + k, 16)
+        shots, _ = frames(plane, places, psf, 100 * k, IMX296, DIM_E)
+        score = scorer(retina(plane, IMX296), IMX296)
+        cells = [score(solved(shots[0], calibration)).pcc]
+        for n in (8, 16):
+            joined = joiner(shots[:n])
+            cells.append(score(solved(joined.counts, joined.calibration)).pcc)
+        found.append(cells)
+        timing.row(name, *cells, registration_error(joined, places), str(sum(one.used for one in joined.frames)))
+    timing.row("mean", *np.mean(found, axis=0))
+
+
+def displaced(folder: Path, names: Sequence[str] = SIX) -> None:
+    """Print what four frames gain whose displacements are 0 to 30 px, and eight of which two are bad, over six good."""
+    calibration, psf = calibrated(PAPER, "green"), wave_psf(PAPER, "green")
+    joiner = BurstJoiner(calibration, PAPER.shape, PLANNER, CLOCK)
+    timing.head(
+        "displacement of the frames of four, px", *(f"{far}" for far in FAR_PX), "6 good", "8, 2 bad", "left out"
+    )
+    rows = []
+    for k, name in enumerate(names):
+        file, place = FIELDS[name]
+        plane = photograph(folder / file, place, PAPER)[..., 1]
+        score, gains, one_db = scorer(retina(plane, PAPER)), [], 0.0
+        for far in FAR_PX:
+            places: Places = [(0.0, 0.0), (0.6 * far, 0.8 * far), (-far, 0.3), (0.5, -far)]
+            shots, _ = frames(plane, places, psf, 100 * k + far)
+            one_db = score(solved(shots[0], calibration)).psnr_db
+            joined = joiner(shots)
+            gains.append(score(solved(joined.counts, joined.calibration)).psnr_db - one_db)
+        shots, still_e = frames(plane, drift(40 + k), psf, 100 * k)
+        bad = {2: counted(np.full_like(still_e, still_e.mean()), PAPER, 3), 5: _smeared(plane, psf)}
+        good = joiner([one for i, one in enumerate(shots) if i not in bad])
+        mixed = joiner([bad.get(i, one) for i, one in enumerate(shots)])
+        both = [score(solved(one.counts, one.calibration)).psnr_db - one_db for one in (good, mixed)]
+        rows.append([*gains, *both])
+        left_out = ", ".join(str(one.index) for one in mixed.frames if not one.used)
+        timing.row(name, *gains, *both, left_out)
+    timing.row("mean", *np.mean(rows, axis=0))
+
+
+def _smeared(plane: Image, psf: Image) -> Counts:
+    """Return a frame during a saccade of 30 px: the mean of seven places."""
+    lights = [exposed(retina(plane, PAPER, (0.0, 5.0 * step)), psf) for step in range(7)]
+    light = np.asarray(np.mean(lights, axis=0), np.float32)
+    return counted(light * np.float32(PEAK_E / light.max()), PAPER, 4)
 
 
 def registration_error(joined: JoinedFrame, places: Places) -> float:

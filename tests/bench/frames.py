@@ -3,14 +3,14 @@
 import sys
 from pathlib import Path
 
-from tests.bench.bursts import bursts
+from tests.bench.bursts import bursts, dim_bursts, displaced
 from tests.bench.colours import colours
 
-PARTS = {"bursts": bursts, "colours": colours}
+PARTS = {"bursts": bursts, "dim": dim_bursts, "displaced": displaced, "colours": colours}
 
 
 def main(words: list[str]) -> None:
-    """Run the named parts, by default both, on the photographs of the folder that comes first."""
+    """Run the named parts, by default all, on the photographs of the folder that comes first."""
     if not words or not (Path(words[0]) / "fundus").is_dir():
         sys.exit("say where the real data are: DATA=folder, which holds fundus/")
     for name in words[1:] or list(PARTS):

@@ -22,7 +22,7 @@ from device.values import Calibration, Colour, Counts, Image, Psf, Sensor
 
 SEED = 21  # of the diffuser
 BLACK_DN, CALIBRATION_FRAMES, FILL = 64.0, 16, 0.8
-MARGIN_PX = 48  # of a photograph beyond the field: the largest shift
+MARGIN_PX = 64  # of a photograph beyond the field: the largest shift
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 
 

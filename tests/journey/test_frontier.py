@@ -75,6 +75,15 @@ def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, t
     assert facts["choice"]["method"] == "variation", "five seconds are enough for everything"
     root = ElementTree.parse(plot).getroot()
     assert root.tag.endswith("svg")
+    light = facts["light"]
+    assert [(one["frames"], one["used"]) for one in light] == [(n, n) for n in (1, 2, 4, 8)]
+    assert light[3]["dose_j_per_cm2"] == pytest.approx(8 * light[0]["dose_j_per_cm2"])
+    assert light[0]["psnr_db"] == pytest.approx(facts["choice"]["psnr_db"], abs=1e-6), "one frame is the choice"
+    assert light[3]["psnr_db"] > light[0]["psnr_db"] + 0.5  # eight times the light
+    bounds = [one["bound_psnr_db"] for one in light]
+    assert bounds == sorted(bounds)
+    assert "8 frames (8 used)" in done.stdout
+    assert "8 frames, " in plot.read_text()
     assert "Diabetic scene" in done.stderr
     assert "the instrument chooses variation" in done.stdout
     assert len([line for line in done.stderr.splitlines() if " dB, PCC " in line]) == len(facts["points"])

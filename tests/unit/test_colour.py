@@ -74,3 +74,13 @@ def test_the_guided_filter_removes_noise_and_keeps_what_green_shows() -> None:
     assert after < before / 4  # 289 pixels to a window, of which a line and an offset are fitted
     alone = guided_filter(seen(OTHER_RETINA, (0, 0)), np.ones_like(green), LIT)
     assert np.isfinite(alone).all()
+
+
+def test_half_of_a_channel_stays_its_own_so_that_a_spot_that_green_lacks_is_kept() -> None:
+    spot = np.zeros_like(LIT)
+    spot[LIT.shape[0] // 2 - 3 : LIT.shape[0] // 2 + 4, LIT.shape[1] // 2 - 3 : LIT.shape[1] // 2 + 4] = 0.3
+    green, red = seen(RETINA, (0, 0)), seen(RED, (0, 0))
+    contrast = [
+        join_colours({"green": green, "red": one}, LIT, 2).picture[..., 0][spot > 0].mean() for one in (red, red + spot)
+    ]
+    assert contrast[1] - contrast[0] > 0.5 * 0.3  # GUIDED_SHARE keeps half, the filter a part of the rest
