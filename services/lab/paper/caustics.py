@@ -105,8 +105,8 @@ def run_walk(bench: Bench) -> Outcome:
         share = float(point.sum(dtype=np.float64)) / full
         printed = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}.get(angle_deg, "")
         low, high = expected - 0.002, expected + 0.002
-        said = printed if expected == 1 else ""
-        claim = within(f"light of a dot at {angle_deg:g} degrees", share, low, high, said, 4)
+        quoted = printed if expected == 1 else ""
+        claim = within(f"light of a dot at {angle_deg:g} degrees", share, low, high, quoted, 4)
         claims.append(claim.put_in("the walk of T, rendered").limit_from("overlap of two discs, +- 0.002 of pixels"))
         rows.append((f"{angle_deg:g}", f"{share:.4f}", f"{expected:g}", printed))
         if angle_deg >= 25:

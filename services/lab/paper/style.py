@@ -4,7 +4,7 @@ CLAIMED = """
 <h2>What is claimed, and what is not</h2>
 <ul>
 <li>Each row has a label. <b>As written</b>: the paper's statement on the paper's object. <b>Adapted</b>: its statement
-on something that differs, as said. <b>Put in</b>: the simulation was given that number, so the row shows only that the
+on something that differs (how). <b>Put in</b>: the simulation was given that number, so the row shows only that the
 program keeps it. <b class=open>Not reproduced</b>: the paper's number is missed, with the reason or what was tried; it
 does not count as held. <b>Ours</b>: the paper says nothing of it.</li>
 <li>A limit has its reason under it, or a star: it was set after the value had been seen, so that a later change of the

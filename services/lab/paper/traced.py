@@ -37,7 +37,7 @@ NOTES = (
     "usual pair for a pupil outside the lenses, and the pupil stands in the focus of the first pair. Nothing is fitted "
     "to the paper's angles. Other orientations light 0 to 100 % of the iris at 30 degrees.",
     "6.3 % at 30 degrees needs a beam that lies 0.5 mm farther off: an eye 0.6 mm too far from the lenses does it. So "
-    "the paper's value is within what hand and ruler allow, and no more can be said without its distances.",
+    "the paper's value is within what hand and ruler allow, and more needs its distances.",
     "The plate: its width (25.4 mm in the parts list) and thickness (5 mm) are not checked against the maker's page. "
     "Traced, a plate of 25.4 mm, 25 mm before the iris, cuts off a field beyond 20 degrees on one side of its tilt; "
     "the paper's 50 degrees need a wider one.",
