@@ -6,7 +6,7 @@ BIN := .venv/bin
 PORT ?= 8000
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-psf bench-retinas bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -14,17 +14,66 @@ help: ## List the make targets.
 # The drivers' libraries come without what they declare (av, OpenEXR, a GPL'd prctl): a raw frame needs none of it.
 PI_LOCK := tests/ports/emulators/requirements.lock
 
-.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml services/package.py services/__main__.py
-	@echo "Setting up .venv (a minute, once)"
+# uv installs a lock file in a tenth of pip's time, and each package from its cache in every further environment.
+UV := .uv-venv/bin/uv
+INSTALL = $(UV) pip install --quiet --require-hashes --python
+INSTALL_THIS = $(UV) pip install --quiet --no-deps --no-build-isolation --python
+
+$(UV):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Diffuscope needs Python 3.11 or newer; set PYTHON=..."; exit 1; }
-	@$(PYTHON) -m venv .venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
-	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
-	@$(BIN)/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
-	@$(BIN)/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(PYTHON) -m venv .uv-venv || { echo "Install the venv module first, on Debian: apt-get install python3-venv"; exit 1; }
+	@.uv-venv/bin/pip install -qq --disable-pip-version-check --only-binary :all: uv==0.13.9
+
+.venv/ready: requirements.lock $(PI_LOCK) pyproject.toml services/package.py services/__main__.py | $(UV)
+	@echo "Setting up .venv (a minute, once)"
+	@$(PYTHON) -m venv .venv
+	@$(INSTALL) $(BIN)/python --compile-bytecode -r requirements.lock  # many processes import it at once
+	@$(INSTALL) $(BIN)/python --no-deps -r $(PI_LOCK)
+	@$(INSTALL_THIS) $(BIN)/python -e .
+	@touch $@
+
+# Numba keeps compiled kernels beside the sources; three parallel test processes would compile each of them three times.
+.venv/kernels: device/recon/model/kernels.py device/recon/model/fused_kernels.py .venv/ready
+	@$(BIN)/python -m tests.compile_kernels
 	@touch $@
 
 run: .venv/ready ## Serve the page with the simulated head; PORT=8001 for another port.
 	@$(BIN)/diffuscope run --port $(PORT)
+
+# Debian's drivers lie behind .venv's own packages on the path, so that NumPy stays that of the lock file; those that only
+# the tests' emulators need are taken out, as they would hide Debian's.
+PI_PACKAGES := python3-picamera2 python3-libcamera python3-spidev python3-smbus2 python3-libgpiod
+PI_CONFIG := /boot/firmware/config.txt
+
+pi: ## On a Raspberry Pi: install the drivers, let .venv see them, switch SPI and I2C on; then restart.
+	@[ -f $(PI_CONFIG) ] || { echo "make pi is for Raspberry Pi OS of Debian 13: there is no $(PI_CONFIG) here"; exit 1; }
+	@sudo apt-get update -qq
+	@sudo apt-get install -y -qq --no-install-recommends $(PI_PACKAGES) python3-venv python3-dev gcc
+	@$(MAKE) .venv/ready
+	@$(BIN)/pip uninstall -qq -y picamera2 spidev smbus2
+	@echo /usr/lib/python3/dist-packages > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/debian.pth"
+	@for line in dtparam=spi=on dtparam=i2c_arm=on dtparam=strict_gpiod; do \
+		grep -qxF "$$line" $(PI_CONFIG) || echo "$$line" | sudo tee -a $(PI_CONFIG); done
+	@echo i2c-dev | sudo tee /etc/modules-load.d/diffuscope-i2c.conf >/dev/null
+	@sudo usermod -aG spi,i2c,gpio,video "$$(id -un)"
+	@echo "Restart the computer, then: $(BIN)/diffuscope doctor"
+
+# KiCad 9 comes from Debian 13 in a chroot of 1.5 GB, which only root can make; nothing of the tests needs it.
+GATE_ROOT := out/kicad
+
+$(GATE_ROOT)/ready:
+	@[ "$$(id -u)" = 0 ] || { echo "make gate makes a chroot, which only root can: sudo make gate"; exit 1; }
+	@command -v mmdebstrap >/dev/null || { apt-get update -qq && apt-get install -y -qq mmdebstrap >/dev/null; }
+	@rm -rf $(GATE_ROOT) && mkdir -p out && mmdebstrap --quiet --variant=minbase --include=kicad --aptopt='Apt::Install-Recommends "false"' \
+		trixie $(GATE_ROOT) http://deb.debian.org/debian
+	@touch $@
+
+gate: $(GATE_ROOT)/ready ## Check the schematic of the gate with KiCad 9 (ERC), and write netlist and drawing to out/gate; needs root.
+	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p out/gate
+	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/ && kicad-cli version && \
+		kicad-cli sch erc --severity-all --exit-code-violations -o erc.rpt gate.kicad_sch && \
+		kicad-cli sch export netlist -o gate.net gate.kicad_sch && kicad-cli sch export svg -o . gate.kicad_sch'
+	@cp $(GATE_ROOT)/gate/erc.rpt $(GATE_ROOT)/gate/gate.net $(GATE_ROOT)/gate/gate.svg out/gate && cat out/gate/erc.rpt
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py
@@ -37,11 +86,11 @@ WORKERS := -n 3 --dist loadfile
 PAGE_WORKERS := -n 4 --dist loadfile
 
 # The page's tests come first: they take longest of all files, and wait while the others compute.
-test: .venv/ready browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
+test: .venv/kernels browser buses ## Run the tests that a change needs first: units, ports, instrument, server, a press on the page.
 	@$(BIN)/python -m pytest $(WORKERS) -rR -m "$(NOT_HERE)" $(JOURNEYS) tests $(addprefix --ignore=,tests/browser tests/ports tests/parts tests/golden $(FAULTS))
 	@umockdev-wrapper $(BIN)/python -m pytest -n 2 --dist loadfile -m "not rig" tests/ports
 
-test-faults: .venv/ready strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
+test-faults: .venv/kernels strace ## Try kills, power cuts, flipped bits, bad frames, optics and invariants.
 	@$(BIN)/python -m pytest $(WORKERS) -m "$(NOT_HERE)" $(FAULTS)
 
 test-browser: .venv/ready browser ## Try the page in every state, size and language, its viewer, speech and the technician's sections.
@@ -71,11 +120,11 @@ test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults a
 # An environment of its own: pyfftw imports dask.array wherever Dask is installed, 0.3 s in every process.
 ARCHIVE_LOCK := services/lab/archive/requirements.lock
 
-.archive-venv/ready: $(ARCHIVE_LOCK) pyproject.toml
+.archive-venv/ready: $(ARCHIVE_LOCK) pyproject.toml | $(UV)
 	@echo "Setting up .archive-venv (a minute, once)"
-	@$(PYTHON) -m venv .archive-venv
-	@.archive-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r $(ARCHIVE_LOCK)
-	@.archive-venv/bin/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(PYTHON) -m venv --without-pip .archive-venv
+	@$(INSTALL) .archive-venv/bin/python -r $(ARCHIVE_LOCK)
+	@$(INSTALL_THIS) .archive-venv/bin/python -e .
 	@touch $@
 
 test-archive: .archive-venv/ready ## Reprocess small archives on Dask: results, table, kills of workers, runs and schedulers.
@@ -103,11 +152,11 @@ browser: ## Install headless Chromium (Debian package) where it is missing.
 # The contract suites once more, in an environment of another Python: what a Raspberry Pi's next system will bring.
 OTHER_PYTHON ?= python3.13
 
-.other-venv/ready: requirements.lock $(PI_LOCK)
-	@$(OTHER_PYTHON) -m venv .other-venv
-	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r requirements.lock
-	@.other-venv/bin/pip install -qq --disable-pip-version-check --require-hashes --no-deps -r $(PI_LOCK)
-	@.other-venv/bin/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+.other-venv/ready: requirements.lock $(PI_LOCK) | $(UV)
+	@$(OTHER_PYTHON) -m venv --without-pip .other-venv
+	@$(INSTALL) .other-venv/bin/python -r requirements.lock
+	@$(INSTALL) .other-venv/bin/python --no-deps -r $(PI_LOCK)
+	@$(INSTALL_THIS) .other-venv/bin/python -e .
 	@touch $@
 
 test-other: .other-venv/ready buses ## Run the contract suites on another Python: OTHER_PYTHON=python3.13.
@@ -156,6 +205,13 @@ bench-kills: .venv/ready buses ## Kill a process that holds the lamp, 200 times,
 bench-store: .venv/ready ## End the instrument 200 times and damage its store: what is lost; time from start to a press.
 	@$(BIN)/python -m tests.bench.store
 
+FRAMES ?= 60
+bench-refraction: .venv/ready ## Print error and coverage of the refraction on textbook frames; DATA=folder has photographs, FRAMES=60 of each sensor and field.
+	@$(BIN)/python -m tests.bench.refraction --data "$(DATA)" --frames $(FRAMES)
+
+bench-montage: .venv/ready ## Print the acceptance figures of the montage on photographs; DATA=folder has them.
+	@$(BIN)/python -m tests.bench.montage --data "$(DATA)"
+
 bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
 	@$(BIN)/python -m tests.bench.sides "$(DATA)"
 
@@ -190,11 +246,11 @@ bench-peers: .venv/ready ## Install LenslessPiCam and ducc0 beside, in .bench-ve
 # A CAD kernel is heavy, and no instrument needs one: an environment of its own.
 PARTS_LOCK := hardware/parts/requirements.lock
 
-.parts-venv/ready: $(PARTS_LOCK) hardware/parts/install
+.parts-venv/ready: $(PARTS_LOCK) hardware/parts/install | $(UV)
 	@hardware/parts/install
 	@echo "Setting up .parts-venv (a minute, once)"
-	@$(PYTHON) -m venv .parts-venv
-	@.parts-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r $(PARTS_LOCK)
+	@$(PYTHON) -m venv --without-pip .parts-venv
+	@$(INSTALL) .parts-venv/bin/python -r $(PARTS_LOCK)
 	@touch $@
 
 parts: .parts-venv/ready ## Write the printed parts as STEP and STL into out/parts.
@@ -209,11 +265,11 @@ test-parts: .parts-venv/ready ## Measure the printed parts: closed, thick enough
 # Sphinx and matplotlib are needed by the documentation only: an environment of its own.
 SITE_LOCK := services/lab/site/requirements.lock
 
-.site-venv/ready: $(SITE_LOCK) pyproject.toml
+.site-venv/ready: $(SITE_LOCK) pyproject.toml | $(UV)
 	@echo "Setting up .site-venv (a minute, once)"
-	@$(PYTHON) -m venv .site-venv
-	@.site-venv/bin/pip install -qq --disable-pip-version-check --require-hashes -r $(SITE_LOCK)
-	@.site-venv/bin/pip install -qq --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@$(PYTHON) -m venv --without-pip .site-venv
+	@$(INSTALL) .site-venv/bin/python -r $(SITE_LOCK)
+	@$(INSTALL_THIS) .site-venv/bin/python -e .
 	@touch $@
 
 site: .site-venv/ready ## Build the documentation with its gallery into out/site; GALLERY=0 leaves the scripts unrun.
@@ -223,20 +279,19 @@ test-site: .venv/ready browser site ## Build the documentation, then test its li
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m site tests/documentation
 
 # Hashes for every platform in one file (x86-64 and aarch64), newest versions that pyproject.toml allows.
-lock: .venv/ready ## Write requirements.lock anew, the part of it that a release needs, those of the printed parts and the documentation.
-	@$(BIN)/pip install -qq --disable-pip-version-check uv
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+lock: | $(UV) ## Write requirements.lock anew, the part of it that a release needs, those of the printed parts and the documentation.
+	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--extra instrument --extra test --group lock pyproject.toml -o requirements.lock
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
-		--constraints requirements.lock --extra instrument pyproject.toml -o systemd/image/requirements.lock
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+		--constraints requirements.lock --constraints $(PI_LOCK) --extra instrument --extra board pyproject.toml -o systemd/image/requirements.lock
+	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--constraints requirements.lock --extra instrument --extra archive --extra test --group lock \
 		--group archive-test pyproject.toml -o $(ARCHIVE_LOCK)
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		hardware/parts/requirements.in -o $(PARTS_LOCK)
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
+	@$(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header \
 		--constraints requirements.lock --extra instrument --extra docs --group lock pyproject.toml -o $(SITE_LOCK)
 
 clean: ## Remove all that was made here; captures live elsewhere and stay.
-	@rm -rf .venv .archive-venv .bench-venv .other-venv .parts-venv .site-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
+	@rm -rf .venv .archive-venv .bench-venv .other-venv .parts-venv .site-venv .uv-venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .coverage build dist out *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -41,6 +41,11 @@ class SystemClock:
         time.sleep(max(0.0, duration_s))
 
 
+def set_system_clock(moment: datetime) -> None:
+    """Set the clock of the computer to a time with a time zone; PermissionError without the capability."""
+    time.clock_settime(time.CLOCK_REALTIME, moment.timestamp())
+
+
 def boot_id() -> str:
     """Return the kernel's id of the current boot; monotonic times are comparable within one boot only.
 

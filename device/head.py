@@ -26,15 +26,16 @@ from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
 from device.drivers.gpio import InputLine, OutputLine
 from device.drivers.guardian import Guardian
 from device.drivers.heartbeat import Heartbeat
+from device.drivers.no_light import NoLight
 from device.drivers.pi_camera import PiCamera
 from device.drivers.probe import ProbeFinding, probe_parts
-from device.drivers.ring import Apa102Ring
+from device.drivers.ring import Apa102Ring, LedRing, Tlc5971Ring
 from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SettingError, SpecError, TooHot
 from device.light_safety.dose_ledger import Ledger
 from device.light_safety.guard import GuardedLight
 from device.light_safety.hazard import NO_LIGHT, Hazard, light_limits, radiometry
-from device.optics.matrix import chain_of, ring
+from device.optics.matrix import chain_of, lamps_of
 from device.ports import NO_CHIPS, Button, Camera, Chips, HeadMemory, Light
 from device.sim import calibration_targets, fault_injection
 from device.sim.camera import SimCamera
@@ -48,7 +49,7 @@ from device.values import Calibration, Eye
 LEASE_MARGIN_S = 0.05  # so that the guard's timer ends first; the guardian process acts only if the timer fails
 
 
-def no_repositioning(eye: Eye) -> None:
+def no_repositioning(eye: Eye, field: str | None = None) -> None:
     """Do nothing: `present_eye` of a head without simulated camera, which the operator positions by hand."""
 
 
@@ -68,7 +69,7 @@ class Head:
     button: Button | None = None
     resources: ExitStack = field(default_factory=ExitStack)  # closes the opened parts in reverse order
     provenance: Provenance | None = None
-    present_eye: Callable[[Eye], None] = no_repositioning
+    present_eye: Callable[[Eye, str | None], None] = no_repositioning
 
     @property
     def kind(self) -> str:
@@ -139,6 +140,11 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
     if spec.calibration is not None:
         kept = Archive(spec.calibration.archive).load()
         spec = with_led_radiometry(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
+    if spec.light.backend == "none":
+        raise SpecError(
+            f"{spec.name} has no lamp, so it takes no pictures of eyes",
+            "Take frames in the light that is there: diffuscope frame --head HEAD -o raw.tiff (hardware/bench.md).",
+        )
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with HeadOpener(spec, clock, allocator) as opening:
@@ -198,13 +204,25 @@ class HeadOpener:
         """Return the lamp without light guard; a real one with `chain`, if given, instead of the head file's LEDs."""
         if self.spec.light.backend == "sim":
             return SimLight(self.world)
+        if self.spec.light.backend == "none":
+            return NoLight()
+        ring = self._ring(chain)
+        self.resources.callback(ring.close)
+        return MirroredLight(ring, self.world) if self.spec.camera.backend == "sim" else ring
+
+    def _ring(self, chain: ChainSpec | None) -> LedRing:
+        """Return the driver of the head's ring with its guardian."""
+        lease_s, sinks = self.spec.light.max_on_s + LEASE_MARGIN_S, self.spec.light.sinks
+        if self.spec.light.backend == "tlc5971":
+            assert sinks is not None
+            guardian = Guardian(sinks.device, chip="tlc5971")
+            self.resources.callback(guardian.close)
+            return Tlc5971Ring(sinks, guardian, lease_s, self._pulse())
         chain = chain or chain_of(self.spec)
         assert chain is not None
         guardian = Guardian(chain.device, chain.rows * chain.cols)
         self.resources.callback(guardian.close)
-        ring = Apa102Ring(chain, guardian, self.spec.light.max_on_s + LEASE_MARGIN_S, self._pulse())
-        self.resources.callback(ring.close)
-        return MirroredLight(ring, self.world) if self.spec.camera.backend == "sim" else ring
+        return Apa102Ring(chain, guardian, lease_s, self._pulse())
 
     def _pulse(self) -> Heartbeat | None:
         """Return the opened heartbeat of the lamp's hardware watchdog; None without one, or with simulated GPIO."""
@@ -338,12 +356,13 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
         )
 
 
-def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Iterator[ProbeFinding]:
+def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None, *, leds: bool = True) -> Iterator[ProbeFinding]:
     """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
 
-    A HardwareError of a part becomes a finding and is not raised. The lamp is dark at the end.
+    Without `leds` the lamp stays dark. A HardwareError of a part becomes a finding and is not raised. The lamp is dark
+    at the end.
     """
-    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator))
+    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator), leds=leds)
 
 
 @contextmanager
@@ -367,10 +386,10 @@ def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
 def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
     spec, calibration = opening.spec, opening.calibration()
-    facing: Callable[[Eye], None] = no_repositioning
+    facing: Callable[[Eye, str | None], None] = no_repositioning
     if spec.camera.backend == "sim":
         facing = opening.world.present_eye
-        facing("OD")  # traces the light now, not while a lamp is on
+        facing("OD", None)  # traces the light now, not while a lamp is on
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
@@ -401,14 +420,10 @@ def refuse_mismatched_head(head: Head) -> None:
 
 def hazard_of(spec: InstrumentSpec) -> Hazard:
     """Return the hazard and limits of a head's light, by measured radiometry, else worst case; no light in a replay."""
-    if spec.light.backend == "replay":
+    if spec.light.backend in ("replay", "none"):
         return Hazard(NO_LIGHT, light_limits())
     field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
-    chain = chain_of(spec)
-    if chain is None:
-        return Hazard(radiometry(spec.light.radiometry, field_deg), light_limits())
-    leds = len(ring(chain))
-    return Hazard(radiometry(spec.light.radiometry, field_deg, leds=leds), light_limits())
+    return Hazard(radiometry(spec.light.radiometry, field_deg, lamps=lamps_of(spec)), light_limits())
 
 
 def recording_spec(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:

@@ -14,7 +14,8 @@ Counts = NDArray[np.uint16]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-Colour = Literal["red", "green", "blue"]
+Colour = Literal["red", "green", "blue", "amber"]
+ChannelName = Literal["red", "green", "blue", "amber"]  # colours of light in a colour picture
 Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
 
@@ -242,6 +243,20 @@ ONLY_FRAME = FrameUse(0, True, (0.0, 0.0), 1.0)  # a picture of one frame
 
 
 @dataclass(frozen=True)
+class ChannelUse:
+    """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
+
+    What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one. `reason`
+    says why a colour is missing in the picture; None for one that the picture has.
+    """
+
+    name: ChannelName
+    shift_px: tuple[float, float] | None
+    predicted: bool = False
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
 class Report:
     """Report of a reconstruction; its fields are the keys of `report.json`.
 
@@ -272,8 +287,8 @@ class Report:
     psf_scale: float = 1.0
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
-    refraction_dpt: dict[str, float] | None = None
-    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null if it is not known."""
+    refraction_dpt: dict[str, float | str | None] | None = None
+    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null without a known geometry."""
 
     regularisation: dict[str, Any] = field(default_factory=dict)
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""
@@ -292,6 +307,9 @@ class Report:
 
     frames: tuple[FrameUse, ...] = (ONLY_FRAME,)
     """What became of each frame of the burst, in its order; one entry for one frame. Not in earlier releases."""
+
+    channels: tuple[ChannelUse, ...] = ()
+    """Colours of light of a colour picture; empty for a grey one. Not in earlier releases."""
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
     head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
+    field_fixed: Annotated[
+        bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
+    ] = False,
     even: Annotated[
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
@@ -170,7 +173,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     options = ReconstructOptions(
         raws[0] if raws else Path(), tuple(psf or ()), None if each else output, method, budget_s, common_dark, flat,
         head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
-        parse_settings(setting or ()), parse_bayer(bayer),
+        parse_settings(setting or ()), parse_bayer(bayer), field_fixed,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
     if each:
@@ -233,6 +236,64 @@ def probe_head(head: Annotated[Path, typer.Option(help="Head file, such as hardw
         if found.remedy:
             typer.echo(f"{'':<22}{found.remedy}")
     raise typer.Exit(0 if well else 1)
+
+
+@app.command("doctor")
+def examine_computer(
+    head: Annotated[Path | None, typer.Option(help="Head file; its parts are opened, without light.")] = None,
+    leds: Annotated[bool, typer.Option("--leds", help="Also light each LED: point the head at white paper.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+) -> None:
+    """What this computer lacks for a head, each with its remedy: buses, permissions, libraries, camera, lamp, chips.
+
+    The exit status is 1 if a check failed; a warning does not count.
+    """
+    from services.health import doctor
+
+    spec = None if head is None else load_head(head)
+    report = doctor.examine(doctor.Machine(SystemClock(), leds=leds), spec)
+    typer.echo(report.model_dump_json(indent=1) if as_json else doctor.table(report))
+    raise typer.Exit(0 if report.healthy else 1)
+
+
+@app.command("frame")
+def take_frame(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/bench.toml.")],
+    output: Annotated[Path, typer.Option("-o", help="Raw frame to write, .tiff.")],
+    count: Annotated[int, typer.Option(min=1, max=256, help="Exposures, of which the mean is written.")] = 1,
+    exposure_s: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Exposure; else the head file's.")] = None,
+) -> None:
+    """Take one raw frame with the lamp dark, in the light that is there: of a scene, a point source or a cap."""
+    from services.lab.take_frames import take_frames
+
+    frame = take_frames(head, output, count, exposure_s, SystemClock())
+    low, high = int(frame.counts.min()), int(frame.counts.max())
+    typer.echo(f"{output}: {frame.counts.shape[0]} x {frame.counts.shape[1]}, counts {low} to {high}")
+
+
+@app.command("light")
+def judge_light(
+    head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
+    power_mw: Annotated[float, typer.Option(min=0, help="Into a pupil of 7 mm, whole ring, full drive, one colour.")],
+    waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
+    peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
+    meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],
+    colour: Annotated[str, typer.Option(help="Of the reading; by default the picture's.")] = "",
+    guard_factor: Annotated[float, typer.Option(min=1.3, max=10, help="For the meter's error.")] = 1.3,
+) -> None:
+    """Judge a power meter's reading of a ring: its shares of the limits, GO or NO GO, and the lines for the head file.
+
+    A reading that such a ring cannot give is refused. The exit status is 1 for NO GO.
+    """
+    from services.lab import measured_light, optics_report
+
+    spec = load_head(head)
+    if colour:
+        spec = measured_light.in_colour(spec, colour)
+    reading = measured_light.MeterReading(spec.light.colour, power_mw, waist_mw_per_cm2, peak_nm, meter, guard_factor)
+    found = measured_light.judge(spec, optics_report.design_of(spec), reading)
+    typer.echo(measured_light.words(reading, found))
+    raise typer.Exit(0 if found.is_go else 1)
 
 
 @app.command("calibrate")
@@ -472,20 +533,36 @@ def optics(
     eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
     pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,
     svg: Annotated[Path | None, typer.Option(help="Where to draw the light path, to scale.")] = None,
+    light: Annotated[
+        bool, typer.Option("--light", help="The chain of light from LED to electron, and its limits.")
+    ] = False,
+    frames: Annotated[int, typer.Option(min=1, max=64, help="Frames of one picture, for --light.")] = 1,
+    light_svg: Annotated[Path | None, typer.Option(help="Where to draw what limits the light.")] = None,
+    search: Annotated[
+        bool, typer.Option("--search", help="Search LEDs, ring, iris and exposure for enough light.")
+    ] = False,
 ) -> None:
     """The optical budget of a head or a sensor: field, crop, scale, pupil, light; of all sensors if none is chosen."""
-    from services.lab import light_path_plot
+    from services.lab import head_search, light_path_plot, light_report
     from services.lab import optics_report as budget
 
     if head is not None and sensor is not None:
         raise typer.BadParameter("choose --head or --sensor, not both")
     if head is None and sensor is None:
-        if svg is not None or eye_mm is not None or pupil_mm is not None:
+        if svg or light or light_svg or search or eye_mm is not None or pupil_mm is not None:
             raise typer.BadParameter("choose --head or --sensor")
         typer.echo(budget.comparison())
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
-    typer.echo(budget.table(chosen))
+    if search:
+        typer.echo(head_search.table(chosen))
+    else:
+        typer.echo(light_report.table(chosen, frames) if light else budget.table(chosen))
+    if light_svg is not None:
+        write_or_raise(
+            light_svg, lambda: light_svg.write_text(light_report.gains_svg(chosen, frames), encoding="utf-8")
+        )
+        typer.echo(f"{light_svg}")
     if svg is not None:
         write_or_raise(svg, lambda: svg.write_text(light_path_plot.draw_light_path(chosen), encoding="utf-8"))
         typer.echo(f"{svg}")

@@ -19,7 +19,7 @@ CARD = "systemd/image/card"
 LAYERS = {"layer/diffuscope.yaml": "diffuscope", "image/diffuscope-card.yaml": "diffuscope-card"}
 # Layers of rpi-image-gen that are used here, as listed in its documentation in August 2026.
 THEIRS = {
-    "rpi5", "image-base", "debian-bookworm-arm64-multi", "rpi-debian-bookworm", "rpi-essential-base", "systemd-min",
+    "rpi5", "image-base", "debian-trixie-arm64-multi", "rpi-debian-trixie", "rpi-essential-base", "systemd-min",
     "network-manager",
 }  # fmt: skip
 RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
@@ -119,10 +119,21 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
     recipe = text("systemd/image/release")
     beside = {path.name for path in (ROOT / "systemd/image").iterdir() if path.is_file()}
     brought = {name for name in beside if f"$here/{name}" in recipe}
-    tools = {"README.md", "base", "bundle", "install", "keys", "release", "requirements.lock", "sbom.py", "wheels"}
+    tools = {
+        "README.md",
+        "base",
+        "bundle",
+        "install",
+        "keys",
+        "release",
+        "requirements.lock",
+        "sbom.py",
+        "suite",
+        "wheels",
+    }
     assert beside - tools <= brought
     assert set(re.findall(r"systemctl.*enable (.*)", recipe)[0].split()) == {
         "diffuscope.service", "diffuscope-identity.service", "diffuscope-settle.service", "diffuscope-update.timer",
-        "diffuscope-wish.path",
+        "diffuscope-wish.path", "diffuscope-clock.path",
     }  # fmt: skip
     assert Path(ROOT / "systemd/diffuscope-identity.service").exists()

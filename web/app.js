@@ -11,7 +11,7 @@ import { playCue, resetPictureTools, captureEventHandlers, ignoreTaps, openPictu
 import { startRouter, navigate } from "./core/router.js";
 import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
 import { render } from "./vendor/lit-html.js";
-import { finishWhenComplete, alertOnError, refreshList, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
+import { finishWhenComplete, alertOnError, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
 import { loadLanguage, t, today } from "./i18n/translate.js";
 
 const STATUS_BEATS = 10; // request the status at every tenth heartbeat
@@ -36,6 +36,7 @@ async function showRoute(route) {
   set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
   ignoreTaps(); // debounce: the second half of a double tap must not press a control of the new screen
   lowerAlerts("link.slow");
+  if (route.screen !== "film" || route.visit !== before.visit) set({ montages: Object.freeze({}) });
   if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
   await loadRoute(route);
   if (!same) requestAnimationFrame(() => focusScreen(route.screen));
@@ -85,6 +86,7 @@ async function loadRoute(route) {
   if (visit?.finished_at && ["aim", "person"].includes(route.screen)) {
     return navigate({ screen: "outcome", visit: route.visit }, { replace: true }); // a finished visit is read-only
   }
+  if (route.screen === "film") refreshMontages(route.visit);
   if (route.screen === "compare") {
     const captures = await Promise.all([route.capture, route.other].map((id) => alertOnError(() => getCapture(id))));
     set({ compared: Object.freeze(captures.filter(Boolean)) });

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from math import pi, radians, tan
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, model_validator
 
@@ -39,7 +40,7 @@ class LedReading(Table):
     """Reading of one LED in one colour at full drive; power and waist irradiance are None if not measured."""
 
     led: int
-    colour: Colour
+    colour: Literal["red", "green", "blue"]  # of an APA102
     peak_nm: float
     power_mw: float | None = None
     waist_mw_per_cm2: float | None = None

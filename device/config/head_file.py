@@ -10,7 +10,7 @@ from device.config.scene import SimSpec
 from device.config.sensors import sensor_profile
 from device.config.toml_file import Table, load_toml
 from device.errors import SpecError
-from device.values import Geometry
+from device.values import Colour, Geometry
 
 
 class CameraSpec(Table):
@@ -34,6 +34,7 @@ class CameraSpec(Table):
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
     device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
     row_us: float = Field(default=30.0, gt=0, le=1000)
+    bayer: bool = False  # colour filters before the pixels; the driver refuses a sensor with filters otherwise
     upright: bool = False  # checked by hand: pictures are upright and not mirrored (hardware/assembly.md)
 
     @model_validator(mode="before")
@@ -96,14 +97,88 @@ class ChainSpec(Table):
         return self
 
 
-class LightSpec(Table):
-    """LED ring: colours for the picture and for aiming, and `max_on_s`, the longest time the guard leaves it on."""
+OUTPUTS = 12  # of one TLC5971
+OUTPUT_MA = 60.0  # largest current of one output, TI SBVS146D
 
-    backend: Literal["sim", "replay", "apa102"]
+
+class SinkLedSpec(Table):
+    """LEDs of one colour of a constant-current ring.
+
+    `places` are their places on the grid, numbered as in `ChainSpec`; `outputs` lists for each LED the outputs that
+    sink its current, several in parallel. `power_mw` is the radiant power of one LED at full drive, `wavelength_um` its
+    peak, `emitter_mm` the width of what shines.
+    """
+
+    part: str = Field(min_length=1)
+    places: tuple[int, ...] = Field(min_length=1)
+    outputs: tuple[tuple[int, ...], ...] = Field(min_length=1)
+    wavelength_um: float = Field(ge=0.4, le=0.7)
+    power_mw: float = Field(gt=0, le=2000)
+    emitter_mm: float = Field(gt=0, le=5)
+    trims: tuple[float, ...] | None = None
+
+    @model_validator(mode="after")
+    def _check_counts(self) -> "SinkLedSpec":
+        """Raise ValueError if outputs or trims are not as many as places, or a trim is not above 0 and at most 1."""
+        if len(self.outputs) != len(self.places) or not all(self.outputs):
+            raise ValueError("outputs has one list of at least one output for each of places")
+        if self.trims is not None and (len(self.trims) != len(self.places) or not all(0 < t <= 1 for t in self.trims)):
+            raise ValueError("trims are as many as places, above 0 and at most 1")
+        return self
+
+
+class SinkSpec(Table):
+    """Ring of high-power LEDs behind TLC5971 constant-current sinks on SPI, up to three colours.
+
+    `output_ma` is the current of one output, set by the resistor at IREF; `most_ma` the limit of the load switch, which
+    no colour may exceed. The grid of places is that of SparkFun's LuMini, so that the LED cap fits both.
+    """
+
+    device: str = Field(default="/dev/spidev0.0", pattern=r"^/dev/spidev\d+\.\d+$")
+    chips: int = Field(default=1, ge=1, le=4)
+    output_ma: float = Field(default=OUTPUT_MA, gt=0, le=OUTPUT_MA)
+    most_ma: float = Field(default=500.0, gt=0, le=1000)
+    rows: int = Field(default=8, ge=1, le=16)
+    cols: int = Field(default=8, ge=1, le=16)
+    pitch_mm: float = Field(default=3.175, gt=0, le=20)
+    green: SinkLedSpec
+    amber: SinkLedSpec | None = None
+    red: SinkLedSpec | None = None
+
+    @property
+    def colours(self) -> "dict[Colour, SinkLedSpec]":
+        """LEDs by colour, without the colours that this ring has not."""
+        named: dict[Colour, SinkLedSpec | None] = {"green": self.green, "amber": self.amber, "red": self.red}
+        return {colour: leds for colour, leds in named.items() if leds is not None}
+
+    @model_validator(mode="after")
+    def _check_outputs(self) -> "SinkSpec":
+        """Raise ValueError if an output or place is used twice or is not there, or a colour draws too much current."""
+        leds = self.colours.values()
+        outputs = [output for one in leds for several in one.outputs for output in several]
+        if len(set(outputs)) < len(outputs) or not all(0 <= output < OUTPUTS * self.chips for output in outputs):
+            raise ValueError(f"outputs are different numbers from 0 to {OUTPUTS * self.chips - 1}")
+        places = [place for one in leds for place in one.places]
+        if len(set(places)) < len(places) or not all(0 <= place < self.rows * self.cols for place in places):
+            raise ValueError(f"places are different numbers from 0 to {self.rows * self.cols - 1}")
+        for colour, one in self.colours.items():
+            if (drawn_ma := self.output_ma * sum(map(len, one.outputs))) > self.most_ma:
+                raise ValueError(f"{colour} draws {drawn_ma:g} mA, more than most_ma = {self.most_ma:g}")
+        return self
+
+
+class LightSpec(Table):
+    """LED ring: colours for the picture and for aiming, and `max_on_s`, the longest time the guard leaves it on.
+
+    `chain` is a matrix of APA102 LEDs, `sinks` a ring of high-power LEDs with TLC5971 drivers; a real head has one.
+    """
+
+    backend: Literal["sim", "replay", "none", "apa102", "tlc5971"]
     chain: ChainSpec | None = None
+    sinks: SinkSpec | None = None
     pupil_mm: float | None = Field(default=None, gt=0, le=10)  # selects the chain's widest ring that fits into it
-    colour: Literal["red", "green", "blue"] = "green"
-    preview_colour: Literal["red", "green"] = "red"
+    colour: Colour = "green"
+    preview_colour: Literal["red", "green", "amber"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
     radiometry: RadiometrySpec | None = None
 
@@ -189,12 +264,13 @@ class InstrumentSpec(Table):
 def load_head(path: Path) -> InstrumentSpec:
     """Return the head in a TOML file (`hardware/heads/*.toml`); SpecError for a missing table or an invalid value."""
     spec = load_toml(path, InstrumentSpec)
-    if spec.light.backend == "apa102" and spec.camera.backend != "replay" and spec.optics is None:
+    if spec.light.backend in ("apa102", "tlc5971") and spec.camera.backend != "replay" and spec.optics is None:
         raise SpecError(f"{path}: a head needs the table [optics]")
     if "sim" in (spec.camera.backend, spec.light.backend) and (spec.sim is None or spec.optics is None):
         raise SpecError(f"{path}: a simulated head needs the tables [optics] and [sim]")
     if spec.light.backend == "apa102" and spec.light.chain is None:
         raise SpecError(f"{path}: a ring of APA102 LEDs needs the table [light.chain]")
+    _refuse_unlit_colours(path, spec.light)
     if spec.camera.backend == "replay" and spec.replay is None:
         raise SpecError(f"{path}: a replayed head needs the table [replay]")
     for key in ("exposure_s", "preview_exposure_s"):
@@ -205,6 +281,17 @@ def load_head(path: Path) -> InstrumentSpec:
             )
     _refuse_pupil_beside_iris(path, spec)
     return spec
+
+
+def _refuse_unlit_colours(path: Path, light: LightSpec) -> None:
+    """Raise SpecError for a ring of TLC5971 without its table, and for a colour of which the ring has no LED."""
+    if light.backend == "tlc5971" and light.sinks is None:
+        raise SpecError(f"{path}: a ring of TLC5971 drivers needs the table [light.sinks]")
+    known: set[Colour] = {"red", "green", "blue"} if light.sinks is None else set(light.sinks.colours)
+    if light.backend in ("apa102", "tlc5971"):
+        for key, colour in (("colour", light.colour), ("preview_colour", light.preview_colour)):
+            if colour not in known:
+                raise SpecError(f"{path}: light.{key} = {colour!r}: this ring has {', '.join(sorted(known))} LEDs only")
 
 
 def _refuse_pupil_beside_iris(path: Path, spec: InstrumentSpec) -> None:

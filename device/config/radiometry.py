@@ -30,6 +30,7 @@ class RadiometrySpec(Table):
     red: BeamSpec | None = None
     green: BeamSpec | None = None
     blue: BeamSpec | None = None
+    amber: BeamSpec | None = None
 
     def beam(self, colour: Colour) -> BeamSpec | None:
         """Return the measurement of a colour; None if not measured."""

@@ -22,7 +22,9 @@ class ObjectSpec(Table):
     `retina` is drawn from the scene's seed with these numbers of lesions; `image` is a photograph; `dots` are a lattice
     of discs; `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
     one disc of `dot_um`. All are moved by `at_deg` (right, down). `size_deg` is the width of a drawn retina or
-    photograph; None: as wide as the field needs.
+    photograph; None: as wide as the field needs. `cut_deg` (right, down) cuts a retina or photograph to a rectangle in
+    the middle of the field, as a photograph whose disc is cut at top and bottom; a photograph then keeps its shape and
+    has the rectangle's width, else its central square fills the field.
     """
 
     kind: Literal["retina", "image", "dots", "ruler", "point"] = "retina"
@@ -39,6 +41,15 @@ class ObjectSpec(Table):
     stroke_um: float = Field(default=220.0, gt=0, le=5000)
     at_deg: tuple[float, float] = (0.0, 0.0)
     size_deg: float | None = Field(default=None, gt=0, lt=120)
+    cut_deg: tuple[float, float] | None = None
+
+    @field_validator("cut_deg")
+    @classmethod
+    def _check_cut(cls, cut_deg: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Return the cut unchanged; ValueError unless both sides are above 0 and below 120 degrees."""
+        if cut_deg is not None and not all(0 < side < 120 for side in cut_deg):
+            raise ValueError(f"sides above 0 and below 120 degrees, not {cut_deg}")
+        return cut_deg
 
     @field_validator("image")
     @classmethod
@@ -54,6 +65,8 @@ class ObjectSpec(Table):
         """Raise ValueError unless the key `image` is given for kind "image", and only for it."""
         if self.kind == "image" and self.image is None:
             raise ValueError('kind = "image" needs the key image, the path of a photograph')
+        if self.kind not in ("image", "retina") and self.cut_deg is not None:
+            raise ValueError(f'the key cut_deg goes with kind = "retina" or "image", not with "{self.kind}"')
         if self.kind != "image" and self.image is not None:
             raise ValueError(f'the key image goes with kind = "image", not with "{self.kind}"')
         return self

@@ -1,10 +1,13 @@
-"""Stand-alone program that turns the ring of LEDs off, with the standard library only.
+"""Stand-alone program that turns the ring of LEDs off, APA102 or TLC5971, with the standard library only.
 
-    python3 -I -S blank.py --device /dev/spidev0.0            now; for systemd's ExecStopPost= and for every boot
+    python3 -I -S blank.py --device /dev/spidev0.0            now; for systemd's ExecStopPost=
+    python3 -I -S blank.py --device /dev/spidev0.0 --insist   for every boot: again for 10 s if the bus fails
     python3 -I -S blank.py --device /dev/spidev0.0 --guard    when its parent ends, or a lease expires
 
 The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
 standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease); it answers each with `ok`.
+Without --chip the messages of both kinds are sent: that of the TLC5971 first, which then ignores the other one, as no
+word at a packet's place in it begins with the write command. A matrix of APA102 sees the other message last.
 Exit status 1: the device does not exist, or does not accept the frame.
 """
 
@@ -20,6 +23,7 @@ from contextlib import suppress
 SPEED_HZ = 4_000_000
 WR_MODE, WR_MAX_SPEED_HZ = 0x40016B01, 0x40046B04  # <linux/spi/spidev.h>: _IOW('k', 1, u8), _IOW('k', 4, u32)
 LEDS = 64
+MOST_SINKS = 4  # a shorter chain of TLC5971 shifts the packets of absent chips out
 TRIES, AGAIN_S = 200, 0.05
 
 
@@ -28,31 +32,41 @@ def dark_frame(leds: int) -> bytes:
     return bytes(4) + b"\xff\0\0\0" * leds + bytes(max(8, -(-leds // 16)))
 
 
-def blank(device: str, leds: int) -> None:
-    """Send the off frame twice; set SPI mode and speed, as the kernel does not keep them. Raises OSError."""
+def dark_packets(chips: int) -> bytes:
+    """Return the off message of a chain of TLC5971: write command 25h, blanked, brightness and grey scales 0."""
+    return (b"\x94\x20" + bytes(26)) * chips
+
+
+def off_frames(chip: str, leds: int) -> list[bytes]:
+    """Return the messages that turn a chain off, each twice; for the chip "any" those of both kinds."""
+    sinks, matrix = [dark_packets(MOST_SINKS)] * 2, [dark_frame(leds)] * 2
+    return {"apa102": matrix, "tlc5971": sinks, "any": sinks + matrix}[chip]
+
+
+def blank(device: str, leds: int, chip: str) -> None:
+    """Send the off messages; set SPI mode and speed, as the kernel does not keep them. Raises OSError."""
     wire = os.open(device, os.O_RDWR | os.O_CLOEXEC)
     try:
         fcntl.ioctl(wire, WR_MODE, struct.pack("=B", 0))
         fcntl.ioctl(wire, WR_MAX_SPEED_HZ, struct.pack("=I", SPEED_HZ))
-        frame = dark_frame(leds)
-        for _ in range(2):
+        for frame in off_frames(chip, leds):
             if os.write(wire, frame) != len(frame):
                 raise OSError(f"{device} took a part of the frame only")
     finally:
         os.close(wire)
 
 
-def blank_with_retries(device: str, leds: int) -> None:
-    """Send the off frame; if the bus fails, retry 200 times at intervals of 50 ms, then raise OSError."""
+def blank_with_retries(device: str, leds: int, chip: str) -> None:
+    """Send the off messages; if the bus fails, retry 200 times at intervals of 50 ms, then raise OSError."""
     for _ in range(TRIES):
         with suppress(OSError):
-            blank(device, leds)
+            blank(device, leds, chip)
             return
         select.select([], [], [], AGAIN_S)
-    blank(device, leds)
+    blank(device, leds, chip)
 
 
-def guard(device: str, leds: int) -> None:
+def guard(device: str, leds: int, chip: str) -> None:
     """Turn the LEDs off when a lease expires; also when standard input or the parent process ends, and then return.
 
     The parent is watched too, because a forked process may hold its pipe open. After a lease has expired, the off frame
@@ -69,7 +83,7 @@ def guard(device: str, leds: int) -> None:
             heard = {ear for ear, _ in poller.poll(lease_ms)}
             if not heard:
                 with suppress(OSError):
-                    blank(device, leds)
+                    blank(device, leds, chip)
                 lease_ms = 1000 * AGAIN_S
                 continue
             message = os.read(0, 4096).decode("ascii") if heard == {0} else ""
@@ -78,18 +92,21 @@ def guard(device: str, leds: int) -> None:
             last = message.split("\n")[-2]
             lease_ms = 1000 * float(last.split()[1]) if last.startswith("lit") else None
             os.write(1, b"ok\n")
-    (blank if lease_ms is None else blank_with_retries)(device, leds)
+    (blank if lease_ms is None else blank_with_retries)(device, leds, chip)
 
 
 def main() -> int:
     """Parse the arguments and run `blank`, or `guard` with --guard; return the exit status, 1 after an OSError."""
     parser = argparse.ArgumentParser(description="Darken the ring of LEDs.")
     parser.add_argument("--device", required=True, help="the SPI device, such as /dev/spidev0.0")
-    parser.add_argument("--leds", type=int, default=LEDS, help="how many LEDs the chain has")
+    parser.add_argument("--leds", type=int, default=LEDS, help="how many APA102 LEDs the chain has")
+    parser.add_argument("--chip", choices=("apa102", "tlc5971", "any"), default="any", help="what the chain is made of")
     parser.add_argument("--guard", action="store_true", help="darken when the parent ends or a lease runs out")
+    parser.add_argument("--insist", action="store_true", help="try again for 10 s if the bus fails")
     arguments = parser.parse_args()
     try:
-        (guard if arguments.guard else blank)(arguments.device, arguments.leds)
+        darken = guard if arguments.guard else blank_with_retries if arguments.insist else blank
+        darken(arguments.device, arguments.leds, arguments.chip)
     except OSError as error:
         sys.stderr.write(f"{arguments.device} cannot be darkened: {error}\n")
         return 1

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from device.clock import Clock
+from device.config.device_nodes import I2C
 from device.errors import BusFault, MemoryDamaged
 from device.values import BatteryState, HeadIdentity
 
@@ -23,11 +24,15 @@ class I2cBus:
     def __init__(self, device: str) -> None:
         try:
             from smbus2 import SMBus, i2c_msg
-        except ImportError as error:
-            raise BusFault(f"smbus2 cannot be used: {error}", "Install python3-smbus2.") from error
+        except Exception as error:  # of another numpy's compiled part: ValueError
+            raise BusFault(
+                f"smbus2 cannot be used: {error}", "Install it: sudo apt install python3-smbus2, then make pi."
+            ) from error
         self._message = i2c_msg
-        with _bus_faults(device):
+        try:
             self._bus: Any = SMBus(device)
+        except OSError as error:
+            raise BusFault(f"{device} cannot be opened: {error}", I2C.remedy(device, error.errno)) from error
 
     def read_word(self, address: int, register: int) -> int:
         """Return the value of a 16-bit register, which the chip transmits high byte first."""

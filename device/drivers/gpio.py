@@ -50,7 +50,7 @@ def _request_line(chip: str, line: int, *, output: bool) -> tuple[Any, Any, Any]
     try:
         import gpiod
         from gpiod.line import Bias, Direction, Value
-    except ImportError as error:
+    except Exception as error:  # of another numpy's compiled part: ValueError
         raise BusFault(
             f"{chip} needs gpiod, which cannot be used: {error}", "Install gpiod (pip, 2.2 or newer)."
         ) from error

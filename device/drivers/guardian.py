@@ -5,7 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
+from device.drivers.blank import LEDS
 from device.errors import LightFault
 
 ANSWER_S = 0.5  # a guardian that answers later would also darken the ring too late
@@ -16,12 +18,13 @@ BLANK = Path(__file__).with_name("blank.py")
 class Guardian:
     """Handle of the child process `blank.py --guard`, which receives leases and acknowledges each.
 
-    `device` is the SPI device, `leds` the length of the chain. Every message raises LightFault if the child has ended
-    or does not answer within 0.5 s; then no light may be turned on.
+    `device` is the SPI device, `chip` what its chain is made of, `leds` its length if these are APA102. Every message
+    raises LightFault if the child has ended or does not answer within 0.5 s; then no light may be turned on.
     """
 
-    def __init__(self, device: str, leds: int) -> None:
-        command = [sys.executable, "-I", "-S", str(BLANK), "--device", device, "--leds", str(leds), "--guard"]
+    def __init__(self, device: str, leds: int = LEDS, chip: Literal["apa102", "tlc5971"] = "apa102") -> None:
+        command = [sys.executable, "-I", "-S", str(BLANK), "--device", device, "--leds", str(leds)]
+        command += ["--chip", chip, "--guard"]
         self._child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )

@@ -27,7 +27,8 @@ OPEN_TIMEOUT_S = 10.0
 SPARE_US = 1500  # between two exposures, for the blanking of the read-out; the sensor lengthens it as needed
 MAIN = (320, 240)  # the processed stream that picamera2 requires; not used
 MOSAICS = {0: "SRGGB", 1: "SGRBG", 2: "SGBRG", 3: "SBGGR", 5: "R"}  # libcamera's ColorFilterArrangement
-FIXED_CONTROLS = {"AeEnable": False, "AwbEnable": False, "AnalogueGain": 1.0, "NoiseReductionMode": 0, "Sharpness": 0.0}
+FIXED_CONTROLS = {"AeEnable": False, "AwbEnable": False, "NoiseReductionMode": 0, "Sharpness": 0.0}
+LIBRARY_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError)  # picamera2, libcamera
 NO_CAMERA_REMEDY = (
     "Check the camera's ribbon cable and the line dtoverlay of config.txt, then turn the device off and on."
 )
@@ -52,22 +53,25 @@ class PiCamera(RetryingCamera):
     ) -> None:
         try:
             from picamera2 import MappedArray, Picamera2
-        except ImportError as error:
+        except Exception as error:  # of another numpy's compiled part: ValueError
             raise CameraMissing(
                 f"picamera2 cannot be imported: {error}",
-                "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them.",
+                "Install the packages python3-picamera2 and python3-libcamera, and let .venv see them: make pi.",
             ) from error
         self._library, self._mapped = Picamera2, MappedArray
         super().__init__(spec, light, simulated)
         self._patience_s, self._allocator = patience_s, allocator
         self._device: Any = None
         self._layout: RawLayout
+        self._gain = 1.0  # lowest of the sensor, at least 1: an IMX708 begins at 1.123
+        self._mosaic = "R"
         self.open(ExposureSettings(spec.exposure_s))
 
     @property
     def facts(self) -> dict[str, str]:
-        """Return the sensor's name and the granted raw format by the keys `sensor` and `format`, for a technician."""
-        return {"sensor": str(self._spec.sensor), "format": self._layout.name}
+        """Return `sensor` and the granted raw `format`, for a technician; and `mosaic` of a sensor with filters."""
+        facts = {"sensor": str(self._spec.sensor), "format": self._layout.name}
+        return facts if self._mosaic == "R" else {**facts, "mosaic": self._mosaic.removeprefix("S")}
 
     # Opening
 
@@ -77,13 +81,14 @@ class PiCamera(RetryingCamera):
             run_with_timeout(OPEN_TIMEOUT_S, lambda: self._start(shot.exposure_s))
         except (HardwareError, TimeoutError):
             raise
-        except (RuntimeError, ValueError, OSError) as error:  # the errors of picamera2 and libcamera
+        except LIBRARY_ERRORS as error:
             raise CameraMissing(f"the {self._name} cannot be opened: {error}", NO_CAMERA_REMEDY) from error
 
     def _start(self, exposure_s: float) -> None:
         device = self._device = self._library(self._camera_index(), allocator=self._allocator)
         spec, size = self._spec, (self._spec.cols, self._spec.rows)
-        mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        mosaic = self._mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        self._refuse_unexpected_mosaic(mosaic)
         asked = device.create_video_configuration(
             main={"size": (min(MAIN[0], size[0] & ~1), min(MAIN[1], size[1] & ~1))},
             raw={"format": f"{mosaic}{spec.bit_depth}", "size": size},
@@ -95,6 +100,16 @@ class PiCamera(RetryingCamera):
         self._layout = self._granted_layout(device.camera_configuration())
         device.start()
         log.info("%s: raw %s", spec.sensor, device.camera_configuration()["raw"])
+
+    def _refuse_unexpected_mosaic(self, mosaic: str) -> None:
+        """Raise CameraMismatch for colour filters that the head file does not expect: counts would not be grey."""
+        if mosaic != "R" and not self._spec.bayer:
+            raise CameraMismatch(
+                f"the {self._spec.sensor} has colour filters ({mosaic.removeprefix('S')}); this head needs the "
+                "monochrome version",
+                "Fit the monochrome version. For a bench write bayer = true under [camera], and reconstruct with "
+                "--bayer.",
+            )
 
     def _camera_index(self) -> int:
         """Return the index of the first camera with the sensor of the head file; CameraMissing or CameraMismatch."""
@@ -111,9 +126,9 @@ class PiCamera(RetryingCamera):
         known = device.camera_controls
         if missing := {"ExposureTime", "AnalogueGain", "FrameDurationLimits"} - known.keys():
             raise CameraMismatch(f"the {self._spec.sensor} does not let {', '.join(sorted(missing))} be chosen")
-        return {
-            name: value for name, value in (FIXED_CONTROLS | exposure_controls(exposure_s)).items() if name in known
-        }
+        self._gain = max(1.0, float(known["AnalogueGain"][0]))
+        wanted = FIXED_CONTROLS | {"AnalogueGain": self._gain} | exposure_controls(exposure_s)
+        return {name: value for name, value in wanted.items() if name in known}
 
     def _granted_layout(self, configuration: dict[str, Any]) -> RawLayout:
         """Return the granted layout, read back as libcamera may adjust a request; CameraMismatch, CameraPacked."""
@@ -156,14 +171,17 @@ class PiCamera(RetryingCamera):
                 return
             flush = None  # the following frames began later
         raise CameraStalled(
-            f"{MAX_SETTLING_FRAMES} frames passed, and none was exposed for {shot.exposure_s * 1e6:.0f} us at gain 1 "
-            f"(the last: {metadata.get('ExposureTime')} us, gain {metadata.get('AnalogueGain')})"
+            f"{MAX_SETTLING_FRAMES} frames passed, and none was exposed for {shot.exposure_s * 1e6:.0f} us at gain "
+            f"{self._gain:g} (the last: {metadata.get('ExposureTime')} us, gain {metadata.get('AnalogueGain')})"
         )
 
     def _matches_request(self, metadata: dict[str, Any], shot: ExposureSettings) -> bool:
-        """Return whether a frame has this exposure (within 1.5 rows: the sensor rounds down to rows) and gain 1."""
+        """Return whether a frame has this exposure (within 1.5 rows: the sensor rounds down to rows) and gain."""
         off_us = abs(float(metadata["ExposureTime"]) - shot.exposure_s * 1e6)
-        return off_us <= 1.5 * self._spec.row_us and abs(float(metadata.get("AnalogueGain", 1.0)) - 1) < 0.1
+        return (
+            off_us <= 1.5 * self._spec.row_us
+            and abs(float(metadata.get("AnalogueGain", self._gain)) - self._gain) < 0.1
+        )
 
     def _read(self, raw: NDArray[np.uint8], counts: Counts | None) -> NDArray[np.uint8] | None:
         """Copy the counts of a borrowed buffer into `counts`, return None; if None, return a copy of the raw bytes."""
@@ -212,7 +230,7 @@ def run_with_timeout(limit_s: float, call: Callable[[], None]) -> None:
         try:
             call()
             done.set_result(None)
-        except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError) as error:
+        except LIBRARY_ERRORS as error:
             done.set_exception(error)
 
     Thread(target=run, name="camera", daemon=True).start()

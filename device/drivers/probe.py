@@ -13,6 +13,7 @@ from device.optics.matrix import chain_of, ring
 from device.ports import Camera, Chips, Light, LightContext
 from device.values import BatteryState, ExposureSettings, Frame, Illumination
 
+MOSAIC_WARNING = "counts of three colours; a third of green light, and reconstruct needs --bayer"
 DETECTION_SIGMAS = 6.0  # detection threshold of an LED above the dark frame's mean, in standard errors of that mean
 
 
@@ -42,17 +43,19 @@ class PartOpener(Protocol):
 OpenParts = Callable[[], AbstractContextManager[PartOpener]]
 
 
-def probe_parts(spec: InstrumentSpec, open_parts: OpenParts) -> Iterator[ProbeFinding]:
+def probe_parts(spec: InstrumentSpec, open_parts: OpenParts, *, leds: bool = True) -> Iterator[ProbeFinding]:
     """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
 
     `open_parts` returns a context that closes the parts which were opened in it. A HardwareError of a part becomes a
-    finding and is not raised. The lamp is dark at the end.
+    finding and is not raised. The lamp is dark at the end, and without `leds` all the time. A colour mosaic is a
+    finding that does not fail where the head file expects it; the driver refuses one that it does not expect.
     """
     with open_parts() as opening:
         light = camera = None
         try:
             light = opening.lamp()
-            yield ProbeFinding("lamp", True, f"{spec.light.backend} answers")
+            if spec.light.backend != "none":
+                yield ProbeFinding("lamp", True, f"{spec.light.backend} answers")
         except HardwareError as error:
             yield _failure("lamp", error)
         try:
@@ -63,7 +66,9 @@ def probe_parts(spec: InstrumentSpec, open_parts: OpenParts) -> Iterator[ProbeFi
             yield _failure("camera", error)
         if camera is not None:
             yield _check_part("black level", lambda: _black_level(spec, camera))
-        if camera is not None and light is not None:
+        if camera is not None and "mosaic" in camera.facts:
+            yield ProbeFinding("mosaic", True, f"colour filters {camera.facts['mosaic']}: {MOSAIC_WARNING}")
+        if leds and camera is not None and light is not None and spec.light.backend != "none":
             yield from _leds(spec, open_parts, camera, light)
         yield from _chips(opening)
 

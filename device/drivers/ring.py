@@ -1,18 +1,19 @@
-"""Ring of APA102 LEDs on SPI: on within a context, off before and after it, and off if this process ends.
+"""Rings of LEDs on SPI: on within a context, off before and after it, and off if this process ends.
 
-The LEDs keep their last colour while they have power. So a guardian process receives a lease before each light, and
-turns the ring off when the lease expires or this process ends.
+APA102 LEDs and TLC5971 drivers keep their last state while they have power. So a guardian process receives a lease
+before each light, and turns the ring off when the lease expires or this process ends.
 """
 
 import logging
 from collections.abc import Sequence
 from threading import Lock
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Protocol
 
-from device.config.head_file import ChainSpec
-from device.drivers.blank import SPEED_HZ, dark_frame
+from device.config.head_file import OUTPUTS, ChainSpec, SinkSpec
+from device.drivers.blank import dark_frame, dark_packets
 from device.drivers.guardian import Guardian
+from device.drivers.spi_bus import SpiBus
 from device.errors import LightFault
 from device.optics.matrix import ring
 from device.values import Colour, Illumination
@@ -34,6 +35,33 @@ def lit_frame(chain: ChainSpec, leds: Sequence[int], glow: Illumination) -> byte
     return bytes(frame)
 
 
+# One TLC5971 packet, 224 bits, most significant first (TI SBVS146D, 9.2.2.3): write command 25h; OUTTMG, EXTGCK,
+# TMGRST, DSPRPT, BLANK; brightness of blue, green, red, 7 bits each; grey scales B3, G3, R3, B2 ... R0, 16 bits each.
+COMMAND, FULL_BRIGHTNESS, GREY_MAX = 0x25, 0x7F, 0xFFFF
+LIT_CONTROL = (
+    0b10110  # outputs change at the clock's rising edge, internal clock, restart at the latch, repeat, no blank
+)
+
+
+def lit_packets(sinks: SinkSpec, glow: Illumination) -> bytes:
+    """Return the message that lights the LEDs of one colour, at level times trim, at least 1/65535.
+
+    LightFault for a colour that the ring does not have. The packet of the last chip comes first; chip 0 is that at the
+    computer, and its outputs 0 to 11 are R0, G0, B0, R1 ... B3.
+    """
+    if glow.colour not in sinks.colours:
+        raise LightFault(f"this ring has no {glow.colour} LEDs", "Correct light.colour in the head file.")
+    leds, greys = sinks.colours[glow.colour], [0] * (OUTPUTS * sinks.chips)
+    for outputs, trim in zip(leds.outputs, leds.trims or (1.0,) * len(leds.outputs), strict=True):
+        for output in outputs:
+            greys[output] = max(1, round(GREY_MAX * glow.level * trim))
+    head = (COMMAND << 5 | LIT_CONTROL) << 21 | FULL_BRIGHTNESS << 14 | FULL_BRIGHTNESS << 7 | FULL_BRIGHTNESS
+    return b"".join(
+        head.to_bytes(4, "big") + b"".join(grey.to_bytes(2, "big") for grey in reversed(greys[first : first + OUTPUTS]))
+        for first in range(OUTPUTS * (sinks.chips - 1), -1, -OUTPUTS)
+    )
+
+
 class Pulse(Protocol):
     """Heartbeat that keeps the hardware gate open while a lease is active (device/drivers/heartbeat.py)."""
 
@@ -44,28 +72,22 @@ class Pulse(Protocol):
         """Stop the heartbeat."""
 
 
-class Apa102Ring:
-    """APA102 driver that implements `ports.Light` on the LEDs of `chain`; LightFault if bus or guardian is unusable."""
+class LedRing:
+    """Driver of a chain of LEDs on SPI that implements `ports.Light`; LightFault if bus or guardian is unusable.
 
-    def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
-        try:
-            import spidev
-        except ImportError as error:
-            raise LightFault(f"spidev cannot be used: {error}", "Install python3-spidev.") from error
-        self._chain, self._guardian, self._lease_s = chain, guardian, lease_s
-        self._leds, self._pulse = ring(chain), pulse
-        self._dark = dark_frame(chain.rows * chain.cols)
+    Subclasses give the message that lights the ring; `dark` is the one that turns it off.
+    """
+
+    def __init__(self, device: str, dark: bytes, guardian: Guardian, lease_s: float, pulse: Pulse | None) -> None:
+        self._dark, self._guardian, self._lease_s, self._pulse = dark, guardian, lease_s, pulse
         self._glow: Illumination | None = None
         self._lock = Lock()  # the guard's timer may turn the ring off while another thread turns it on
-        self._wire: Any = spidev.SpiDev()
-        try:
-            bus, select = chain.device.removeprefix("/dev/spidev").split(".")
-            self._wire.open(int(bus), int(select))
-            self._wire.mode = 0
-            self._wire.max_speed_hz = SPEED_HZ
-        except (OSError, ValueError) as error:
-            raise LightFault(f"{chain.device} cannot be opened: {error}") from error
+        self._bus: SpiBus | None = SpiBus(device)
         self.off()
+
+    def _lit(self, glow: Illumination) -> bytes:
+        """Return the message that lights the ring; LightFault for a colour that it does not have."""
+        raise NotImplementedError
 
     @property
     def illumination(self) -> Illumination | None:
@@ -79,12 +101,12 @@ class Apa102Ring:
     def off(self) -> None:
         """Turn the ring off, stop the heartbeat, cancel the lease; harmless if off or closed. Raises LightFault."""
         with self._lock:
-            if self._wire is None:
+            if self._bus is None:
                 return
             self._glow = None
             try:
-                self._send(self._dark)
-                self._send(self._dark)
+                self._bus.send(self._dark)
+                self._bus.send(self._dark)
             finally:
                 if self._pulse is not None:
                     self._pulse.stop()
@@ -93,35 +115,56 @@ class Apa102Ring:
     def turn_on(self, glow: Illumination) -> None:
         """Grant the lease, start the heartbeat, then turn the ring on; LightFault. Called by RingLightContext only."""
         with self._lock:
+            if self._bus is None:
+                raise LightFault("the lamp has been closed")
+            frame = self._lit(glow)
             self._guardian.grant_lease(self._lease_s)
             if self._pulse is not None:
                 self._pulse.start(self._lease_s)
-                self._send(self._dark)  # LEDs show arbitrary colours after power-up
+                self._bus.send(self._dark)  # LEDs show arbitrary colours after power-up
             self._glow = glow
-            self._send(lit_frame(self._chain, self._leds, glow))
+            self._bus.send(frame)
 
     def close(self) -> None:
         """Turn the ring off, close the SPI device and end the guardian; closing twice is harmless."""
-        if self._wire is None:
+        if self._bus is None:
             return
         try:
             self.off()
         finally:
-            self._wire.close()
-            self._wire = None
+            self._bus.close()
+            self._bus = None
             self._guardian.close()
 
-    def _send(self, frame: bytes) -> None:
-        try:
-            self._wire.writebytes2(frame)
-        except (OSError, SystemError) as error:  # spidev raises SystemError for a short write
-            raise LightFault(f"the lamp's bus does not take its message: {error}") from error
+
+class Apa102Ring(LedRing):
+    """Ring of a matrix of APA102 LEDs: for benches and model eyes, its light is too weak for an eye (OPTICS.md 4.6)."""
+
+    def __init__(self, chain: ChainSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
+        self._chain, self._leds = chain, ring(chain)
+        super().__init__(chain.device, dark_frame(chain.rows * chain.cols), guardian, lease_s, pulse)
+
+    def _lit(self, glow: Illumination) -> bytes:
+        if glow.colour not in BLUE_GREEN_RED:
+            raise LightFault(f"an APA102 has no {glow.colour} LED", "Correct light.colour in the head file.")
+        return lit_frame(self._chain, self._leds, glow)
+
+
+class Tlc5971Ring(LedRing):
+    """Ring of high-power LEDs behind TLC5971 constant-current drivers, which start dark when they get power."""
+
+    def __init__(self, sinks: SinkSpec, guardian: Guardian, lease_s: float, pulse: Pulse | None = None) -> None:
+        self._sinks = sinks
+        super().__init__(sinks.device, dark_packets(sinks.chips), guardian, lease_s, pulse)
+
+    def _lit(self, glow: Illumination) -> bytes:
+        return lit_packets(self._sinks, glow)
 
 
 class RingLightContext:
     """Context manager: the ring is on from entry to exit."""
 
-    def __init__(self, ring: Apa102Ring, glow: Illumination) -> None:
+    def __init__(self, ring: LedRing, glow: Illumination) -> None:
         self._ring, self._glow = ring, glow
 
     def __enter__(self) -> "RingLightContext":

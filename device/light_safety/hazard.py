@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 from device.config.radiometry import FIELD_DEG, WAIST_CM2, RadiometrySpec
 from device.config.toml_file import Table, load_toml
 from device.errors import LightLimit, SpecError
-from device.optics.illumination import LED, LEDS, TRANSMISSION_TO_EYE, photon_budget
+from device.optics.illumination import LED, LEDS, TRANSMISSION_TO_EYE, Led, photon_budget
+from device.optics.matrix import Lamp
 from device.values import Colour, Illumination
 
 LIMITS = Path(__file__).with_name("limits.toml")
@@ -164,29 +165,36 @@ Radiometry = Mapping[Colour, Beam]
 NO_LIGHT: Radiometry = {colour: Beam(led.wavelength_um, 0.0, 0.0) for colour, led in LED.items()}  # for a recording
 
 
-def radiometry(measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS) -> Radiometry:
-    """Return the beam of each colour: as measured, times the guard factor; if unmeasured, the worst case."""
+def radiometry(
+    measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS,
+    lamps: Mapping[Colour, Lamp] | None = None,
+) -> Radiometry:  # fmt: skip
+    """Return the beam of each colour: as measured, times the guard factor; if unmeasured, the worst case.
+
+    `lamps` are the head's LEDs by colour; None: `leds` LEDs of an APA102-2020 in each of its colours.
+    """
     found: dict[Colour, Beam] = {}
-    for colour in LED:
+    for colour, lamp in (lamps or {colour: Lamp(led, leds) for colour, led in LED.items()}).items():
         spec = measured.beam(colour) if measured else None
         if measured is None or spec is None:
-            found[colour] = worst_beam(colour, field_deg, leds)
+            found[colour] = worst_beam(colour, field_deg, lamp.count, lamp.led)
         else:
             scale = measured.guard_factor / 1000
             found[colour] = Beam(spec.wavelength_um, scale * spec.retina_mw_per_cm2, scale * spec.waist_mw_per_cm2)
     return found
 
 
-def worst_beam(colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS) -> Beam:
+def worst_beam(colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS, led: Led | None = None) -> Beam:
     """Return the worst-case beam of an unmeasured colour: lossless optics, and LEDs brighter by the uncertainty factor.
 
     `retina` holds the light of all `leds` LEDs, `waist` that of one LED: the LEDs are further apart than the disc of 1
     mm over which the waist irradiance is averaged.
     """
-    budget = photon_budget(colour, pitch_um=1.0, field_deg=field_deg)
+    led = led or LED[colour]
+    budget = photon_budget(colour, pitch_um=1.0, field_deg=field_deg, led=led)
     scale = LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE / 1000
     return Beam(
-        LED[colour].wavelength_um,
+        led.wavelength_um,
         scale * budget.retina_mw_per_cm2 * leds / LEDS,
         scale * budget.cornea_mw / LEDS / WAIST_CM2,
     )
@@ -201,32 +209,49 @@ class Hazard:
 
     def photochemical_w_per_cm2(self, glow: Illumination) -> float:
         """Return the A-weighted irradiance of the retina, W/cm2."""
-        beam = self.beams[glow.colour]
+        beam = self._beam(glow)
         return glow.level * beam.retina_w_per_cm2 * self.limits.photochemical_weight.at(beam.wavelength_um)
 
     def thermal_w_per_cm2(self, glow: Illumination) -> float:
         """Return the R-weighted irradiance of the retina, W/cm2."""
-        beam = self.beams[glow.colour]
+        beam = self._beam(glow)
         return glow.level * beam.retina_w_per_cm2 * self.limits.thermal_weight.at(beam.wavelength_um)
 
     def waist_w_per_cm2(self, glow: Illumination) -> float:
         """Return the irradiance in the waist of the beam, unweighted, W/cm2."""
-        return glow.level * self.beams[glow.colour].waist_w_per_cm2
+        return glow.level * self._beam(glow).waist_w_per_cm2
 
     def dose_j_per_cm2(self, glow: Illumination, duration_s: float) -> float:
         """Return the A-weighted retinal dose of an illumination of this duration, J/cm2."""
         return self.photochemical_w_per_cm2(glow) * max(0.0, duration_s)
 
+    def _beam(self, glow: Illumination) -> Beam:
+        """Return the beam of a colour; LightLimit for a colour whose irradiance is not known: this head has no LED."""
+        if glow.colour not in self.beams:
+            raise LightLimit(
+                f"this head has no {glow.colour} LEDs, so their irradiance is not known",
+                f"Choose one of {', '.join(self.beams)} in the head file.",
+            )
+        return self.beams[glow.colour]
+
     def refuse(self, glow: Illumination) -> None:
         """Raise LightLimit, with the permitted level, if an illumination exceeds any of the three irradiance limits."""
+        times = self._times(glow)
+        if times > 1:
+            raise LightLimit(
+                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
+                f"Dim it to {100 * self.highest_level(glow.colour):g} % or less, or have the head's light measured.",
+            )
+
+    def highest_level(self, colour: Colour) -> float:
+        """Return the highest level of a colour within the three irradiance limits, at most 1, in steps of 0.001."""
+        return min(1.0, floor(1000 / self._times(Illumination(colour))) / 1000)
+
+    def _times(self, glow: Illumination) -> float:
+        """Return the largest irradiance over its limit."""
         limits = self.limits
-        times = max(
+        return max(
             self.photochemical_w_per_cm2(glow) / limits.photochemical_w_per_cm2,
             self.thermal_w_per_cm2(glow) / limits.thermal_w_per_cm2,
             self.waist_w_per_cm2(glow) / limits.waist_w_per_cm2,
         )
-        if times > 1:
-            raise LightLimit(
-                f"{glow.colour} light at {100 * glow.level:.3g} % is {times:.3g} times brighter than an eye may see",
-                f"Dim it to {floor(1000 * glow.level / times) / 10:g} % or less, or have the head's light measured.",
-            )

@@ -8,9 +8,17 @@ from device.config.sensors import SensorProfile
 from device.errors import SpecError
 from device.optics import field_extent
 from device.optics.eye import Relay, reflex_free_mm, size_mm
-from device.optics.illumination import PhotonBudget, half_period_deg, photon_budget, within_simulated_range
+from device.optics.illumination import LED, Led, PhotonBudget, half_period_deg, photon_budget, within_simulated_range
 from device.optics.light_path import LightPath, relay_of
-from device.optics.matrix import chain_of, inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.optics.matrix import (
+    EMITTER_MM,
+    Lamp,
+    geometry_of,
+    inner_ring_at_pupil_mm,
+    lamps_of,
+    ring,
+    ring_at_pupil_mm,
+)
 from device.values import Colour
 
 
@@ -29,6 +37,9 @@ class Design:
     pupil_mm: float
     colour: Colour = "green"
     exposure_s: float = 0.1
+    led: Led = LED["green"]
+    emitter_mm: float = EMITTER_MM
+    read_noise_e: float = 0.0
 
     @property
     def relay(self) -> Relay:
@@ -86,10 +97,12 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
     """Return a head's design, with ring and pupil of `path` if the head names none; SpecError without [optics]."""
     if spec.optics is None:
         raise SpecError(f"{spec.name}: no table [optics], so nothing is known of its light path")
-    chain, camera, pupil_mm = chain_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
+    chain, camera, pupil_mm = geometry_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
+    colour = spec.light.colour
+    lamp = (lamps_of(spec) or {}).get(colour) or Lamp(LED[colour], len(ring(chain)))
     return Design(
         spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, path.eye.focal_mm, pupil_mm,
-        spec.light.colour, camera.exposure_s,
+        colour, camera.exposure_s, lamp.led, lamp.emitter_mm, camera.read_noise_e,
     )  # fmt: skip
 
 
@@ -105,7 +118,7 @@ def optical_budget(design: Design) -> OpticalBudget:
     """Return all numbers of a design, by the formulas in `eye.py`, `matrix.py` and `illumination.py`."""
     relay, field, pitch_um = design.relay, design.optics.field_deg, design.pitch_um
     leds = len(ring(design.chain))
-    light = photon_budget(design.colour, pitch_um, field, design.eye_mm, relay, leds)
+    light = photon_budget(design.colour, pitch_um, field, design.eye_mm, relay, leds, design.led)
     electrons = light.electrons_per_px_s * design.exposure_s
     finest_deg = half_period_deg(electrons, pitch_um)
     long, short = (_side(relay, field, side_mm) for side_mm in design.sides_mm)

@@ -9,7 +9,13 @@ from math import acos, asin, atan, degrees, hypot, pi, radians, sin, sqrt, tan
 
 CORNEA_RADIUS_MM = 7.8
 CORNEA_INDEX = 1.376
-WALK_FROM_DEG, WALK_MM, WALK_POWER = 15.0, 0.12801840, 1.4409122
+# Series through the ray trace of the real lenses, in powers of the half field over 30 degrees (OPTICS.md 6.3, 6.4);
+# tests/physics/test_traced_relay.py compares them with the trace up to TRACED_TO_DEG.
+TRACED_TO_DEG = 31.0
+WALK_MM = {3: 5.2596, 5: 0.5667, 7: 0.0947}
+SAGITTAL_DPT = {2: 6.4251, 4: -0.0886, 6: -0.0070}  # of a flat screen behind the model eye's lens
+TANGENTIAL_DPT = {2: 11.6529, 4: 1.8813, 6: 0.5779}
+MODEL_EYE_MM = 25.2  # traced focal length of that lens at 0.55 um
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,12 @@ class Relay:
         margin_mm = self.pupil_margin_mm(pupil_mm)
         if margin_mm < 0:
             return 0.0
-        return 2 * (WALK_FROM_DEG + float((margin_mm / WALK_MM) ** (1 / WALK_POWER)))
+        low_deg, high_deg = 0.0, 90.0
+        for _ in range(50):  # beam walk grows with the angle: halve the interval that holds the margin
+            middle_deg = (low_deg + high_deg) / 2
+            filled = beam_walk_mm(middle_deg) <= margin_mm
+            low_deg, high_deg = (middle_deg, high_deg) if filled else (low_deg, middle_deg)
+        return 2 * low_deg
 
     def first_lens_aperture_mm(self, field_deg: float) -> float:
         """Return the clear aperture of the first lens, mm: twice the chief ray's height plus the beam's diameter."""
@@ -107,8 +118,21 @@ def correction_dpt(distance_mm: float, focal_length_mm: float = 25.0) -> float:
 
 
 def beam_walk_mm(angle_deg: float) -> float:
-    """Return the lateral shift of the beam over the iris at a field angle, mm: a fitted power law; OPTICS.md 1.4."""
-    return float(WALK_MM * max(0.0, abs(angle_deg) - WALK_FROM_DEG) ** WALK_POWER)
+    """Return the shift of the beam over the iris at a field angle, mm: the ray trace's series; OPTICS.md 6.3."""
+    return _series(WALK_MM, angle_deg)
+
+
+def flat_screen_dpt(angle_deg: float, focal_length_mm: float) -> tuple[float, float]:
+    """Return sagittal and tangential vergence, dpt, of a flat screen in the focus of the model eye; OPTICS.md 6.4.
+
+    `focal_length_mm` scales the lens with its screen.
+    """
+    scale = MODEL_EYE_MM / focal_length_mm
+    return scale * _series(SAGITTAL_DPT, angle_deg), scale * _series(TANGENTIAL_DPT, angle_deg)
+
+
+def _series(terms: dict[int, float], angle_deg: float) -> float:
+    return sum(factor * (abs(angle_deg) / 30) ** power for power, factor in terms.items())
 
 
 def iris_overlap(shift_mm: float, beam_mm: float, iris_mm: float) -> float:

@@ -6,6 +6,8 @@ OPTICS.md 4.1 and 4.2. The LEDs' power is an estimate within a factor of two unt
 from dataclasses import dataclass
 from math import degrees, exp, log, pi, radians, sin, tan
 
+import numpy as np
+
 from device.optics import field_extent
 from device.optics.eye import Relay
 from device.values import Colour
@@ -34,7 +36,24 @@ LED: dict[Colour, Led] = {
     "red": Led(0.622, 2.31, (0.072 + 0.049) / 2, 0.60),
     "green": Led(0.522, 1.98, (0.0194 + 0.0141) / 2, 0.58),
     "blue": Led(0.467, 4.89, (0.0129 + 0.0081) / 2, 0.445),
-}
+}  # of an APA102-2020
+PEAK_UM: dict[Colour, float] = {colour: led.wavelength_um for colour, led in LED.items()} | {"amber": 0.590}
+# Wavelength, um, with the reflectance and the quantum efficiency there; at 590 nm both are estimates (OPTICS.md 4.1).
+RESPONSE = (
+    (0.467, LED["blue"].reflectance, 0.445), (0.522, LED["green"].reflectance, 0.58),
+    (0.590, 0.030, 0.61), (0.622, LED["red"].reflectance, 0.60),
+)  # fmt: skip
+
+
+def led_at(wavelength_um: float, power_mw: float) -> Led:
+    """Return an LED of that peak and power; reflectance and efficiency by power laws between the points of RESPONSE.
+
+    Outside of 0.467 to 0.622 um the value of the nearest point is taken.
+    """
+    um, reflectance, efficiency = zip(*RESPONSE, strict=True)
+    at = np.log(wavelength_um)
+    values = (float(np.exp(np.interp(at, np.log(um), np.log(known)))) for known in (reflectance, efficiency))
+    return Led(wavelength_um, power_mw, *values)
 
 
 @dataclass(frozen=True)
@@ -49,14 +68,15 @@ class PhotonBudget:
 
 def photon_budget(
     colour: Colour, pitch_um: float, field_deg: float = 33.4, eye_mm: float = 17.0, relay: Relay | None = None,
-    leds: int = LEDS,
+    leds: int = LEDS, led: Led | None = None,
 ) -> PhotonBudget:  # fmt: skip
     """Return the budget of `leds` LEDs at full drive, spread over the field of a human eye, collected by the iris.
 
-    `eye_mm` is the eye's focal length; `relay` None: the paper's. The image's width is d + 2 s, iris plus twice the
-    shift of the field's edge, because the diffuser spreads every point over the iris's shadow.
+    `eye_mm` is the eye's focal length; `relay` None: the paper's; `led` None: that colour of an APA102-2020. The
+    image's width is d + 2 s, iris plus twice the shift of the field's edge, because the diffuser spreads every point
+    over the iris's shadow.
     """
-    relay, led = relay or Relay(), LED[colour]
+    relay, led = relay or Relay(), led or LED[colour]
     cornea_mw = leds * led.power_mw * sin(radians(RELAY_HALF_CONE_DEG)) ** 2 * TRANSMISSION_TO_EYE
     lit_cm2 = pi * (eye_mm / 10 * tan(radians(field_deg / 2))) ** 2
     retina_mw_per_cm2 = cornea_mw / lit_cm2

@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 from device.config.head_file import ChainSpec, OpticsSpec
 from device.config.toml_file import Table, load_toml
 from device.optics.eye import Relay
+from device.optics.glass import Glass
+from device.optics.lens_data import LayoutSpec, LensSpec
 
 Place = tuple[float, float]
 
@@ -30,13 +32,19 @@ class EyeSpec(Table):
 
 
 class LightPath(Table):
-    """Components from the eye to the sensor, and the ring of LEDs."""
+    """Components from the eye to the sensor, and the ring of LEDs.
+
+    `layout`, `lens` and `glass` are the real lenses of the ray trace (`traced_relay.py`); a file may leave them out.
+    """
 
     name: str = Field(min_length=1)
     optics: OpticsSpec
     relay: RelaySpec
     ring: ChainSpec
     eye: EyeSpec
+    layout: LayoutSpec | None = None
+    lens: dict[str, LensSpec] = Field(default_factory=dict)
+    glass: dict[str, Glass] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _one_magnification(self) -> "LightPath":

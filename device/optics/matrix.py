@@ -1,11 +1,26 @@
-"""LED matrix geometry: positions of the LEDs and selection of those that form a ring."""
+"""Ring geometry: places of the LEDs of a matrix or a constant-current ring, and the LEDs that a head lights."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from math import hypot
 
 from device.config.head_file import ChainSpec, InstrumentSpec
 from device.errors import SpecError
+from device.optics.eye import iris_overlap
+from device.optics.illumination import LED, Led, led_at
+from device.values import Colour
 
 MIN_LEDS = 4  # fewer do not light a field from all sides
+EMITTER_MM = 0.25  # width of the green emitter in an APA102-2020; OPTICS.md 3.5 (an estimate)
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """LEDs of one colour of a ring: one LED at full drive, their number, and the width of what shines, mm."""
+
+    led: Led
+    count: int
+    emitter_mm: float = EMITTER_MM
 
 
 def led_positions_mm(chain: ChainSpec) -> list[tuple[float, float]]:
@@ -77,3 +92,37 @@ def chain_of(spec: InstrumentSpec) -> ChainSpec | None:
     if chain is None or light.pupil_mm is None or spec.optics is None:
         return chain
     return ring_for_pupil(chain, light.pupil_mm, spec.optics.angular_magnification)
+
+
+def geometry_of(spec: InstrumentSpec, colour: Colour | None = None) -> ChainSpec | None:
+    """Return the places of a head's LEDs as a matrix with its ring; None without LEDs of its own.
+
+    Of a constant-current ring those of `colour`, by default the picture's; SpecError if it has none of that colour.
+    """
+    sinks = spec.light.sinks
+    if sinks is None:
+        return chain_of(spec)
+    wanted = colour or spec.light.colour
+    if wanted not in sinks.colours:
+        raise SpecError(f"{spec.name} has no {wanted} LEDs")
+    leds = sinks.colours[wanted].places
+    return ChainSpec(device=sinks.device, rows=sinks.rows, cols=sinks.cols, pitch_mm=sinks.pitch_mm, leds=leds)
+
+
+def lamps_of(spec: InstrumentSpec) -> Mapping[Colour, Lamp] | None:
+    """Return the LEDs of a head by colour; None without LEDs of its own, such as a simulated or recorded head's."""
+    sinks = spec.light.sinks
+    if sinks is not None:
+        return {
+            colour: Lamp(led_at(one.wavelength_um, one.power_mw), len(one.places), one.emitter_mm)
+            for colour, one in sinks.colours.items()
+        }
+    chain = chain_of(spec)
+    return None if chain is None else {colour: Lamp(led, len(ring(chain))) for colour, led in LED.items()}
+
+
+def share_in_pupil(chain: ChainSpec, magnification: float, emitter_mm: float, pupil_mm: float) -> float:
+    """Return the share of the ring's light, 0 to 1, whose image at the eye falls into a centred pupil, diameter mm."""
+    radius = magnification * emitter_mm / 2
+    passed = [iris_overlap(magnification * at, pupil_mm / 2, min(radius, pupil_mm / 2)) for at in _radii_mm(chain)]
+    return sum(passed) / len(passed)

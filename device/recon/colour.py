@@ -8,16 +8,14 @@ drive has 45 times the hazard of green (OPTICS.md 4.4). NUMERICS.md 10.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import ndimage
 
 from device.recon.estimation.registration import Registrar, Registration, Shift
 from device.recon.model.resampling import block_mean, moved_back
-from device.values import Image
+from device.values import ChannelName, ChannelUse, Image
 
-ChannelName = Literal["red", "green", "blue", "amber"]
 CHANNELS: tuple[ChannelName, ...] = ("red", "green", "blue", "amber")
 RGB: tuple[ChannelName, ...] = ("red", "green", "blue")  # channels of the picture
 FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
@@ -31,18 +29,6 @@ LEAST_SD = 8.0  # of the correlation: all wrong registrations had 6.5 or less, a
 BLUE_FROM_RED_GREEN = (-0.133, 0.274, 0.862)
 BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green of these photographs, 0.42 to 0.72
 MOST_OF_MEAN = 3.0  # of red and green: the photographs hold nothing brighter
-
-
-@dataclass(frozen=True)
-class ChannelUse:
-    """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
-
-    What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one.
-    """
-
-    name: ChannelName
-    shift_px: Shift | None
-    predicted: bool = False
 
 
 @dataclass(frozen=True)

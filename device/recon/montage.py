@@ -24,7 +24,7 @@ from device.recon.estimation.masked_correlation import (
 from device.recon.model.field_of_view import lit_field
 from device.recon.model.grid import Grid
 from device.recon.model.resampling import block_mean
-from device.values import Image
+from device.values import Image, check_image_shape
 
 LEAST_PEAK, LEAST_OVER_SECOND, LEAST_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.24 to 0.51
 # A small overlap correlates higher by chance: more is asked of it. Pictures of one retina have 0.79 to 0.94.
@@ -32,7 +32,7 @@ SMALL_OVERLAP, PEAK_PER_OVERLAP = 0.4, 0.5
 FIELD_SAMPLES = 260  # across the field when registered: vessels stay resolved
 FEATHER_SHARE = 0.25  # of the field's radius over which a picture's weight rises from its edge
 RIM_PX = 3.0  # at the edge of a field, whose light falls off
-MOST_PICTURES = 64
+MOST_PICTURES, LEAST_PX = 64, 32
 
 Floats = NDArray[np.float64]
 
@@ -147,6 +147,13 @@ def _composed(index: int, match: Match, target: Placement, n: int) -> Placement:
 def _refuse_different(pictures: Sequence[Image]) -> None:
     if not 0 < len(pictures) <= MOST_PICTURES:
         raise FrameError(f"a montage has 1 to {MOST_PICTURES} pictures, not {len(pictures)}", "Give fewer pictures.")
+    for one in pictures:
+        check_image_shape(one.shape)
+        if min(one.shape[:2]) < LEAST_PX:
+            raise FrameError(
+                f"a picture of {one.shape[0]} x {one.shape[1]} pixels shows no vessels",
+                f"Give pictures of at least {LEAST_PX} x {LEAST_PX} pixels.",
+            )
     shapes = {one.shape for one in pictures}
     if len(shapes) > 1:
         listed = ", ".join(" x ".join(map(str, shape)) for shape in sorted(shapes))

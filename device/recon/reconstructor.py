@@ -26,7 +26,13 @@ from device.recon.assessment.image_quality import (
 )
 from device.recon.assessment.psf_consistency import Match, PsfConsistency
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.refraction import Refraction, RefractionEstimator, can_estimate_refraction
+from device.recon.estimation.refraction import (
+    NoRefraction,
+    Refraction,
+    RefractionEstimator,
+    can_estimate_refraction,
+)
+from device.recon.estimation.refraction_notation import report_of
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -36,6 +42,8 @@ from device.recon.model.resampling import to_sensor
 from device.recon.model.resolution import STOPBAND_SHARE, STOPBAND_SHARE_OPEN, working_bin
 from device.recon.solvers.solver import Diagnostics, Solver
 from device.values import Calibration, Image, Reconstruction, Report, check_image_shape
+
+CYLINDER_SEARCHES = 6  # most of the duration of a cylinder in searches for M on noise, which end after the coarse one
 
 
 @dataclass(frozen=True)
@@ -161,15 +169,16 @@ class Reconstructor:
     False saves this time where no deadline is used. `consistency` tests the PSF on each frame, outside the deadline
     (for files). `audience`: the reader of the warnings. With `refract`, and with known geometry and field, the
     refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF scaled
-    accordingly, or the stored PSF if there is no reliable estimate. `methods`: the table in which the recipes' methods
-    are looked up. SettingError if a bin is below 1, or for a method that the table does not have.
+    accordingly, or the stored PSF if there is no reliable estimate; `field_fixed` takes the field of the calibration as
+    exact. The cylinder is estimated after the picture, if it fits into the deadline. `methods`: the table in which the
+    recipes' methods are looked up. SettingError if a bin is below 1, or for a method that the table does not have.
     """
 
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, clock: Clock,
         recipes: tuple[Recipe, ...] = (), psf_index: int = 0, refract: bool = True,
         consistency: PsfConsistency | None = None, timed: bool = True, methods: Mapping[str, Method] = METHODS,
-        audience: Audience = Audience.OPERATOR,
+        audience: Audience = Audience.OPERATOR, field_fixed: bool = False,
     ) -> None:  # fmt: skip
         recipes = recipes or default_schedule(calibration, shape, psf_index)
         if min(recipe.bin for recipe in recipes) < 1:
@@ -182,9 +191,10 @@ class Reconstructor:
         self.defects = DefectFinder(calibration, shape, psf_index)
         self.refractor = None
         if refract and can_estimate_refraction(calibration):
-            self.refractor = RefractionEstimator(calibration, shape, planner, psf_index)
+            self.refractor = RefractionEstimator(calibration, shape, planner, psf_index, field_fixed)
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
         self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
+        self._cylinder_cost = DurationEstimate()
         self._consistency: PsfConsistency | None = None
         self._audience = audience
         self._warm_up(timed)
@@ -203,7 +213,7 @@ class Reconstructor:
                 DurationEstimate(),
                 DurationEstimate(),
             )
-        self._find_cost = DurationEstimate()
+        self._find_cost, self._cylinder_cost = DurationEstimate(), DurationEstimate()
         self(noise, rounds=2)
         for m_dpt in (1.0, None):
             self._refocus(m_dpt)
@@ -220,7 +230,7 @@ class Reconstructor:
 
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
-        rounds: int | None = None, quick: bool = False, joined: Image | None = None,
+        rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -229,14 +239,15 @@ class Reconstructor:
         only one. `rounds` limits the rounds of every stage. With several stages a ROUND_DONE follows each round of the
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
-        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. FrameError for another shape than
-        that of the sensor, or if too many pixels are missing (`Preprocessor`).
+        sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
+        use the PSF of the picture before. FrameError for another shape than that of the sensor, or if too many pixels
+        are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
-            if stage is self._refracted[0] and not quick:
+            if stage is self._refracted[0] and not quick and refract:
                 self._estimate_refraction(run)
             if not run.has_time_for(stage):
                 break
@@ -249,6 +260,9 @@ class Reconstructor:
         run.done.finish_cost.add(finished_s - solved_s)
         solve_s = solved_s - begin_s - run.refraction_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
+        if isinstance(run.refraction, Refraction):
+            self._estimate_cylinder(run, run.refraction)
+            seconds["cylinder"] = self.clock.now_s() - finished_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
     def _estimate_refraction(self, run: "_Run") -> None:
@@ -261,6 +275,15 @@ class Reconstructor:
             self._find_cost.add(self.clock.now_s() - begin_s)
         self._refocus(run.selected_dpt)
         run.refraction_s = self.clock.now_s() - begin_s
+
+    def _estimate_cylinder(self, run: "_Run", found: Refraction) -> None:
+        """Add the cylinder to the refraction of the run, if time is left after the picture."""
+        cost_s = max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
+        if self.refractor is None or not run.fits(cost_s):
+            return
+        begin_s = self.clock.now_s()
+        run.refraction = self.refractor.add_cylinder(found)
+        self._cylinder_cost.add(self.clock.now_s() - begin_s)
 
     def _refocus(self, m_dpt: float | None) -> None:
         """Set the OTF of the later stages to an eye with mean sphere `m_dpt`; None selects the stored PSF."""
@@ -297,17 +320,17 @@ class Reconstructor:
             match = Match.UNKNOWN if figures is None else figures.match
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience)
         explained = not dark and is_explained(quality, match, misfit)
-        if not (explained and is_lit(quality)):
-            eye = None
+        if eye is not None and not (explained and is_lit(quality)):
+            eye = NoRefraction("the forward model does not explain the frame")
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }
-        if eye is not None and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
+        if isinstance(eye, Refraction) and (abs(eye.sphere_dpt) > 8 or eye.sd_dpt > 0.5):
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=run.rounds_done, stopped=run.stopped, seconds=seconds,
             psf_index=self.psf_index, psf_scale=run.psf_scale,
-            refraction_dpt=None if eye is None else {"sphere": -eye.sphere_dpt, "sd": eye.sd_dpt},
+            refraction_dpt=None if eye is None else report_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin,
             residual=diagnostics.residual,
@@ -337,14 +360,14 @@ class _Run:
         self.done: _Stage = owner.stages[0]
         self.solved: _Solved | None = None  # None before the first stage
         self.rounds_done, self.stopped = 0, "done"
-        self.refraction: Refraction | None = None
+        self.refraction: Refraction | NoRefraction | None = None
         self.refraction_s, self.between_s, self.psf_scale = 0.0, 0.0, 1.0
 
     @property
     def selected_dpt(self) -> float | None:
         """Mean sphere M of the PSF for the later stages, in dpt; None for the stored PSF."""
         eye = self.refraction
-        return None if eye is None or eye.in_doubt else eye.sphere_dpt
+        return None if not isinstance(eye, Refraction) or eye.in_doubt else eye.sphere_dpt
 
     def fits(self, cost_s: float) -> bool:
         """Return True if a step of `cost_s` seconds fits into the time left, or if there is no deadline."""

@@ -1,36 +1,53 @@
 """Eyes in front of a simulated head: object, optical setup and light of each eye and colour, computed once."""
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 
 import numpy as np
 
 from device.config.head_file import InstrumentSpec
-from device.sim.fundus import Fundus
+from device.sim.fundus import FIELD_CENTRE_DEG, Fundus
 from device.sim.objects import draw_object, moved_behind_field
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, build_setup
 from device.sim.render import electrons_per_s
+from device.sim.vessels import DISC
 from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
 FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
+Pair = tuple[float, float]
+STRAIGHT: Pair = (0.0, 0.0)
+# Turn of a right eye to the fixation target of a field of view, as the shift of its picture in degrees right and down.
+FIXATION_DEG: dict[str, Pair] = {"nerve": (FIELD_CENTRE_DEG[0] - DISC[0], FIELD_CENTRE_DEG[1] - DISC[1])}
 
 
 class RenderedEyes:
     """Retinas, setups and images of both eyes of a scene; `choose` selects the effects for each colour of light.
 
-    `scene` is the scene in the picture's colour, with the eye that is present first.
+    `scene` is the scene in the picture's colour, with the eye that is present first. `turn_deg` is their turn from
+    the scene's own gaze, degrees right and down in the picture. What was computed for one turn is kept for the others.
     """
 
     def __init__(self, spec: InstrumentSpec, eye: Eye, choose: EffectSelector) -> None:
         self.scene = Scene(spec, spec.light.colour, eye)
-        self._choose = choose
-        self._setups: dict[tuple[Eye, Colour], OpticalSetup] = {}
-        self._rates: dict[tuple[Eye, Colour, int], Image] = {}
-        self._retinas: dict[Eye, Fundus] = {}
+        self._choose, self.turn_deg = choose, STRAIGHT
+        self._setups: dict[tuple[Eye, Colour, Pair], OpticalSetup] = {}
+        self._rates: dict[tuple[Eye, Colour, int, Pair], Image] = {}
+        self._retinas: dict[tuple[Eye, Pair], Fundus] = {}
+
+    def turned_to(self, eye: Eye, field: str | None) -> "RenderedEyes":
+        """Return these eyes with an eye turned to the fixation target of a field of view.
+
+        None, an unknown field, a photograph and a drawing: no turn.
+        """
+        turn_deg = FIXATION_DEG.get(field or "", STRAIGHT) if self.scene.sim.object.kind == "retina" else STRAIGHT
+        turned = copy(self)
+        turned.turn_deg = turn_deg if eye == "OD" else (-turn_deg[0], turn_deg[1])
+        return turned
 
     @cached_property
     def plan(self) -> tuple[Decision, ...]:
@@ -38,22 +55,23 @@ class RenderedEyes:
         return self._choose(self.scene)
 
     def retina(self, eye: Eye) -> Fundus:
-        """Return the object of the scene for an eye (retina, photograph or drawing), drawn once per eye.
+        """Return the object of the scene for an eye (retina, photograph or drawing), drawn once per eye and turn.
 
         It covers the whole field and may be larger than the sensor. Its rows and columns have the parity of the
         sensor's, so that the centres coincide.
         """
-        if eye not in self._retinas:
+        key = eye, self.turn_deg
+        if key not in self._retinas:
             scene, camera = self.scene, self.scene.spec.camera
             px_per_deg = scene.geometry.px_per_deg
             wide = int(np.ceil(px_per_deg * scene.optics.field_deg)) + 4
             shape = (wide + (wide - camera.rows) % 2, wide + (wide - camera.cols) % 2)
-            self._retinas[eye] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg)
-        return self._retinas[eye]
+            self._retinas[key] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg, self.turn_deg)
+        return self._retinas[key]
 
     def setup(self, eye: Eye, colour: Colour) -> OpticalSetup:
-        """Return the optical setup of an eye in one colour with its selected effects, built once per eye and colour."""
-        key = eye, colour
+        """Return the optical setup of an eye in one colour with its selected effects, built once for each turn."""
+        key = eye, colour, self.turn_deg
         if key not in self._setups:
             scene = Scene(self.scene.spec, colour, eye)
             self._setups[key] = build_setup(scene, self.retina(eye), self._chosen(scene))
@@ -73,9 +91,9 @@ class RenderedEyes:
     def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
-        `step`, 0 to STEPS, is the number of frames for which the eye has drifted. Computed once per eye, colour, step.
+        `step`, 0 to STEPS, is the number of frames for which the eye has drifted. Computed once for each combination.
         """
-        key = eye, colour, step
+        key = eye, colour, step, self.turn_deg
         if key not in self._rates:
             setup = self.setup(eye, colour)
             if step > 0:

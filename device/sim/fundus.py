@@ -45,21 +45,34 @@ class Fundus:
     disc: tuple[float, float] | None = None
     fovea: tuple[float, float] | None = None
 
+    def plane(self, colour: Colour) -> Image:
+        """Return the reflectance in one colour; in amber the geometric mean of red and green where it was not drawn."""
+        if colour == "amber" and colour not in self.reflectance:
+            mixed: Image = np.sqrt(self.reflectance["red"] * self.reflectance["green"])
+            return mixed
+        return self.reflectance[colour]
+
 
 @dataclass(frozen=True)
 class Canvas:
-    """Pixel grid of a drawing: `x` (1, cols) and `y` (rows, 1) are degrees right and down from the fovea."""
+    """Pixel grid of a drawing: `x` (1, cols) and `y` (rows, 1) are degrees right and down from the fovea.
+
+    `margin_px` pixels on each side are beyond the field; the drawing inside does not depend on them.
+    """
 
     shape: tuple[int, int]
     px_per_deg: float
     x: Image = field(repr=False)
     y: Image = field(repr=False)
+    margin_px: int = 0
 
     @classmethod
-    def of(cls, shape: tuple[int, int], px_per_deg: float) -> "Canvas":
-        """Return a canvas of `shape` (rows, cols) centred on FIELD_CENTRE_DEG."""
+    def of(cls, inner: tuple[int, int], px_per_deg: float, margin_px: int = 0) -> "Canvas":
+        """Return a canvas of `inner` (rows, cols) and a margin, centred on FIELD_CENTRE_DEG."""
+        shape = (inner[0] + 2 * margin_px, inner[1] + 2 * margin_px)
         down, right = (((np.arange(n) - (n - 1) / 2) / px_per_deg).astype(np.float32) for n in shape)
-        return cls(shape, px_per_deg, (right + FIELD_CENTRE_DEG[0])[None, :], (down + FIELD_CENTRE_DEG[1])[:, None])
+        x, y = (right + FIELD_CENTRE_DEG[0])[None, :], (down + FIELD_CENTRE_DEG[1])[:, None]
+        return cls(shape, px_per_deg, x, y, margin_px)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Return the (row, col) of a place (x, y) in degrees from the fovea."""
@@ -72,9 +85,13 @@ class Canvas:
         return away
 
     def noise(self, rng: np.random.Generator, scale_deg: float) -> Image:
-        """Return noise of zero mean and unit variance, smoothed by a Gaussian of sigma `scale_deg`."""
-        raw = rng.standard_normal(self.shape, dtype=np.float32)
-        return smooth(raw, scale_deg * self.px_per_deg)
+        """Return noise of zero mean and unit variance, smoothed by a Gaussian of sigma `scale_deg`.
+
+        In the margin it is mirrored.
+        """
+        inner = (self.shape[0] - 2 * self.margin_px, self.shape[1] - 2 * self.margin_px)
+        raw = rng.standard_normal(inner, dtype=np.float32)
+        return np.pad(smooth(raw, scale_deg * self.px_per_deg), self.margin_px, mode="symmetric")
 
 
 def smooth(raw: Image, sigma_px: float) -> Image:
@@ -103,18 +120,20 @@ def fundus(
     haemorrhages: int = 0,
     microaneurysms: int = 0,
     exudates: int = 0,
+    beyond_deg: float = 0.0,
 ) -> Fundus:
     """Return one retina drawn in the middle of `shape` (rows, cols), reproducible by its arguments.
 
     The field is a disc of radius px_per_deg * field_deg / 2 (small angle, as in values.Geometry), cropped to `shape`.
-    Reflectances are fractions of the light, about 0.01 in green.
+    For an eye that turns, the retina is continued `beyond_deg` beyond this disc, which stays the same but for the ends
+    of vessels at its edge; lesions are inside it. Reflectances are fractions of the light, about 0.01 in green.
     """
-    radius_px = px_per_deg * field_deg / 2
-    wide = int(np.ceil(2 * radius_px)) + 2
-    size = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # centres of canvas and shape coincide
-    canvas = Canvas.of(size, px_per_deg)
+    wide = int(np.ceil(px_per_deg * field_deg)) + 2
+    inner = (wide + (wide - shape[0]) % 2, wide + (wide - shape[1]) % 2)  # centres of canvas and shape coincide
+    canvas = Canvas.of(inner, px_per_deg, int(np.ceil(px_per_deg * beyond_deg)))
+    size, radius_px = canvas.shape, px_per_deg * (field_deg / 2 + beyond_deg)
     rng = np.random.default_rng((seed, 2))
-    vessels = grow(seed, field_deg / 2 + 1, FIELD_CENTRE_DEG)
+    vessels = grow(seed, field_deg / 2 + 1, FIELD_CENTRE_DEG, beyond_deg)
     lesion_rng = np.random.default_rng((seed, 3))  # separate stream: lesions leave the rest of the picture unchanged
     lesions = scatter(
         canvas.x, canvas.y, lesion_rng, field_deg / 2, FIELD_CENTRE_DEG, haemorrhages, microaneurysms, exudates

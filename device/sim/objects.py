@@ -31,16 +31,19 @@ TICK_UM, FIFTH_TICK_UM = 1500.0, 3000.0  # heights of a ruler's ticks and of eve
 TOLERANCE_DEG = 0.05  # tolerance for an object that ends on the field's edge
 
 
-def draw_object(scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float) -> Fundus:
+def draw_object(
+    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, turn_deg: Pair = (0.0, 0.0)
+) -> Fundus:
     """Return the object of a scene in the middle of `shape` (rows, cols): reflectances in 0..1, zero outside the field.
 
-    The object is shifted by `at_deg` of the scene plus the eye's gaze. SpecError for a drawing that does not fit into
-    the field, or a photograph that cannot be read.
+    The object is shifted by `at_deg` of the scene plus the eye's gaze and `turn_deg`. SpecError for a drawing that does
+    not fit into the field, or a photograph that cannot be read.
     """
     what, gaze = scene.object, scene.eye.gaze_deg
-    at_deg = (what.at_deg[0] + gaze[0], what.at_deg[1] + gaze[1])
+    at_deg = (what.at_deg[0] + gaze[0] + turn_deg[0], what.at_deg[1] + gaze[1] + turn_deg[1])
     if what.kind in ("retina", "image"):
-        return _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
+        found = _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
+        return found if what.cut_deg is None else _cut(found, what.cut_deg, px_per_deg)
     _refuse_drawing_beyond_field(what, scene.eye.focal_length_um, optics.field_deg, at_deg)
     outside = {"dots": _dots, "ruler": _ruler, "point": _disc}[what.kind](what)
     plane = _coverage(outside, scene.eye.focal_length_um, shape, px_per_deg, at_deg)
@@ -67,10 +70,10 @@ def _shifted_picture(
     what = scene.object
     if at_deg == (0.0, 0.0) and what.size_deg is None:
         return _picture(scene, eye, shape, px_per_deg, optics.field_deg)
-    wide_deg = what.size_deg or optics.field_deg + (2 * hypot(*at_deg) if what.kind == "retina" else 0.0)
-    wide = ceil(px_per_deg * max(wide_deg, optics.field_deg)) + 4
+    wide_deg, beyond_deg = what.size_deg or optics.field_deg, hypot(*at_deg) if what.kind == "retina" else 0.0
+    wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * beyond_deg)) + 4
     rows, cols = (max(wide + (wide - n) % 2, n) for n in shape)
-    found = _picture(scene, eye, (rows, cols), px_per_deg, wide_deg)
+    found = _picture(scene, eye, (rows, cols), px_per_deg, wide_deg, beyond_deg)
     return _crop_to_field(
         found, shape, px_per_deg * optics.field_deg / 2, (at_deg[1] * px_per_deg, at_deg[0] * px_per_deg)
     )
@@ -98,14 +101,20 @@ def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float) -> Fundus
     return Fundus(planes, found.field, vessels, place(found.disc), place(found.fovea))
 
 
-def _picture(scene: SimSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, wide_deg: float) -> Fundus:
-    """Return a photograph if the scene names one, else a retina drawn from its seed; both are `wide_deg` wide."""
+def _picture(
+    scene: SimSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, wide_deg: float, beyond_deg: float = 0.0
+) -> Fundus:
+    """Return a photograph if the scene names one, else a retina drawn from its seed; both are `wide_deg` wide.
+
+    The retina continues `beyond_deg` on each side.
+    """
     what = scene.object
     if what.image is not None:
-        return photograph(what.image, shape, px_per_deg, wide_deg)
+        return photograph(what.image, shape, px_per_deg, wide_deg, None if what.cut_deg is None else what.cut_deg[0])
     return fundus(
         shape, px_per_deg, wide_deg, scene.seed % 2**32, eye=eye, haemorrhages=what.haemorrhages,
         microaneurysms=what.microaneurysms, exudates=what.exudates,
+        beyond_deg=beyond_deg,
     )  # fmt: skip
 
 
@@ -126,6 +135,18 @@ def _crop_to_field(found: Fundus, shape: tuple[int, int], radius_px: float, move
     planes = {colour: (shifted(plane) * edge).astype(np.float32) for colour, plane in found.reflectance.items()}
     vessels = None if found.vessels is None else (shifted(found.vessels.astype(np.float32)) > 0.5) & field
     return Fundus(planes, field, vessels, place(found.disc), place(found.fovea))
+
+
+def _cut(found: Fundus, cut_deg: Pair, px_per_deg: float) -> Fundus:
+    """Return an object cut to a centred rectangle (right, down) with an edge of one pixel."""
+    sides = [
+        np.clip(px_per_deg * side / 2 + 0.5 - np.abs(np.arange(n) - (n - 1) / 2), 0, 1).astype(np.float32)
+        for n, side in zip(found.field.shape, reversed(cut_deg), strict=True)
+    ]
+    window = sides[0][:, None] * sides[1][None, :]
+    kept = found.field & (window > 0.5)
+    planes = {colour: plane * window for colour, plane in found.reflectance.items()}
+    return Fundus(planes, kept, None if found.vessels is None else found.vessels & kept, found.disc, found.fovea)
 
 
 def _soft_field(shape: tuple[int, int], radius_px: float) -> Image:

@@ -18,14 +18,14 @@ from device.config.head_file import InstrumentSpec, OpticsSpec
 from device.config.scene import SimSpec
 from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
-from device.optics.illumination import LED
+from device.optics.illumination import PEAK_UM
 from device.sim.fundus import Fundus
 from device.sim.sensor import SensorModel
 from device.values import Colour, Eye, Geometry, Image
 
 # Peak electrons at full drive, relative to green: the ring's currents are trimmed so that a red aiming picture of half
 # the exposure is bright and a red picture of the full exposure does not saturate (23 ke- well, 15 ke- green).
-TRIM: dict[Colour, float] = {"red": 1.5, "green": 1.0, "blue": 0.9}
+TRIM: dict[Colour, float] = {"red": 1.5, "green": 1.0, "blue": 0.9, "amber": 1.2}
 TABLE_E, TABLE_PITCH_UM = 20000.0, 5.04  # reference light of the tabulated etas: peak electrons and pixel pitch
 LIT_SHARE = 0.37  # of the peak: the mean of the lit pixels of a retina behind this diffuser
 SENSOR_SHARE = 0.15  # of the peak: the mean of the paper's whole sensor
@@ -57,7 +57,7 @@ class Scene:
         assert self.spec.optics is not None
         if self.colour == self.spec.light.colour:
             return self.spec.optics
-        return self.spec.optics.model_copy(update={"wavelength_um": LED[self.colour].wavelength_um})
+        return self.spec.optics.model_copy(update={"wavelength_um": PEAK_UM[self.colour]})
 
     @property
     def geometry(self) -> Geometry:

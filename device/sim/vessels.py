@@ -18,6 +18,7 @@ DISC = (15.2, -1.5)  # nasal of the fovea, and a little above it
 STEP = 0.12  # between points of a path
 MIN_WIDTH_DEG = 0.05  # thinner vessels are not drawn
 AVASCULAR = 1.15  # radius of the zone around the fovea
+TAPER_DEG = 1.2  # at the end of a vessel
 CELL = 0.3  # grid cell reserved by one vessel of a kind
 MAX_TOTAL_TURN_RAD = 1.7  # largest total turn of a vessel, radians; arches are exempt
 CURVATURE_LENGTH_DEG = 1.3  # correlation length of the random curvature
@@ -113,20 +114,39 @@ class GrowthState:
         )
 
 
-def grow(seed: int, reach_deg: float, centre: tuple[float, float]) -> list[Vessel]:
-    """Return the vessels of one eye within `reach_deg` of `centre` (x, y), widest first, reproducible by the seed."""
+def grow(seed: int, reach_deg: float, centre: tuple[float, float], beyond_deg: float = 0.0) -> list[Vessel]:
+    """Return the vessels of one eye within `reach_deg` of `centre` (x, y), widest first, reproducible by the seed.
+
+    With `beyond_deg` the vessels that leave this circle are continued so far beyond it; those inside stay the same.
+    """
     garden = GrowthState(np.random.default_rng((seed, 1)), reach_deg, centre)
-    waiting = [_sprout(garden, trunk) for trunk in TRUNKS]
-    vessels = []
+    vessels, left = _grown(garden, [(_sprout(garden, trunk), []) for trunk in TRUNKS])
+    if beyond_deg > 0:
+        garden.reach_deg, garden.rng = reach_deg + beyond_deg, np.random.default_rng((seed, 4))
+        vessels += _grown(garden, left)[0]
+    return vessels
+
+
+Path = list[tuple[float, float, float]]
+
+
+def _grown(garden: GrowthState, waiting: list[tuple[Tip, Path]]) -> tuple[list[Vessel], list[tuple[Tip, Path]]]:
+    """Return the vessels that grow from tips and the ends of their paths, and the same of those that left the circle.
+
+    The end of the path, full width over the length of a taper, is drawn again by the continuation.
+    """
+    vessels, left = [], []
     while waiting:
-        waiting.sort(key=lambda tip: -tip.width_deg)
-        tip = waiting.pop(0)
-        points = [(tip.x, tip.y, tip.width_deg)]
+        waiting.sort(key=lambda one: -one[0].width_deg)
+        tip, before = waiting.pop(0)
+        points = [*before, (tip.x, tip.y, tip.width_deg)]
         for branch in _lengthen(garden, tip, points):
-            waiting.append(branch)
+            waiting.append((branch, []))
         if len(points) > 8:
             vessels.append(Vessel(tip.kind, _tapered(points, tip)))
-    return vessels
+        if math.hypot(tip.x - garden.centre[0], tip.y - garden.centre[1]) > garden.reach_deg:
+            left.append((tip, points[-round(TAPER_DEG / STEP) : -1]))
+    return vessels, left
 
 
 def _sprout(garden: GrowthState, trunk: Trunk) -> Tip:

@@ -28,8 +28,9 @@ FELLOW_EYE: dict[Eye, Eye] = {"OD": "OS", "OS": "OD"}
 class World:
     """Shared state of a simulated head: retina, eye, diffuser, lamp, calibration target and faults.
 
-    `eye` is the present one of `eyes`; a test may assign the eyes of another scene. A procedural left retina is the
-    mirror image of a right one; a photograph is not mirrored. `choose` selects the effects for each colour of light.
+    `eye` is the present one of `eyes`, turned to its fixation target; a test may assign the eyes of another scene. A
+    procedural left retina is the mirror image of a right one; a photograph is not mirrored. `choose` selects the
+    effects for each colour of light.
     `ambient_e_per_s` is ambient light in addition to the scene's. `target` is the light of a calibration target
     (`calibration_targets.py`), electrons per second (rows, cols): it replaces the eye, does not depend on the lamp, and
     shifts by `shake_px` columns in every second frame. `faults` holds the active faults: "camera.missing",
@@ -69,13 +70,14 @@ class World:
             )
         return part in self.faults
 
-    def present_eye(self, eye: Eye) -> None:
+    def present_eye(self, eye: Eye, field: str | None = None) -> None:
         """Present an eye to the head, with the fault "eye.other" the fellow eye; a calibration target stays in place.
 
-        The light of this eye is computed now for the picture's and the aiming colour, not later while the lamp is lit:
-        with drift for each step of a burst.
+        The eye turns to the fixation target of a field of view; None: it looks straight on. Its light is computed now
+        for the picture's and the aiming colour, not later while the lamp is lit: with drift for each step of a burst.
         """
         self.eye = FELLOW_EYE[eye] if self.has_fault("eye.other") else eye
+        self.eyes = self.eyes.turned_to(self.eye, field)
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
         for step in range(1, STEPS + 1) if self.eyes.drift_px else ():
@@ -118,7 +120,7 @@ class World:
 
     def truth(self, colour: Colour) -> Image:
         """Return the ground truth on the sensor grid: reflectance, float32 (rows, cols), zero outside the field."""
-        return crop_or_pad(self.retina.reflectance[colour], self.shape)
+        return crop_or_pad(self.retina.plane(colour), self.shape)
 
     def psf(self, colour: Colour) -> Image:
         """Return the noise-free PSF of a colour on the axis, with the eye's refraction, (n, n) at sensor pitch."""

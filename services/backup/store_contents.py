@@ -14,13 +14,15 @@ from contextlib import closing
 from pathlib import Path
 
 from services.errors import BackupDamaged, StoreDamaged
-from services.records import blobs, reserve_file, schema, snapshots
+from services.records import blobs, device_identity, reserve_file, schema, snapshots
 from services.records.record_files import CAPTURE_RECORD
 
 # Logs of the database (their rows are in its copy), older copies of it, the present reserve, and measurements of the
-# computer, which another one has to make again.
+# computer, which another one has to make again; the identity of the device, since a restored device is another one.
 _DATABASE_LOGS = (f"{schema.DATABASE}-{suffix}" for suffix in snapshots.LOG_SUFFIXES)
-NOT_BACKED_UP = frozenset({*_DATABASE_LOGS, "snapshots", "replaced", "plans", "explorer", reserve_file.NAME})
+NOT_BACKED_UP = frozenset(
+    {*_DATABASE_LOGS, "snapshots", "replaced", "plans", "explorer", reserve_file.NAME, device_identity.FILE}
+)
 
 
 def units(store: Path) -> list[str]:

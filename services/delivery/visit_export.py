@@ -13,8 +13,10 @@ from datetime import datetime
 from services.delivery.visit_json import visit_as_json
 from services.imaging.picture_files import with_note
 from services.records.answers import IDENTIFIERS
-from services.records.capture_report import report_as_json
+from services.records.capture import COLOUR, RecordOrigin
+from services.records.capture_report import origin_as_json, report_as_json
 from services.records.capture_store import CaptureStore
+from services.records.device_identity import read_device
 from services.records.json_values import JsonObject
 from services.records.visit import Visit
 
@@ -24,8 +26,10 @@ EARLIEST_ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # earliest date of a ZIP entry
 def export_files(store: CaptureStore, visit: Visit, undo_until: datetime | None) -> dict[str, bytes]:
     """Return the exported files of a visit by name, with the time until which its finish can be undone, or None.
 
-    `<slot>-<number>.png` and `.json`: picture and report of each capture, the oldest of a slot first; `visit.json`: the
-    visit without identifying fields; `SHA256SUMS`. StoreDamaged if any picture or report is damaged.
+    `<slot>-<number>.png` (in green light) and `.json`: picture and report of each capture, the oldest of a slot first;
+    `<slot>-<number>-colour.png`: its picture in colour, if there is one; `visit.json`: the visit without identifying
+    fields, with the origin of its newest picture in `device`; `SHA256SUMS`. StoreDamaged if any picture or report is
+    damaged.
     """
     until = undo_until.isoformat() if undo_until else None
     return _files(store, visit, visit_as_json(visit) | {"undo_until": until})
@@ -38,22 +42,40 @@ def uploaded_files(store: CaptureStore, visit: Visit) -> dict[str, bytes]:
 
 def _files(store: CaptureStore, visit: Visit, shown: JsonObject) -> dict[str, bytes]:
     files: dict[str, bytes] = {}
+    device = _origin(store, visit)
     for slot, state in visit.slots.items():
         for number, taken in enumerate(state.captures, 1):
-            files[f"{slot}-{number}.png"] = _picture(store, taken.capture)
+            files[f"{slot}-{number}.png"] = _picture(store, taken.capture, "picture.png")
+            if COLOUR in store.get(taken.capture).files:
+                files[f"{slot}-{number}-colour.png"] = _picture(store, taken.capture, COLOUR)
             files[f"{slot}-{number}.json"] = _report(store, taken.capture)
     plain = dict(shown) | {"fields": {key: value for key, value in visit.fields.items() if key not in IDENTIFIERS}}
+    if device is not None:
+        plain["device"] = origin_as_json(device)
     files["visit.json"] = json.dumps(plain, indent=1, ensure_ascii=False).encode()
     sums = [f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items()]
     return files | {"SHA256SUMS": "".join(sums).encode()}
 
 
-def _picture(store: CaptureStore, id: str) -> bytes:
-    """Return the stored picture (PNG) of a capture.
+def _origin(store: CaptureStore, visit: Visit) -> RecordOrigin | None:
+    """Return the origin of the newest capture of a visit; without one, that of this device, None if it has no identity.
+
+    It depends on what is stored only, so that a repeated upload is equal.
+    """
+    ids = sorted((taken.capture for state in visit.slots.values() for taken in state.captures), reverse=True)
+    for origin in (store.get(id).report.device for id in ids):
+        if origin is not None:
+            return origin
+    device = read_device(store.folder)
+    return None if device is None else RecordOrigin(device.uuid, device.serial)
+
+
+def _picture(store: CaptureStore, id: str, name: str) -> bytes:
+    """Return a stored picture (PNG) of a capture.
 
     For a capture that was moved to the other eye, return the same pixels with the corrected eye in the note.
     """
-    capture, stored = store.get(id), store.read(id, "picture.png")
+    capture, stored = store.get(id), store.read(id, name)
     if not capture.report.moved:
         return stored
     return with_note(stored, f"{capture.eye} {capture.taken_at:%Y-%m-%d}")

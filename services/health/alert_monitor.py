@@ -15,7 +15,7 @@ from device.clock import Clock
 from device.errors import DiffuscopeError, StoreError, StoreReadOnly
 from services.health import alerts
 from services.health.alerts import Alert, AlertCode, CoolingTimer
-from services.health.collector import CLOCK_SYNCHRONISED_FILE
+from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
 from services.periodic_worker import PeriodicWorker
 from services.records.capture_store import CaptureStore
@@ -117,7 +117,7 @@ class AlertMonitor:
     def _of_date(self) -> Iterator[Alert]:
         now, now_s = self._clock.wall(), self._clock.now_s()
         drift_s = (now - self._began[0]).total_seconds() - (now_s - self._began[1])
-        return alerts.date_alerts(now, self._newest(), drift_s, CLOCK_SYNCHRONISED_FILE.exists())
+        return alerts.date_alerts(now, self._newest(), drift_s, clock_state() in ("network", "browser"))
 
     def _newest(self) -> datetime | None:
         """Return the time of the newest capture; None without one, or if the store cannot be read."""

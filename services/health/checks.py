@@ -19,6 +19,7 @@ from services.health.thresholds import (
     MAX_UNSAVED_DAYS,
     MIN_VISITS_LEFT,
 )
+from services.records.capture import ClockState
 from services.records.recovery_report import RecoveryReport
 
 
@@ -50,7 +51,10 @@ class StatusSnapshot:
     without a row; `damaged`: number of captures and visits whose row cannot be read; `unsent`: numbers of visits in the
     upload queue and of those that need help from a user (None: upload is not set up); `recovery`: what the last start
     restored; `backup_at`: time at which the last backup began; `unsaved_since`: time of the first capture after that;
-    `unchecked_limits`: names of the light limits that were not compared with the purchased standard.
+    `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
+    `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
+    settings of the card that were not taken at the last start; `throttled_bits`: state of supply and clock as the
+    firmware of a Raspberry Pi reports it.
     """
 
     state: str
@@ -66,7 +70,7 @@ class StatusSnapshot:
     warmest_c: float
     computer_c: float | None
     now: datetime
-    clock_was_set: bool
+    clock: ClockState
     newest: datetime | None
     presses: Sequence[tuple[float, float]]
     torn_bytes: Sequence[int] = ()
@@ -77,6 +81,9 @@ class StatusSnapshot:
     backup_at: datetime | None = None
     unsaved_since: datetime | None = None
     unchecked_limits: tuple[str, ...] = ()
+    takes_blue_light: bool = False
+    settings_problem: tuple[str, str] | None = None
+    throttled_bits: int | None = None
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -193,13 +200,19 @@ def heat(facts: StatusSnapshot) -> Check:
 def clock(facts: StatusSnapshot) -> Check:
     """Check that the date is not before EARLIEST_DATE or the newest capture: pictures carry this date.
 
-    Ok but not known if the network has not set the clock.
+    Ok but not known if nothing has set the clock since the start of the computer.
     """
     earliest = thresholds.earliest_date(facts.newest)
-    how = "set by the network" if facts.clock_was_set else "never compared with another clock"
+    how = CLOCK_WORDS[facts.clock]
     value, limit = f"{facts.now:%Y-%m-%d %H:%M} UTC, {how}", f"not before {earliest:%Y-%m-%d %H:%M}"
     ok, remedy = not thresholds.is_date_wrong(facts.now, facts.newest), "Set date and time before the next picture."
-    return Check("clock", ok, value, limit, remedy, known=facts.clock_was_set or not ok)
+    return Check("clock", ok, value, limit, remedy, known=facts.clock != "not_set" or not ok)
+
+
+CLOCK_WORDS: dict[ClockState, str] = {
+    "network": "set by the network", "rtc": "kept by the clock of the board", "browser": "set by a tablet",
+    "not_set": "time not set",
+}  # fmt: skip
 
 
 def speed(facts: StatusSnapshot) -> Check:
@@ -244,17 +257,52 @@ def backup(facts: StatusSnapshot) -> Check:
 BACKUP_REMEDY = "Put in a USB stick and open Backup on the technician's page: what is only on this device can be lost."
 
 
+BLUE_LIGHT = (
+    "; the programme takes blue light, which has 45 times the hazard of green at the same drive"  # OPTICS.md 4.4
+)
+
+
 def light_limits(facts: StatusSnapshot) -> Check:
     """Check that the light limits were compared with the purchased standard; ok but not known if not.
 
     At most half of a limit that was not compared is used (`MOST_UNCHECKED_SHARE` in device/light_safety/hazard.py).
     """
     limit = "each compared with the standard"
+    blue = BLUE_LIGHT if facts.takes_blue_light else ""
     if not facts.unchecked_limits:
-        return Check("light_limits", True, "compared with the standard", limit, "")
+        return Check("light_limits", True, "compared with the standard" + blue, limit, "")
     many = _count(len(facts.unchecked_limits), "number", "numbers")
     value = f"{many} not compared with the purchased standard, so at most half of a limit is used"
-    return Check("light_limits", True, value, limit, "", known=False)
+    return Check("light_limits", True, value + blue, limit, "", known=False)
+
+
+def settings(facts: StatusSnapshot) -> Check:
+    """Check that the last start took the file `diffuscope.toml` of the card, if it has one."""
+    message, remedy = facts.settings_problem or ("taken", "")
+    return Check("settings", facts.settings_problem is None, message, "taken at the last start", remedy)
+
+
+def power(facts: StatusSnapshot) -> Check:
+    """Check that the supply of the board was never too low since its start, and that its clock is not reduced now.
+
+    Ok but not known on another computer. Bits: `vcgencmd get_throttled` of Raspberry Pi's documentation.
+    """
+    limit = "5 V since the start, full clock"
+    if facts.throttled_bits is None:
+        return Check("power", True, "not measured", limit, "", known=False)
+    found = [(words, remedy) for bit, words, remedy in THROTTLED if facts.throttled_bits >> bit & 1]
+    value = ", ".join(words for words, _ in found) or "steady"
+    return Check("power", not found, value, limit, " ".join(dict.fromkeys(remedy for _, remedy in found)))
+
+
+SUPPLY_REMEDY = "Use the supply of the parts list (5 V, 5 A) with its own cable, and charge the battery."
+COOLING_REMEDY = "Let the device cool, and check that its fan turns."
+THROTTLED = (
+    (0, "supply too low now", SUPPLY_REMEDY),
+    (16, "supply too low since the start", SUPPLY_REMEDY),
+    (2, "clock reduced", COOLING_REMEDY),
+    (3, "close to the highest temperature", COOLING_REMEDY),
+)
 
 
 def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of_release: bool = False) -> Check:
@@ -265,7 +313,7 @@ def _result(error: DiffuscopeError | None, name: str, value: str, limit: str, of
 
 CHECKS: tuple[Callable[[StatusSnapshot], Check], ...] = (
     camera, lamp, calibration, captures, database, space, battery, heat, clock, speed, sending, backup,
-    light_limits,
+    light_limits, settings, power,
 )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Status collector: the inputs of the health checks from instrument, capture store, upload queue and computer."""
 
+import json
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -10,13 +11,15 @@ from device.light_safety.hazard import light_limits
 from services.backup.backup_key import read_key
 from services.errors import BackupDamaged, RecordRemoved
 from services.health.checks import StatusSnapshot
+from services.health.clock_source import clock_state
 from services.health.instrument_status import InstrumentStatus
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
 from services.records.visit_repository import VisitRepository
 
 COMPUTER_TEMPERATURE_FILE = Path("/sys/class/thermal/thermal_zone0/temp")
-CLOCK_SYNCHRONISED_FILE = Path("/run/systemd/timesync/synchronized")
+SETTINGS_PROBLEM_FILE = Path("/run/diffuscope-settings/problem.json")  # of services/identity, at the last start
+PLATFORM_DEVICES = Path("/sys/devices/platform")
 MAX_PRESSES = 100
 
 
@@ -45,7 +48,7 @@ def collect_status(
         warmest_c=instrument.warmest_c,
         computer_c=int(COMPUTER_TEMPERATURE_FILE.read_text()) / 1000 if COMPUTER_TEMPERATURE_FILE.exists() else None,
         now=clock.wall(),
-        clock_was_set=CLOCK_SYNCHRONISED_FILE.exists(),
+        clock=clock_state(),
         newest=newest[0].taken_at if newest else None,
         presses=[(spent_s, spent_s - one.report.budget_s) for one in newest if (spent_s := one.report.total_s) > 0],
         unsent=unsent,
@@ -56,7 +59,26 @@ def collect_status(
         backup_at=backup_at,
         unsaved_since=unsaved_since,
         unchecked_limits=light_limits().unchecked,
+        takes_blue_light="blue" in people.protocol.colours,
+        settings_problem=read_settings_problem(SETTINGS_PROBLEM_FILE),
+        throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
     )
+
+
+def read_throttled_bits(devices: Path) -> int | None:
+    """Return the state of supply and clock from the firmware's file in sysfs; None on another computer."""
+    for file in devices.glob("soc*/soc*firmware/get_throttled"):
+        with suppress(OSError, ValueError):
+            return int(file.read_text(encoding="ascii"), 16)
+    return None
+
+
+def read_settings_problem(file: Path) -> tuple[str, str] | None:
+    """Return message and remedy of the settings that the last start did not take; None without a problem."""
+    if not file.exists():
+        return None
+    content = json.loads(file.read_text(encoding="utf-8"))
+    return str(content["message"]), str(content["remedy"])
 
 
 def _backup_status(store: CaptureStore) -> tuple[datetime | None, datetime | None]:

@@ -22,6 +22,7 @@ from services.http.routes.calibration import calibration_router
 from services.http.routes.captures import captures_router, press_router
 from services.http.routes.events import event_router
 from services.http.routes.exports import exports_router
+from services.http.routes.montages import montage_router
 from services.http.routes.preview import preview_router
 from services.http.routes.removal import removal_routes
 from services.http.routes.status import status_router
@@ -37,6 +38,7 @@ from services.instrument.events import EventBus
 from services.instrument.head_arbiter import HeadArbiter
 from services.instrument.pending_captures import PendingCaptures
 from services.instrument.status import read_status
+from services.instrument.visit_montage import MontageMaker
 from services.records.protocol import Protocol, load_protocol
 from services.records.upload_queue import UploadQueue
 from services.records.visit_repository import VisitRepository
@@ -73,18 +75,17 @@ def create_app(
     visits, lease = VisitRepository(store.engine, protocol or load_protocol(), clock), ControlLease(clock)
     queue, pack = UploadQueue(store.engine, clock), archive_builder(store, visits)
     worker = UploadWorker(queue, pack, uploader, lambda: arbiter.is_idle, clock) if uploader is not None else None
-    sources = AlertSources(
-        lambda: read_status(arbiter), store, visits, lambda: lease.holder, None if worker is None else queue
-    )
-    alerts = AlertMonitor(sources, clock, arbiter.context.event_bus.publish)
+    alerts = _alert_monitor(arbiter, visits, lease, None if worker is None else queue)
     checkpoints = Checkpoints(store, lambda: arbiter.is_idle, lambda: arbiter.state == "aim", clock)
-    life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker)
+    montages = MontageMaker(store, lambda: arbiter.is_idle)
+    life = _lifespan(arbiter.context.event_bus, alerts, checkpoints, worker, montages)
     app = _http_application(life, own_host_names() if host_names is None else host_names)
     pending, controlled = PendingCaptures(), [Depends(acquire_control_lease(lease))]
     app.include_router(press_router(lambda: arbiter.exam, store, visits, pending), dependencies=controlled)
     app.include_router(captures_router(store, arbiter))
     app.include_router(visits_router(visits, lease, pending, checkpoints.request), dependencies=controlled)
     app.include_router(exports_router(visits, store, usb_drives or UsbDrives()), dependencies=controlled)
+    app.include_router(montage_router(visits, montages))
     app.include_router(upload_router(worker), dependencies=controlled)
     app.include_router(status_router(arbiter, visits, lease, alerts, worker))
     lit = [Depends(acquire_lease_for_light(lease)), Depends(limit_clients(preview_limits))]
@@ -96,6 +97,15 @@ def create_app(
         app.include_router(router, dependencies=[Depends(login_required(authenticator))])
     add_page_routes(app)
     return Application(app, visits, lease, alerts, worker)
+
+
+def _alert_monitor(
+    arbiter: HeadArbiter, visits: VisitRepository, lease: ControlLease, queue: UploadQueue | None
+) -> AlertMonitor:
+    """Return the monitor of the alerts of an application; `queue` None: nothing is uploaded."""
+    context = arbiter.context
+    sources = AlertSources(lambda: read_status(arbiter), context.store, visits, lambda: lease.holder, queue)
+    return AlertMonitor(sources, context.clock, context.event_bus.publish)
 
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
@@ -116,11 +126,15 @@ def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAP
 
 
 def _lifespan(
-    event_bus: EventBus, alerts: AlertMonitor, checkpoints: Checkpoints, upload_worker: UploadWorker | None
+    event_bus: EventBus,
+    alerts: AlertMonitor,
+    checkpoints: Checkpoints,
+    upload_worker: UploadWorker | None,
+    montages: MontageMaker,
 ) -> Lifespan:
     """Return the lifespan handler: alerts, checkpoints and upload worker start and stop with the server.
 
-    At the end it also closes the event bus.
+    At the end it also ends the montages and closes the event bus.
     """
 
     @asynccontextmanager
@@ -132,6 +146,7 @@ def _lifespan(
         yield
         if upload_worker is not None:
             upload_worker.close()
+        montages.close()
         checkpoints.close()
         alerts.close()
         event_bus.close()

@@ -46,6 +46,7 @@ from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_pa
 from services.instrument.update_requests import UpdateRequests
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
+from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol
 from services.records.read_only_store import opened_store
@@ -110,6 +111,7 @@ def serve(
     clock = SystemClock()
     with _Stop() as stop, address, opened_store(data, clock) as store, ExitStack() as undo, _limited_logs(clock):
         data = store.folder  # of a read-only store: its copy in memory
+        protocol = _with_own_numbers(protocol, store)
         dose_tables = DoseLedgerStore(store.engine, clock, light_limits().window_s)
         archive = Archive(archive_path(spec, data))
         event_log = undo.enter_context(closing(EventLog(data / "diary")))
@@ -134,6 +136,15 @@ def serve(
         stop.register(_limited_server(app.http, clock, context.event_bus)).run(sockets=[address])
     if (failure := arbiter.owner.failure) is not None or stop.has_failed:
         raise failure or DiffuscopeError("the instrument stopped unexpectedly")
+
+
+def _with_own_numbers(protocol: Protocol, store: CaptureStore) -> Protocol:
+    """Return the protocol with the numbers of this device, whose identity is created at the first start.
+
+    A disk that is read-only and has no identity leaves the protocol as it is: it takes no pictures.
+    """
+    device = load_or_create_device(store.folder) if store.refusal is None else read_device(store.folder)
+    return protocol if device is None else protocol.for_device(device.prefix)
 
 
 def _limited_server(app: FastAPI, clock: Clock, event_bus: EventBus) -> "Server":

@@ -7,6 +7,7 @@ Linear pixels would show vessels too dark; any other curve would change their co
 import json
 import struct
 import zlib
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from io import BytesIO
 from itertools import accumulate
@@ -25,7 +26,8 @@ from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metad
 
 Pixels = NDArray[np.uint8]
 
-MARK = "SIMULATED"
+MARK, PREDICTED = "SIMULATED", "PREDICTED"
+_TEXTS = ("simulated", "predicted")  # text chunks besides the note
 _BROKEN_TIFF = (tifffile.TiffFileError, struct.error, zlib.error)  # exceptions of tifffile on truncated data
 _LOW, _HIGH = 0.5, 99.8  # percentiles of the lit pixels: noise below, reflections above
 _SAMPLES = 40_000  # error of the percentiles below a grey level, in 1 % of the time for all pixels
@@ -34,29 +36,37 @@ _SATURATED_SHARE = 0.05  # of the pixels of a block: the block is shown as satur
 _STEPS = 4096  # in linear light, finer than 8 bits of sRGB anywhere (its slope is at most 12.92)
 _LETTER_RATIO = 1 / 18  # letter size of the mark over picture height: legible on a telephone at arm's length
 _LETTER_LEAST_PX = 12.0  # smaller letters touch each other
+_PREDICTED_RATIO = 1 / 32  # of the mark of predicted channels
 
 
-def to_png(picture: Image, simulated: bool, note: str = "") -> bytes:
+def to_png(picture: Image, simulated: bool, note: str = "", predicted: Sequence[str] = ()) -> bytes:
     """Return an 8-bit sRGB PNG, windowed between percentiles 0.5 and 99.8 of the pixels that are not zero.
 
     `picture` is linear float32 (rows, cols) or (rows, cols, 3) and keeps its size; all channels share one window, which
     preserves neutral colours. A simulated picture carries a mark in its pixels and the text chunk `simulated`; `note`
-    becomes a text chunk. Raises FrameError if any value is NaN or infinite.
+    becomes a text chunk. So do `predicted` channels, which were not measured: mark in the bottom right corner and text
+    chunk `predicted`. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_invalid_picture(picture)
-    return _png(Pillow.fromarray(_marked(_display_pixels(picture), simulated)), "true" if simulated else "false", note)
+    pixels = _marked(_display_pixels(picture), simulated)
+    texts = {"simulated": "true" if simulated else "false"}
+    if predicted:
+        texts["predicted"] = ", ".join(predicted)
+        pixels = _with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
+    return _png(Pillow.fromarray(pixels), texts, note)
 
 
 def with_note(png: bytes, note: str) -> bytes:
     """Return a PNG of `to_png` with another note and the same pixels."""
     with Pillow.open(BytesIO(png)) as image:
-        return _png(image, str(image.info["simulated"]), note)
+        return _png(image, {name: str(image.info[name]) for name in _TEXTS if name in image.info}, note)
 
 
-def _png(image: Pillow.Image, simulated: str, note: str) -> bytes:
+def _png(image: Pillow.Image, texts: Mapping[str, str], note: str) -> bytes:
     chunks = PngInfo()
     chunks.add(b"sRGB", b"\0")
-    chunks.add_text("simulated", simulated)
+    for name, text in texts.items():
+        chunks.add_text(name, text)
     if note:
         chunks.add_itxt("note", note)
     out = BytesIO()
@@ -180,33 +190,54 @@ def _srgb_curve() -> Pixels:
 
 def _marked(pixels: Pixels, simulated: bool) -> Pixels:
     """Return a copy of the pixels with the mark in the bottom left corner if `simulated`, else the same array."""
-    if not simulated:
-        return pixels
-    band = _band(*pixels.shape[:2])
+    return _with_band(pixels, MARK, _LETTER_RATIO) if simulated else pixels
+
+
+def _with_band(pixels: Pixels, text: str, ratio: float, *, at_right: bool = False) -> Pixels:
+    """Return a copy of the pixels with `text` in a bottom corner; `ratio`: letter size over the picture's height."""
+    band = _band(*pixels.shape[:2], text, ratio)
     rows, cols = band.shape
     marked = pixels.copy()
-    marked[-rows:, :cols] = band if pixels.ndim == 2 else band[..., np.newaxis]
+    corner = marked[-rows:, -cols:] if at_right else marked[-rows:, :cols]
+    corner[...] = band if pixels.ndim == 2 else band[..., np.newaxis]
     return marked
 
 
-@lru_cache(maxsize=8)
-def _band(rows: int, cols: int) -> Pixels:
-    """Return the mark (text MARK, white on black, grey pixels) for a picture of rows x cols, not larger than it."""
-    size = max(_LETTER_LEAST_PX, rows * _LETTER_RATIO)
-    size = max(1.0, size * min(1.0, cols / _lengths(size)[-1]))
-    font, ends = ImageFont.load_default(size), _lengths(size)
+@lru_cache(maxsize=16)
+def _band(rows: int, cols: int, text: str, ratio: float) -> Pixels:
+    """Return a mark (text, white on black, grey pixels) for a picture of rows x cols, not larger than it."""
+    size = max(_LETTER_LEAST_PX, rows * ratio)
+    size = max(1.0, size * min(1.0, cols / _lengths(text, size)[-1]))
+    font, ends = ImageFont.load_default(size), _lengths(text, size)
     width, height = min(cols, round(ends[-1])), min(rows, round(1.25 * size))
     band = Pillow.new("L", (width, height), 0)
-    for letter, end in zip(MARK, ends, strict=False):  # the last value is the right margin
+    for letter, end in zip(text, ends, strict=False):  # the last value is the right margin
         ImageDraw.Draw(band).text((end, height / 2), letter, fill=255, font=font, anchor="rm")
     return np.asarray(band)
 
 
-def _lengths(size: float) -> list[float]:
-    """Return the right end of each letter of the mark, and last the width of its band, pixels; `size`: letter size."""
+def _lengths(text: str, size: float) -> list[float]:
+    """Return the right end of each letter of a mark, and last the width of its band, pixels; `size`: letter size."""
     font, gap = ImageFont.load_default(size), 0.15 * size
-    ends = list(accumulate((font.getlength(letter) + gap for letter in MARK), initial=0.3 * size))
+    ends = list(accumulate((font.getlength(letter) + gap for letter in text), initial=0.3 * size))
     return [*ends[1:], ends[-1] + 0.45 * size]
+
+
+def read_png(png: bytes) -> Image:
+    """Return the linear light, 0 to 1, of a picture that `to_png` wrote, float32 (rows, cols) or (rows, cols, 3).
+
+    The mark of a simulated picture is replaced by 0. FrameError for other data.
+    """
+    try:
+        with Pillow.open(BytesIO(png)) as image:
+            pixels, simulated = np.asarray(image), image.info.get("simulated") == "true"
+    except (OSError, ValueError, SyntaxError) as error:  # SyntaxError: Pillow, for a damaged PNG
+        raise FrameError(f"this is not a whole PNG: {error}") from error
+    light = from_srgb(pixels)
+    if simulated:
+        rows, cols = _band(*light.shape[:2], MARK, _LETTER_RATIO).shape
+        light[-rows:, :cols] = 0
+    return light
 
 
 def from_srgb(pixels: NDArray[np.uint8]) -> Image:

@@ -1,6 +1,7 @@
 """Blocking work in the background: in a thread of this process, or in a subprocess at the lowest priority."""
 
 import os
+import signal
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from multiprocessing import get_context
@@ -26,18 +27,27 @@ def run_in_thread(work: Callable[[], Result], keep_alive: Callable[[], None]) ->
     return result.result()
 
 
-def run_in_subprocess(work: Callable[..., Any], *args: Any, report: Report) -> Any:
+def run_in_subprocess(
+    work: Callable[..., Any], *args: Any, report: Report, may_run: Callable[[], bool] = lambda: True
+) -> Any:
     """Run `work(*args, send)` in a subprocess of lowest priority and return its result; values must be picklable.
 
-    Each message that `work` passes to `send` is passed to `report` in this process. Raises the DiffuscopeError of
-    `work`, or DiffuscopeError if the process ends without a result.
+    Each message that `work` passes to `send` is passed to `report` in this process. While `may_run`, called every
+    POLL_S, returns false, the subprocess is stopped; an error that it raises ends the subprocess. Raises the
+    DiffuscopeError of `work`, or DiffuscopeError if the process ends without a result.
     """
     receiver, sender = SPAWNED.Pipe(duplex=False)
     process = SPAWNED.Process(target=_run_worker, args=(sender, work, args), daemon=True)
     process.start()
     sender.close()
+    is_stopped = False
     try:
         while True:
+            if is_stopped == may_run():
+                is_stopped = not is_stopped
+                os.kill(process.pid or 0, signal.SIGSTOP if is_stopped else signal.SIGCONT)
+            if not receiver.poll(POLL_S):
+                continue
             kind, value = receiver.recv()
             if kind == "done":
                 return value

@@ -161,7 +161,7 @@ def captures_with_calibration(store: CaptureStore, calibration_id: str, since: d
 def spheres_dpt(captures: Iterable[Capture]) -> list[tuple[datetime, float]]:
     """Return time and mean sphere of each capture with a reported refraction; dioptres, positive for myopia."""
     spheres = ((one.taken_at, (one.report.reconstruction.refraction_dpt or {}).get("sphere")) for one in captures)
-    return [(taken_at, -sphere) for taken_at, sphere in spheres if sphere is not None]
+    return [(taken_at, -sphere) for taken_at, sphere in spheres if isinstance(sphere, int | float)]
 
 
 def exposures(store: CaptureStore, capture: Capture, between: Callable[[], None] = lambda: None) -> ExposurePair:

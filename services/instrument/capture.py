@@ -13,10 +13,10 @@ from device.light_safety.dose_report import DoseReport
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
-from device.values import EYES, Eye, Frame, Image, Report
+from device.values import EYES, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
-from services.records.capture import Capture, CaptureReport, LateralityEstimate, PictureVerdict
+from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
 from services.records.capture_journal import InterruptedCapture
 from services.records.capture_report import read_report, report_as_json
 from services.records.capture_target import CaptureTarget, Permit, permit_test_picture
@@ -71,7 +71,8 @@ class ExposedCapture:
     """Exposed capture: the lit frames and the dark frame of a press, before reconstruction.
 
     `expose_s`: duration of all exposures. `light`: dose report. `verdict`: first verdict, on `frame`. `unusable`:
-    reason of each frame that must not enter the picture, by its index.
+    reason of each frame that must not enter the picture, by its index. `colours`: one frame in each other colour of
+    light; `missing`: reason of each that was not taken.
     """
 
     press: Press
@@ -83,6 +84,8 @@ class ExposedCapture:
     light: DoseReport
     verdict: Verdict
     unusable: Mapping[int, str] = field(default_factory=dict)
+    colours: Mapping[Colour, Frame] = field(default_factory=dict)
+    missing: Mapping[Colour, str] = field(default_factory=dict)
 
     @property
     def frame(self) -> Frame:
@@ -114,14 +117,16 @@ class IdempotencyKeys:
 
 
 def capture_files(
-    capture: Capture, head: str, lit: tuple[Frame, ...], dark: Frame, shown: Image, quick: bytes | None
+    capture: Capture, head: str, shot: ExposedCapture, shown: Image, quick: bytes | None, colour: Image | None
 ) -> dict[str, bytes]:
     """Return the files of a capture by name; `shown` is the linear picture of the field, `quick` its quick look (JPEG).
 
-    `head` is the name of the head. The raw frames and the calibration in their metadata suffice to repeat the
-    reconstruction: `raw.tiff` is the first frame of the burst, `raw-1.tiff` the next one.
+    `colour` is the picture in colour, if there is one. `head` is the name of the head. The raw frames and the
+    calibration in their metadata suffice to repeat the reconstruction: `raw.tiff` is the first frame of the burst,
+    `raw-1.tiff` the next one, `raw-red.tiff` that in red light.
     """
-    frame = lit[0]
+    frame, note = shot.frame, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
+    predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
     metadata = RawMetadata(
         id=capture.id, eye=capture.eye, taken_at=capture.taken_at, exposure_s=frame.exposure_s,
         illumination=frame.illumination, simulated=frame.simulated, calibration_id=capture.calibration_id, head=head,
@@ -129,10 +134,15 @@ def capture_files(
     return {
         **{
             "raw.tiff" if k == 0 else f"raw-{k}.tiff": picture_files.raw_tiff(one.counts, metadata)
-            for k, one in enumerate(lit)
+            for k, one in enumerate(shot.frames)
         },
-        "dark.tiff": picture_files.raw_tiff(dark.counts, replace(metadata, illumination=None)),
-        "picture.png": picture_files.to_png(shown, capture.simulated, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"),
+        **{
+            f"raw-{name}.tiff": picture_files.raw_tiff(one.counts, replace(metadata, illumination=one.illumination))
+            for name, one in shot.colours.items()
+        },
+        "dark.tiff": picture_files.raw_tiff(shot.dark.counts, replace(metadata, illumination=None)),
+        "picture.png": picture_files.to_png(shown, capture.simulated, note),
+        **({} if colour is None else {COLOUR: picture_files.to_png(colour, capture.simulated, note, predicted)}),
         "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),
         "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
     }

@@ -5,7 +5,7 @@ between two steps. One thread, the one that owns the head, calls it.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -20,23 +20,36 @@ from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import BurstReconstructor
+from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction import RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor, Step, default_schedule
-from device.values import EYES, Calibration, ExposureSettings, Eye, Frame, Illumination, Image, Reconstruction, Report
+from device.values import (
+    EYES,
+    Calibration,
+    Colour,
+    ExposureSettings,
+    Eye,
+    Frame,
+    Illumination,
+    Image,
+    Reconstruction,
+    Report,
+)
 from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
-from services.records.capture import NO_METHOD, Capture
-from services.records.capture_target import CaptureTarget
+from services.records.capture import NO_METHOD, Capture, RecordOrigin
+from services.records.capture_target import OTHER_COLOURS, CaptureTarget
 
 log = logging.getLogger(__name__)
 
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
+NO_PSF = "the calibration has no PSF in this colour of light"
 
 
 class FrameReconstructor(Protocol):
@@ -68,6 +81,20 @@ class FramesReconstructor(Protocol):
         """Yield the quick look of the first frame, a pause after each frame and round, and the picture."""
 
 
+class ColoursReconstructor(Protocol):
+    """Reconstruction of other colours in steps, as `device.recon.colour_reconstructor.ColourReconstructor` does it."""
+
+    @property
+    def others(self) -> Collection[Colour]:
+        """Colours that can be reconstructed."""
+
+    def steps(
+        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
+        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the steps of `green`, a pause after each round of the other colours, and the picture with colours."""
+
+
 class FrameFeedback(Protocol):
     """Assessment of frames and pictures, as `FrameAssessor` does it."""
 
@@ -86,16 +113,21 @@ class FrameFeedback(Protocol):
 
 @dataclass(frozen=True)
 class Exposure:
-    """Lit frames of one press, their dark frame, and begin (clock seconds) and duration of all exposures.
+    """Frames of one press: lit ones, one in each other colour of light, and their dark frame.
 
-    `unusable` holds the reason of each lit frame that must not enter the picture, by its index.
+    `begin_s` (clock seconds) and `duration_s` are those of all exposures, `dose_j_per_cm2` is their dose. `unusable`
+    holds the reason of each lit frame that must not enter the picture, by its index; `missing` the reason of each other
+    colour that was not taken.
     """
 
     lit: tuple[Frame, ...]
+    colours: Mapping[Colour, Frame]
     dark: Frame
     begin_s: float
     duration_s: float
+    dose_j_per_cm2: float
     unusable: Mapping[int, str] = field(default_factory=dict)
+    missing: Mapping[Colour, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -109,38 +141,49 @@ class LiveFrame:
 
 @dataclass(frozen=True)
 class CaptureRecord:
-    """Capture before its storage: its row, its frames, and the picture of the illuminated field; `head`: its name."""
+    """Capture before its storage: its row, its exposure, and the picture of the illuminated field; `head`: its name.
+
+    `colour` is the picture in colour, if there is one.
+    """
 
     capture: Capture
-    lit: tuple[Frame, ...]
-    dark: Frame
+    shot: ExposedCapture
     shown: Image
     head: str
+    colour: Image | None = None
 
     def files(self, quick: bytes | None) -> dict[str, bytes]:
         """Return the encoded files by name; `quick` is the quick look (JPEG), if one was made."""
-        return capture_files(self.capture, self.head, self.lit, self.dark, self.shown, quick)
+        return capture_files(self.capture, self.head, self.shot, self.shown, quick, self.colour)
 
 
 class CapturePipeline:
     """Steps of the captures and live pictures of one head.
 
     `reconstructor` makes the pictures of captures of one frame, `bursts` those of several (None: a press takes one
-    frame), `live` those of live pictures, whose colour may have another PSF.
+    frame), `live` those of live pictures, whose colour may have another PSF. `colours` solves the other colours of
+    light (None: a press takes the picture's colour only). `origin` returns the origin of a capture.
     """
 
     def __init__(
         self, head: Head, clock: Clock, reconstructor: FrameReconstructor, live: FrameReconstructor,
         feedback: FrameFeedback, bursts: FramesReconstructor | None = None,
+        colours: ColoursReconstructor | None = None, origin: Callable[[], RecordOrigin | None] = lambda: None,
     ) -> None:  # fmt: skip
-        self.reconstructor, self.live, self.bursts = reconstructor, live, bursts
-        self._head, self._clock, self._feedback = head, clock, feedback
+        self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
+        self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
 
-    def expose(self, eye: Eye, *, in_visit: bool = False, count: int = 1) -> Exposure:
-        """Return up to `count` lit frames and a dark one of an eye, as the function `expose`, with its errors."""
-        begin_s, count = self._clock.now_s(), count if self.bursts is not None else 1
-        lit, dark = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count)
-        return Exposure(lit, dark, begin_s, self._clock.now_s() - begin_s)
+    def expose(
+        self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
+        field: str | None = None,
+    ) -> Exposure:  # fmt: skip
+        """Return up to `count` lit frames, one in each of `colours`, and a dark one, as the function `expose`."""
+        count = count if self.bursts is not None else 1
+        able = () if self.colours is None else self.colours.others
+        taken = [colour for colour in colours if colour in able]
+        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken, field=field)
+        unable = {colour: NO_PSF for colour in colours if self.colours is not None and colour not in able}
+        return replace(exposure, missing={**unable, **exposure.missing})
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
         """Return the exposure with its first good frame at the front, and the verdict on that frame.
@@ -179,9 +222,14 @@ class CapturePipeline:
     def _steps(self, shot: ExposedCapture, deadline: Deadline) -> Iterator[Step]:
         dark, simulated = shot.dark.counts, shot.frame.simulated
         if self.bursts is None or len(shot.frames) == 1:
-            return self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
-        counts = [frame.counts for frame in shot.frames]
-        return self.bursts.steps(counts, dark, unusable=shot.unusable, simulated=simulated, deadline=deadline)
+            green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
+        else:
+            counts = [frame.counts for frame in shot.frames]
+            green = self.bursts.steps(counts, dark, unusable=shot.unusable, simulated=simulated, deadline=deadline)
+        if self.colours is None or not (shot.colours or shot.missing):
+            return green
+        colours = {colour: frame.counts for colour, frame in shot.colours.items()}
+        return self.colours.steps(green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing)
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
         """Return the final verdict, from the first one, the report and the number of tries of the slot."""
@@ -191,10 +239,11 @@ class CapturePipeline:
         """Return the record of a capture with its report, laterality estimate and shown picture."""
         shown = crop_to_field(made.picture, self._head)
         side = self._feedback.estimate_laterality(shown, verdict, shot.press.target)
-        report = capture_report(shot, made.report, verdict, side, budget_s)
+        report = replace(capture_report(shot, made.report, verdict, side, budget_s), device=self._origin())
         id, eye, taken_at, calibration_id = shot.id, shot.press.eye, shot.taken_at, self._head.calibration.id
         capture = Capture(id, eye, taken_at, made.simulated, calibration_id, report, {})
-        return CaptureRecord(capture, shot.frames, shot.dark, shown, self._head.spec.name)
+        colour = made.colour if isinstance(made, ColourReconstruction) else None
+        return CaptureRecord(capture, shot, shown, self._head.spec.name, colour)
 
     def expose_live(self, eyes: tuple[Eye, ...], *, in_visit: bool = False) -> LiveFrame:
         """Return a frame in aiming light, whose dose counts for `eyes`; without a visit a lower limit applies."""
@@ -208,8 +257,12 @@ class CapturePipeline:
         return jpeg, self._feedback.aim(counts, seen.exposed_s)
 
 
-def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
+def plan_pipeline(
+    head: Head, clock: Clock, plans: Path, origin: Callable[[], RecordOrigin | None] = lambda: None
+) -> CapturePipeline:
     """Return the pipeline of a head after all planning; `plans` is the folder of the FFT plans.
+
+    `origin` returns the origin of a capture, None if its device has no identity.
 
     With PSFs of several depths one frame is exposed, to choose among them. Raises the errors of `expose` then.
     """
@@ -218,12 +271,26 @@ def plan_pipeline(head: Head, clock: Clock, plans: Path) -> CapturePipeline:
     index = _best_psf(head, clock, calibration, planner)
     recipes = default_schedule(calibration, shape, index)
     reconstructor = live_reconstructor = Reconstructor(calibration, shape, planner, clock, recipes, index)
-    if live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
-        live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
-    feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
     is_recording = head.spec.camera.backend == "replay"  # whose next raw may show something else
     bursts = None if is_recording else BurstReconstructor(reconstructor, planner)
-    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts)
+    others: dict[Colour, Reconstructor] = {}
+    takes_colours, measured = (
+        bursts is not None and light.colour == "green",
+        {psf.colour for psf in head.calibration.psfs},
+    )
+    for colour in OTHER_COLOURS if takes_colours else ():
+        if colour in measured:
+            own = head.calibration.for_colour(colour)
+            others[colour] = Reconstructor(own, shape, planner, clock, recipes, index, refract=False)
+        elif None in measured:  # a PSF that holds for any colour
+            others[colour] = reconstructor
+    colours = ColourReconstructor(reconstructor, others) if takes_colours else None
+    if light.preview_colour in others:
+        live_reconstructor = others[light.preview_colour]
+    elif live.psfs[0] is not calibration.psfs[0]:  # the colour of the live pictures has a PSF of its own
+        live_reconstructor = Reconstructor(live, shape, planner, clock, recipes[:1], refract=False)
+    feedback = FrameAssessor(calibration, shape, planner, index, head.spec.camera)
+    return CapturePipeline(head, clock, reconstructor, live_reconstructor, feedback, bursts, colours, origin)
 
 
 def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Planner) -> int:
@@ -233,28 +300,43 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
     """
     if len(calibration.psfs) == 1:
         return 0
-    (frame,), _ = expose(head, EYES, clock)
+    (frame,) = expose(head, EYES, clock).lit
     return most_likely_psf(calibration, frame.counts, planner)[0]
 
 
 def expose(
-    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1
-) -> tuple[tuple[Frame, ...], Frame]:
-    """Return up to `count` lit frames and a dark one; the dose counts for `eyes`, without a visit up to a lower limit.
+    head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
+    colours: Sequence[Colour] = (), field: str | None = None,
+) -> Exposure:  # fmt: skip
+    """Return up to `count` lit frames, one in each of `colours`, and a dark one.
 
-    There are fewer lit frames if the guard permits no light for so long.
+    The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
+    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
+    field of view of the programme, to which a simulated eye turns.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
     """
     head.check()
-    shot = ExposureSettings(head.spec.camera.exposure_s)
-    announce_eye(head, eyes)
+    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)
+    announce_eye(head, eyes, field)
     head.camera.prepare(shot)
+    taken: dict[Colour, Frame] = {}
+    missing: dict[Colour, str] = {}
     try:
         glow = Illumination(head.spec.light.colour)
         lit = burst(head.camera, head.light, glow, shot, count, clock, eyes, in_visit=in_visit)
-        return lit, head.camera.expose(shot)
+        dose_j_per_cm2 = head.light.given_j_per_cm2
+        for colour in colours:
+            try:
+                glow = Illumination(colour, head.light.hazard.highest_level(colour))
+                (taken[colour],) = burst(head.camera, head.light, glow, shot, 1, clock, eyes, in_visit=in_visit)
+                dose_j_per_cm2 += head.light.given_j_per_cm2
+            except DiffuscopeError as error:
+                log.warning("no %s light: %s", colour, error, extra={"code": error.code})
+                missing[colour] = error.message
+        dark = head.camera.expose(shot)
+        return Exposure(lit, taken, dark, begin_s, clock.now_s() - begin_s, dose_j_per_cm2, missing=missing)
     finally:
         head.light.off()
 
@@ -278,10 +360,13 @@ def expose_live(
     return frame, exposed_s, clock.now_s()
 
 
-def announce_eye(head: Head, eyes: tuple[Eye, ...]) -> None:
-    """Announce the eye of the next exposure to a simulated head while the lamp is off, if `eyes` has exactly one."""
+def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) -> None:
+    """Announce eye and field of view of the next exposure to a simulated head, if `eyes` has exactly one eye.
+
+    The lamp is off.
+    """
     if len(eyes) == 1:
-        head.present_eye(eyes[0])
+        head.present_eye(eyes[0], field)
 
 
 def crop_to_field(image: Image, head: Head) -> Image:

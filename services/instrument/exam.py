@@ -22,6 +22,7 @@ from services.instrument.exam_loop import ExamParts, run_exam
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import WireState
 from services.instrument.progress import Progress
+from services.instrument.record_origin import CaptureOrigin
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S, Capture
@@ -54,7 +55,8 @@ class ExamService:
             head, store, clock, watchdog, budget_s, requests, ExamEvents(event_bus, watchdog, self.progress, requests),
             self.capture_journal, self.calibration_monitor,
         )  # fmt: skip
-        work = parts, lambda: plan_pipeline(head, clock, plans), self.ready.set, on_failure
+        origin = CaptureOrigin(head, store.folder)
+        work = parts, lambda: plan_pipeline(head, clock, plans, origin), self.ready.set, on_failure
         self._thread = Thread(target=run_exam, args=work, name="head", daemon=True)
         self._thread.start()
 

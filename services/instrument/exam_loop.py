@@ -9,7 +9,7 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 from device.clock import Clock
@@ -116,13 +116,20 @@ class ExamLoop:
         self._parts.capture_journal.begin(press.journal_entry(id), press.key)
         self._events.stage(press, id, "expose")
         target = press.target
-        exposure = self._pipeline.expose(press.eye, in_visit=target.visit is not None, count=target.frames)
+        exposure = self._pipeline.expose(
+            press.eye,
+            in_visit=target.visit is not None,
+            count=target.frames,
+            colours=target.colours,
+            field=target.field,
+        )
         exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
-        light = self._parts.head.light.dose_report()
+        light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
         return ExposedCapture(
-            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable
-        )
+            press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable,
+            exposure.colours, exposure.missing,
+        )  # fmt: skip
 
     def _complete_oldest(self) -> None:
         """Reconstruct and store the oldest exposure, then resolve the future of its press."""

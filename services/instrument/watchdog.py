@@ -9,7 +9,7 @@ import socket
 
 log = logging.getLogger(__name__)
 
-BEAT_S = 2.0  # longest interval of heartbeats while idle; WatchdogSec of the unit is five times as long
+BEAT_S = 2.0  # longest interval of heartbeats while idle; WatchdogSec of the unit is fifteen times as long
 
 
 class Watchdog:

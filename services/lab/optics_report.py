@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from device.config.head_file import load_head
+from device.config.head_file import InstrumentSpec, load_head
 from device.config.sensors import known_sensors
 from device.errors import SettingError
 from device.optics.budget import Design, OpticalBudget, Side, design_of_head, design_of_sensor, optical_budget
@@ -30,6 +30,11 @@ def design(head: Path | None, sensor: str | None, eye_mm: float | None, pupil_mm
     else:
         raise SettingError(f"no sensor is called {sensor!r}", f"Choose one of {', '.join(sorted(known_sensors()))}.")
     return replace(found, eye_mm=eye_mm or found.eye_mm, pupil_mm=pupil_mm or found.pupil_mm)
+
+
+def design_of(spec: InstrumentSpec) -> Design:
+    """Return the design of a head's specification, with the light path of `hardware/optics.toml`."""
+    return design_of_head(load_light_path(resources.LIGHT_PATH), spec)
 
 
 def table(chosen: Design) -> str:

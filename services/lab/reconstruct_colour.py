@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from device.errors import FrameError, SettingError
-from device.recon.colour import CHANNELS, ChannelName, ColourPicture, join_colours
+from device.recon.colour import CHANNELS, ColourPicture, join_colours
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
-from device.values import FrameUse, Image
+from device.values import ChannelName, FrameUse, Image
 from services.lab.reconstruct_burst import load_burst, solve_burst
 from services.lab.reconstruct_file import (
     FileReconstruction,

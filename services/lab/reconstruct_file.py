@@ -20,7 +20,6 @@ from device.config.image_files import write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.assessment.psf_consistency import PsfConsistency
-from device.recon.colour import ChannelUse
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
@@ -60,14 +59,12 @@ class FileReport(Report):
     `solved` is (rows, cols) in samples of the solved frame, `given` the options that replaced a choice of the program
     (`settings` of the method among them), `psf_channels` the number of PSFs for the channels of the raw (1: one PSF for
     all), `bayer` the pattern of a mosaic. The other figures of several PSFs are those of the brightest channel.
-    `channels` says what became of each colour of light.
     """
 
     solved: Shape = (0, 0)
     given: dict[str, float | str | dict[str, float]] = field(default_factory=dict)
     psf_channels: int = 1
     bayer: str | None = None
-    channels: tuple[ChannelUse, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -305,7 +302,7 @@ def plan_reconstructor(
     return Reconstructor(
         calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency,
         timed=options.budget_s is not None, methods=METHODS if method is None else {**METHODS, method.name: method},
-        audience=Audience.FILES,
+        audience=Audience.FILES, field_fixed=options.field_fixed,
     )  # fmt: skip
 
 

@@ -43,6 +43,7 @@ class ReconstructOptions:
     Images are paths or arrays. `output` None writes nothing. `even`: flat-field correction of the picture.
     `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and `settings` (of the method, see
     device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`: the raw is a mosaic.
+    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge.
     """
 
     raw: Source
@@ -63,6 +64,7 @@ class ReconstructOptions:
     rounds: int | None = None
     settings: Settings = field(default_factory=dict)
     bayer: Bayer | None = None
+    field_fixed: bool = False
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,25 @@ FILE = Path(__file__).parent / "site" / "report.schema.json"
 SECONDS: Mapping[str, str] = {
     "expose": "Lit and dark exposure; captures only.",
     "join": "Picture of each raw of a burst, their registration, and the joined frame; bursts only.",
+    "colour": "Pictures in the other colours of light, their registration, and the colour picture; captures only.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
+    "cylinder": "Estimate of the cylinder, after the picture.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
 }
 REFRACTION: Mapping[str, str] = {
-    "sphere": "Mean sphere of the spectacle correction in dpt; negative for myopia.",
+    "sphere": "Mean sphere M of the spectacle correction in dpt; negative for myopia.",
     "sd": "Standard deviation of `sphere` in dpt.",
+    "j0": "Jackson cross cylinder J0 of the correction in dpt (power vector after Thibos).",
+    "j0_sd": "Standard deviation of `j0` in dpt.",
+    "j45": "Jackson cross cylinder J45 of the correction in dpt.",
+    "j45_sd": "Standard deviation of `j45` in dpt.",
+    "sphere_sc": "Sphere of the sphere-cylinder notation in dpt: M - cylinder/2.",
+    "cylinder": "Minus cylinder in dpt.",
+    "axis_deg": "Axis of the cylinder in TABO degrees, above 0 and up to 180, as the examiner sees the eye.",
+    "field_deg": "Diameter of the lit field that was found with the refraction, in degrees.",
+    "field_deg_sd": "Standard deviation of `field_deg` in degrees; 0 for a field that was held.",
+    "refused": "Reason for which there is no refraction, and every number is null; null with a refraction.",
 }
 REGULARISATION: Mapping[str, str] = {
     "tau": "Weight of the total variation (methods variation and open).",
@@ -58,6 +70,7 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
+LATER = ("frames", "channels")  # fields of `Report` that earlier releases did not write
 FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
@@ -68,6 +81,18 @@ FRAME: Mapping[str, JsonValue] = {
     },
     "weight": {"type": "number", "description": "Share of the frame in the joined frame, 0 to 1."},
     "reason": {"type": ["string", "null"], "description": "Reason why the frame is not used; null if it is."},
+}  # fmt: skip
+CHANNEL: Mapping[str, JsonValue] = {
+    "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
+    "shift_px": {
+        "type": ["array", "null"], "items": {"type": "number"}, "minItems": 2, "maxItems": 2,
+        "description": "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at "
+        "(r, c) plus this in this channel, in pixels of the raw. Null for a predicted or a missing channel.",
+    },
+    "predicted": {"type": "boolean", "description": "True if the channel was computed from the others, not measured."},
+    "reason": {
+        "type": ["string", "null"], "description": "Why the picture has not this colour; null for one that it has.",
+    },
 }  # fmt: skip
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",
@@ -124,19 +149,6 @@ FILES: Mapping[str, JsonValue] = {
     ),
     "psf_channels": _typed("integer", "Number of PSFs for the channels of the raw; 1: one PSF for all."),
     "bayer": _text("Pattern of the colour mosaic, for example rggb; null for a raw without a mosaic."),
-    "channels": _typed(
-        "array", "Colours of light of a colour picture, in the order in which they were given; empty for a grey one.",
-        items={"type": "object", "properties": {
-            "name": {"enum": ["red", "green", "blue", "amber"], "description": "Colour of the light."},
-            "shift_px": _typed(
-                ["array", "null"],
-                "Rows and columns: what is at (r, c) of the reference, green or else the first, stands at (r, c) plus "
-                "this in this channel, in pixels of the raw. Null for a predicted channel.",
-                items={"type": "number"}, minItems=2, maxItems=2,
-            ),
-            "predicted": _typed("boolean", "True if the channel was computed from the others, not measured."),
-        }},
-    ),
 }  # fmt: skip
 CAPTURE: Mapping[str, JsonValue] = {
     "dose_j_per_cm2": _figure("Light dose of this exposure at the retina in J/cm2."),
@@ -189,8 +201,28 @@ CAPTURE: Mapping[str, JsonValue] = {
     "confirmed": _typed(
         "object", "Confirmation of the recorded eye; only if there is one.", properties=EYE_AT_BY
     ),
+    "device": _typed(
+        "object", "Origin of the capture; captures of earlier releases have none.",
+        properties={
+            "uuid": _text("UUID of the device, made with its data folder."),
+            "serial": _text("Serial number of its board."),
+            "software": _text("Version of the software."),
+            "head": _text("Name of the head."),
+            "calibration_id": _text("Identifier of the calibration."),
+            "calibrated_at": _text("Date of the calibration, ISO 8601; null for a simulated one."),
+            "clock": _text(
+                "Source of the date: network, rtc (clock of the board), browser (of a tablet), or not_set: it may be "
+                "too early."
+            ),
+        },
+    ),
     "simulated": _typed("boolean", "True if the frame shows no real eye."),
 }  # fmt: skip
+
+
+def _refraction() -> dict[str, JsonValue]:
+    """Return the schemas of the entries of a refraction: a text for `refused`, a number for the others; or null."""
+    return {name: _text(text) if name == "refused" else _figure(text) for name, text in REFRACTION.items()}
 
 
 def report_schema() -> dict[str, JsonValue]:
@@ -204,10 +236,11 @@ def report_schema() -> dict[str, JsonValue]:
             "properties": _each(SECONDS, _number),
             "additionalProperties": {"type": "number"},
         },
-        "refraction_dpt": {"type": ["object", "null"], "properties": _each(REFRACTION, _number)},
+        "refraction_dpt": {"type": ["object", "null"], "properties": _refraction()},
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
         "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},
+        "channels": {"type": "array", "items": {"type": "object", "properties": dict(CHANNEL)}},
     }
     for name, entries in nested.items():
         properties[name] = {"description": properties[name]["description"], **entries}
@@ -216,12 +249,12 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels, bayer and channels, and the instrument the others. "
+            "given, psf_channels and bayer, the instrument the instrument the others; both write frames and channels. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",
         "properties": {**properties, **FILES, **CAPTURE},
-        "required": [one.name for one in fields(Report) if one.name != "frames"],  # earlier releases had none
+        "required": [one.name for one in fields(Report) if one.name not in LATER],
     }
 
 

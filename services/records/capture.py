@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Self
+from typing import Literal, Self
 
 from device.light_safety.dose_report import DoseReport
 from device.values import Eye, Report
 from services.records.json_values import JsonObject
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
+COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
 BUDGET_S = 5.0  # standard time budget, also of captures of earlier releases, whose report has none
 
 
@@ -70,14 +71,37 @@ class EyeConfirmation:
     others: JsonObject = field(default_factory=dict)
 
 
+# Source of the date of a record: see services/health/clock_source.py; a browser is asked where nothing better is there.
+ClockState = Literal["not_set", "browser", "rtc", "network"]
+
+
+@dataclass(frozen=True)
+class RecordOrigin:
+    """Device, software, head and calibration that made a record, and the source of its date.
+
+    `uuid`, `serial`: of the device. `calibrated_at`: date of the calibration (ISO 8601); None for a simulated one.
+    `clock`: a ClockState, also one of a later release. `others`: as in PictureVerdict.
+    """
+
+    uuid: str | None = None
+    serial: str | None = None
+    software: str | None = None
+    head: str | None = None
+    calibration_id: str | None = None
+    calibrated_at: str | None = None
+    clock: str | None = None
+    others: JsonObject = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class CaptureReport:
     """Report of a capture: its reconstruction, light, visit and slot, verdict, laterality and time budget.
 
     `reconstruction.seconds`: durations by stage, with the exposure. `visit` and `slot`: ids, None for a test picture.
-    `moved`: corrections of the eye, oldest first; `confirmed`: None unless the recorded eye was confirmed. `others`:
-    entries of the stored JSON that this release does not read or that have another type; they are written again
-    unchanged. A field that is missing in the report of an earlier release has its default.
+    `moved`: corrections of the eye, oldest first; `confirmed`: None unless the recorded eye was confirmed. `device`:
+    origin, None in captures of earlier releases. `others`: entries of the stored JSON that this release does not read
+    or that have another type; they are written again unchanged. A field that is missing in the report of an earlier
+    release has its default.
     """
 
     reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD, frames=()))
@@ -89,6 +113,7 @@ class CaptureReport:
     budget_s: float = BUDGET_S
     moved: tuple[EyeCorrection, ...] = ()
     confirmed: EyeConfirmation | None = None
+    device: RecordOrigin | None = None
     others: JsonObject = field(default_factory=dict)
 
     @property

@@ -6,10 +6,10 @@ not know, are in the `others` of the typed values. Entries that an earlier relea
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 from device.light_safety.dose_report import DoseReport
-from device.values import EYES, FrameUse, Report
+from device.values import EYES, ChannelName, ChannelUse, FrameUse, Report
 from services.records.capture import (
     BUDGET_S,
     NO_METHOD,
@@ -18,11 +18,13 @@ from services.records.capture import (
     EyeCorrection,
     LateralityEstimate,
     PictureVerdict,
+    RecordOrigin,
 )
 from services.records.json_values import JsonObject, JsonValue
 from services.records.row_validation import one_of, parsed_json, text
 
 Value = TypeVar("Value")
+ORIGIN = ("uuid", "serial", "software", "head", "calibration_id", "calibrated_at", "clock")
 
 
 # Writer
@@ -46,6 +48,7 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     made, light = report.reconstruction, report.light
     entries: dict[str, JsonValue] = {
         **vars(made), "warnings": list(made.warnings), "frames": [_frame_as_json(one) for one in made.frames],
+        "channels": [_channel_as_json(one) for one in made.channels],
         **vars(light), "dose_high": list(light.dose_high), "limits_unchecked": list(light.limits_unchecked),
         "visit": report.visit, "slot": report.slot, "test": report.is_test,
         "verdict": None if report.verdict is None else verdict_as_json(report.verdict),
@@ -54,18 +57,33 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
     }  # fmt: skip
     if not made.frames:
         del entries["frames"]
+    if not made.channels:
+        del entries["channels"]
     if not light.limits_unchecked:
         del entries["limits_unchecked"]
     if report.moved:
         entries["moved"] = [_correction_as_json(one) for one in report.moved]
     if report.confirmed is not None:
         entries["confirmed"] = _confirmation_as_json(report.confirmed)
+    if report.device is not None:
+        entries["device"] = origin_as_json(report.device)
     return entries
+
+
+def origin_as_json(origin: RecordOrigin) -> dict[str, JsonValue]:
+    """Return the origin of a record as a JSON object: the block `device` of reports, exports and uploads."""
+    known: dict[str, JsonValue] = {name: getattr(origin, name) for name in ORIGIN}
+    return known | dict(origin.others)
 
 
 def _frame_as_json(one: FrameUse) -> JsonValue:
     shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
     return {"index": one.index, "used": one.used, "shift_px": shift, "weight": one.weight, "reason": one.reason}
+
+
+def _channel_as_json(one: ChannelUse) -> JsonValue:
+    shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
+    return {"name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason}
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -102,6 +120,7 @@ def read_report(content: object) -> CaptureReport:
     """
     entries = _object(content)
     verdict, moved, confirmed = entries.get("verdict"), entries.get("moved"), entries.get("confirmed")
+    device = entries.get("device")
     report = CaptureReport(
         reconstruction=_reconstruction(entries),
         light=_dose_report(entries),
@@ -112,6 +131,7 @@ def read_report(content: object) -> CaptureReport:
         budget_s=_checked(entries, "budget_s", _number, BUDGET_S),
         moved=() if moved is None else _moves(moved),
         confirmed=_confirmation(confirmed) if isinstance(confirmed, Mapping) else None,
+        device=_origin(device) if isinstance(device, Mapping) else None,
     )
     return replace(report, others=_unwritten(entries, _known_entries(report)))
 
@@ -143,6 +163,7 @@ def _reconstruction(entries: JsonObject) -> Report:
         quality=_lenient(entries, "quality", _copied, {}),
         warnings=_lenient(entries, "warnings", _texts, ()),
         frames=_lenient(entries, "frames", _frames, ()),
+        channels=_lenient(entries, "channels", _channels, ()),
     )
 
 
@@ -156,6 +177,18 @@ def _frame(entries: JsonObject) -> FrameUse:
     index, used = _checked(entries, "index", _whole, 0), entries.get("used") is True
     shift_px, weight = _checked(entries, "shift_px", _position, None), _checked(entries, "weight", _number, 0.0)
     return FrameUse(index, used, shift_px, weight, _checked(entries, "reason", text, None))
+
+
+def _channels(value: object) -> tuple[ChannelUse, ...]:
+    if not isinstance(value, list):
+        raise ValueError("channels that are no list")
+    return tuple(_channel(_object(one)) for one in value)
+
+
+def _channel(entries: JsonObject) -> ChannelUse:
+    name = one_of(entries.get("name"), *get_args(ChannelName))
+    shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
+    return ChannelUse(name, shift_px, predicted, _checked(entries, "reason", text, None))
 
 
 def _dose_report(entries: JsonObject) -> DoseReport:
@@ -195,6 +228,12 @@ def _confirmation(entries: JsonObject) -> EyeConfirmation:
     eye, at, by = (_lenient(entries, name, text, None) for name in ("eye", "at", "by"))
     confirmed = EyeConfirmation(eye, at, by)
     return replace(confirmed, others=_unwritten(entries, _confirmation_as_json(confirmed)))
+
+
+def _origin(entries: JsonObject) -> RecordOrigin:
+    uuid, serial, software, head, id, calibrated_at, clock = (_lenient(entries, name, text, None) for name in ORIGIN)
+    origin = RecordOrigin(uuid, serial, software, head, id, calibrated_at, clock)
+    return replace(origin, others=_unwritten(entries, origin_as_json(origin)))
 
 
 def _unwritten(entries: JsonObject, written: JsonObject) -> JsonObject:
@@ -247,11 +286,18 @@ def _numbers(value: object) -> dict[str, float]:
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
 
 
-def _refraction(value: object) -> dict[str, float]:
-    """Return the numbers of a refraction by name; ValueError if its `sphere` is neither a number nor null."""
+def _refraction(value: object) -> dict[str, float | str | None]:
+    """Return the numbers and nulls of a refraction by name, and the text of `refused`; entries of other types are
+    omitted. ValueError if its `sphere` is neither a number nor null.
+    """
     entries = _object(value)
     _checked(entries, "sphere", _number, None)
-    return {name: one for name, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool)}
+    kept: dict[str, float | str | None] = {}
+    for name, one in entries.items():
+        is_number = isinstance(one, int | float) and not isinstance(one, bool)
+        if one is None or is_number or (name == "refused" and isinstance(one, str)):
+            kept[name] = one  # type: ignore[assignment]  # narrowed by the conditions
+    return kept
 
 
 def _texts(value: object) -> tuple[str, ...]:

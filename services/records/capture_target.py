@@ -2,14 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from sqlalchemy.orm import Session
 
 from services.records.capture import Capture
 
+OtherColour = Literal["red", "blue"]
+OTHER_COLOURS: tuple[OtherColour, ...] = get_args(OtherColour)
 RowWriter = Callable[[Session, Capture], None]
 Permit = Callable[[], None]
 FRAMES = 4  # of one press: the burst for which the instrument plans
+COLOURS: tuple[OtherColour, ...] = ("red",)  # of one press besides green; blue has 45 times the hazard of green
 
 
 def permit_test_picture() -> None:
@@ -24,6 +28,7 @@ class CaptureTarget:
     rows in the transaction that stores the capture, whose record holds `request`, the reference of the press
     (`IdempotentRequests.reference`). `permit` is called right before the light and raises ConsentMissing
     or ConsentDeclined if the visit does not allow light. `frames`: number of lit frames, 1 to FRAMES.
+    `colours`: other colours of light, of which one frame each is taken.
     """
 
     visit: str | None = None
@@ -35,6 +40,7 @@ class CaptureTarget:
     request: str | None = None
     permit: Permit = permit_test_picture
     frames: int = FRAMES
+    colours: tuple[OtherColour, ...] = COLOURS
 
 
 TEST_PICTURE = CaptureTarget()

@@ -1,5 +1,6 @@
 """Rows of patients: the number of a known or new patient, and the counter of automatic numbers."""
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from device.errors import InputError
@@ -10,19 +11,26 @@ from services.records.schema import CounterRow, PatientRow
 def patient_number(session: Session, prefix: str, number: str | None, made_at: str) -> str:
     """Return the patient's number (None: the next automatic one), creating the patient if new, at `made_at`.
 
-    An unknown number that is known with the `prefix` of the programme before it gets the prefix. InputError for a
-    number in the form of an automatic one with a wrong check digit.
+    An unknown number that is known with a prefix before it gets the prefix: the `prefix` of the programme first, then
+    those that this device used earlier. InputError for a number in the form of an automatic one with a wrong check
+    digit.
     """
     if number is None:
         number = _next_number(session, prefix)
-    elif session.get(PatientRow, number) is None and session.get(PatientRow, prefix + number) is not None:
-        number = prefix + number
-    elif numbering.looks_automatic(prefix, number) and not numbering.has_valid_check_digit(prefix, number):
-        raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
+    elif session.get(PatientRow, number) is None:
+        prefixes = [prefix, *(one for one in session.scalars(select(CounterRow.prefix)) if one != prefix)]
+        known = next((one + number for one in prefixes if session.get(PatientRow, one + number) is not None), None)
+        if known is None and any(_is_mistyped(one, number) for one in prefixes):
+            raise InputError(f"number: {number} is mistyped: its last digit does not fit", "Type the number again.")
+        number = known or number
     if session.get(PatientRow, number) is None:
         session.add(PatientRow(number=number, made_at=made_at))
         session.flush()
     return number
+
+
+def _is_mistyped(prefix: str, number: str) -> bool:
+    return numbering.looks_automatic(prefix, number) and not numbering.has_valid_check_digit(prefix, number)
 
 
 def _next_number(session: Session, prefix: str) -> str:

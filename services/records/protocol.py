@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
-from services.records.capture_target import FRAMES
+from services.records.capture_target import COLOURS, FRAMES, OtherColour
 
 DEFAULT_PROTOCOL = Path(__file__).parent / "protocol.toml"
 CHOOSE_REMEDY = "Choose one of the pictures on the page."
@@ -33,11 +33,13 @@ class Slot(Table):
 class Programme(Table):
     """Settings of the programme.
 
-    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers.
+    `vision_limit`: lowest visual acuity that is not referred; `prefix`: prefix of automatic patient numbers;
+    `device_in_number`: the letters of the device follow the prefix, so that no two devices give the same number.
     """
 
     vision_limit: Vision
     prefix: str = Field(pattern="^[A-Z]{0,4}$")
+    device_in_number: bool = True
     centre_phone: str | None = Field(default=None, max_length=40)
 
 
@@ -45,20 +47,31 @@ class Protocol(Table):
     """Screening protocol: picture slots in their order, permitted reasons why a picture is not possible, programme.
 
     `retakes`: number of permitted retakes of a slot. `frames`: number of frames of one picture; more frames give more
-    light, so less noise, and take longer.
+    light, so less noise, and take longer. `colours`: other colours of light, of which one frame each is taken; blue
+    only if it is listed.
     """
 
     slots: tuple[Slot, ...] = Field(min_length=1, max_length=16)
     reasons: tuple[Reason, ...] = REASONS
     retakes: int = Field(ge=0, le=10)
     frames: int = Field(default=FRAMES, ge=1, le=FRAMES)
+    colours: tuple[OtherColour, ...] = COLOURS
     programme: Programme
 
     @model_validator(mode="after")
     def _slots_differ(self) -> Self:
         if len({slot.id for slot in self.slots}) < len(self.slots):
             raise ValueError("two slots have the same id; give each its own")
+        if len(set(self.colours)) < len(self.colours):
+            raise ValueError("a colour is listed twice; list it once")
         return self
+
+    def for_device(self, letters: str) -> Self:
+        """Return the protocol with the letters of a device behind the prefix of its numbers, if it wants them."""
+        if not self.programme.device_in_number:
+            return self
+        programme = self.programme.model_copy(update={"prefix": self.programme.prefix + letters})
+        return self.model_copy(update={"programme": programme})
 
     def slot(self, id: str) -> Slot:
         """Return the slot with that id; RecordNotFound if there is none."""

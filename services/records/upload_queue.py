@@ -15,13 +15,14 @@ from device.clock import Clock
 from device.errors import DiffuscopeError
 from services.errors import ReceiverUnreachable
 from services.records import row_validation, schema
+from services.records.capture import COLOUR
 from services.records.record_signing import recorded
 from services.records.row_validation import reading_record, without_damaged
 from services.records.schema import CaptureSlotRow, FileRow, UploadRow, VisitRow
 from services.records.storage_errors import storage_errors
 
 STUCK_AFTER = timedelta(days=3)  # an unreachable receiver needs no attention before
-UPLOADED_FILES = ("picture.png", "report.json")  # uploaded files of each capture
+UPLOADED_FILES = ("picture.png", COLOUR, "report.json")  # uploaded files of each capture
 # Same expression as the partial index `visits_to_send`, so that SQLite uses it.
 UNSENT = and_(VisitRow.finished_at.is_not(None), or_(VisitRow.sent.is_(None), VisitRow.sent != VisitRow.finished_at))
 SAME_FINISH = and_(UploadRow.visit == VisitRow.id, UploadRow.finished_at == VisitRow.finished_at)

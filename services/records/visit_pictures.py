@@ -38,7 +38,10 @@ class VisitPictures:
         """
         request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
         if id is None or slot is None:
-            return CaptureTarget(write_rows=self._row_writer(key), request=request, frames=self._protocol.frames)
+            return CaptureTarget(
+                write_rows=self._row_writer(key), request=request, frames=self._protocol.frames,
+                colours=self._protocol.colours,
+            )  # fmt: skip
         visit, protocol_slot = self._get(id), self._protocol.slot(slot)
         if protocol_slot.eye != eye:
             raise InputError(f"{slot} is a picture of {protocol_slot.eye}, not of {eye}", CHOOSE_REMEDY)
@@ -49,7 +52,7 @@ class VisitPictures:
         tries = len(visit.slots[slot].captures)
         return CaptureTarget(
             id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit,
-            self._protocol.frames,
+            self._protocol.frames, self._protocol.colours,
         )  # fmt: skip
 
     def permission(self, id: str | None) -> Permit:

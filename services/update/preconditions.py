@@ -5,7 +5,7 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,6 +33,13 @@ from services.update.rauc import Release
 Version = tuple[int, ...]
 Answer = TypeVar("Answer", bound=BaseModel)
 EXAM_S = 1800.0
+# A Raspberry Pi 5 with the bootloader of 23 September 2024 hung in a tried version, with one of November it did not:
+# home-assistant/operating-system issue 3943.
+MIN_BOOTLOADER = datetime(2024, 11, 1, tzinfo=UTC)
+BOOTLOADER_REMEDY = (
+    "Write Raspberry Pi Imager's Bootloader (Pi 5 family) to another card, start the device with it until the screen "
+    "is green, then start the device with its own card."
+)
 KERNEL_REMEDY = "Get the update that the maker of the device made for cards: it brings its kernel."
 
 
@@ -185,6 +192,19 @@ def refuse_unsuitable(release: Release, compatible: str, runs: str, modules: Pat
         raise UpdateStepMissing(f"version {release.version} needs {release.minimum} or newer, and {runs} runs")
     if not release.has_kernel and _has_modules(modules):
         raise UpdateWrongDevice(f"it has no kernel, and this device runs Linux {os.uname().release}", KERNEL_REMEDY)
+
+
+def refuse_old_bootloader(file: Path) -> None:
+    """Raise UpdateWrongDevice if the bootloader in the EEPROM was built before MIN_BOOTLOADER.
+
+    `file`: its build time in the device tree, big-endian seconds; without the file the computer has none to check.
+    """
+    if not file.exists():
+        return
+    built = datetime.fromtimestamp(int.from_bytes(file.read_bytes()), UTC)
+    if built < MIN_BOOTLOADER:
+        dates = f"of {built:%Y-%m-%d}, and an update needs {MIN_BOOTLOADER:%Y-%m-%d} or newer"
+        raise UpdateWrongDevice(f"the bootloader of the board is {dates}", BOOTLOADER_REMEDY)
 
 
 def _has_modules(modules: Path) -> bool:

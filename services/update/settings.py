@@ -25,6 +25,7 @@ class UpdateSettings(BaseModel):
     restart: tuple[str, ...] = ("systemctl", "reboot")
     instrument: str = "http://127.0.0.1:8000"
     modules: Path = Path("/lib/modules")  # kernel modules of the running version
+    bootloader: Path = Path("/proc/device-tree/chosen/bootloader/build-timestamp")  # of the Raspberry Pi's EEPROM
     lowest_battery: float = Field(default=0.5, ge=0, le=1)
     answer_s: float = Field(default=15.0, gt=0)  # timeout of requests to the instrument
     patience_s: float = Field(

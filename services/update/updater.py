@@ -106,6 +106,7 @@ class Updater:
         settings = self._settings
         preconditions.refuse_while_trying(self._chooser)
         with preconditions.update_lock(settings.folder), self._journal.record_refusals():
+            preconditions.refuse_old_bootloader(settings.bootloader)
             ill, begin_s = self._at_rest(), self._clock.now_s()
             sources.remove_copy(settings.folder)
             self._journal.write(state="fetching", version="", before=self.running_version, share=0.0, ill=ill)

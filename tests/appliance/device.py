@@ -19,7 +19,7 @@ from tests.systemd.machine import CACHE, Machine, leader
 PARTITIONS = {"2": "A", "3": "B"}
 NAMES = {"A": "root-a", "B": "root-b", "boot-a": "boot-a", "boot-b": "boot-b"}
 SLOT_MB, BOOT_MB, DATA_MB = 500, 4, 1600
-FOLDERS = ("captures", "compiled", "update", "journal")
+FOLDERS = ("captures", "compiled", "update", "journal", "network", "timesync", "settings")
 
 # The container shows the host's kernel command line; ours is mounted over it, also in units with their own /proc.
 FIRST = """\

@@ -54,7 +54,7 @@ class Workshop:
         (folder / "tree").mkdir(parents=True)
         (folder / "tree" / "version").write_text(version)
         (folder / "tree" / "noise").write_bytes(random.randbytes(noise_bytes))
-        run("mksquashfs", folder / "tree", folder / "rootfs.img", "-quiet", "-no-progress", "-comp", "lz4")
+        run("mksquashfs", folder / "tree", folder / "rootfs.img", "-quiet", "-no-progress", "-comp", "zstd")
         subprocess.run(["rm", "-r", str(folder / "tree")], check=True)
         (folder / "manifest.raucm").write_text(
             f"[update]\ncompatible={compatible}\nversion={version}\ndescription=updates from {minimum} or newer\n\n"

@@ -27,6 +27,7 @@ CARD = IMAGE / "card"
 NAMES = ["chooser", "boot-a", "boot-b", "root-a", "root-b"]
 GROWN_MB = 7000
 KERNEL = "6.6.31+rpt-rpi-2712"
+PYTHON = dict(re.findall(r"^(\w+)=(.+)$", (IMAGE / "suite").read_text(), re.M))["python"]
 SHIPPED = {
     "fstab": "etc/fstab",
     "repart.conf": "etc/repart.d/50-data.conf",
@@ -37,7 +38,13 @@ SHIPPED = {
 def tree_of(folder: Path, encrypt: str = "n") -> Path:
     """Create a minimal root file system with everything that a card needs; return its path."""
     tree = folder / "tree"
-    for name in ("opt/diffuscope/.venv/lib/python3.11/site-packages", "boot/firmware", "boot/chooser", "data", "proc"):
+    for name in (
+        f"opt/diffuscope/.venv/lib/python{PYTHON}/site-packages",
+        "boot/firmware",
+        "boot/chooser",
+        "data",
+        "proc",
+    ):
         (tree / name).mkdir(parents=True)
     for ours, theirs in SHIPPED.items():
         run("install", "-D", "--mode=644", IMAGE / ours, tree / theirs)

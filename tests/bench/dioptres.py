@@ -11,7 +11,7 @@ from device.calibration.procedure.calibration_sequence import CalibrationJob, Ca
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec
 from device.head import target_placer
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction import Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
@@ -72,5 +72,5 @@ def refracted(spec: InstrumentSpec, found: Calibration, planner: Planner) -> flo
         with SimLight(world).on(Illumination(spec.light.colour)):
             frame = camera.expose(shot).counts.copy()
         seen = refractor.find(frame, camera.expose(shot).counts)
-        errors.append(np.nan if seen is None else seen.sphere_dpt - m_dpt)
+        errors.append(seen.sphere_dpt - m_dpt if isinstance(seen, Refraction) else np.nan)
     return float(np.sqrt(np.mean(np.square(errors))))

@@ -133,11 +133,13 @@ def refraction(folder: Path) -> None:
             stored = score(maker(shot, Recipe("gradient"), refract=False)(shot.counts).picture).pcc
             relaxed = relaxed or {"dB": psnr_db, "PCC": stored}
             estimate_dpt = made.report.refraction_dpt
-            found = np.nan if estimate_dpt is None else -estimate_dpt["sphere"]
+            known = estimate_dpt is not None and estimate_dpt["refused"] is None
+            found = -estimate_dpt["sphere"] if known else np.nan
             errors.append(found - m_dpt)
             losses.append(relaxed["dB"] - psnr_db)
             kept += [stored / relaxed["PCC"]] if abs(m_dpt) == 4 else []
-            timing.row(f"{m_dpt:+.1f}", found, np.nan if estimate_dpt is None else estimate_dpt["sd"], psnr_db, stored)
+            sd_dpt = estimate_dpt["sd"] if known else np.nan
+            timing.row(f"{m_dpt:+.1f}", found, sd_dpt, psnr_db, stored)
     check_at_least("RMS error of M <= 0.12 dpt", -float(np.sqrt(np.mean(np.square(errors)))), -0.12)
     check_at_least("loss of PSNR by the warped PSF <= 0.3 dB", -max(losses), -0.3)
     check_at_least("PCC of the 0 dpt PSF at +-4 dpt >= 0.88 of that at 0", min(kept), 0.88)

@@ -1,4 +1,4 @@
-"""Colour picture for the tests of the viewer: the simulated heads have one colour of light."""
+"""Colour picture for the tests of the viewer, with stronger colours than those of the simulated head."""
 
 import io
 
@@ -23,7 +23,9 @@ def drawn_retina() -> Image.Image:
 
 
 def show_colour_pictures(page: Page) -> None:
-    """Replace every final picture that the page requests by the colour picture."""
-    out = io.BytesIO()
-    drawn_retina().save(out, "png")
-    page.route("**/picture.png", lambda route: route.fulfill(body=out.getvalue(), content_type="image/png"))
+    """Replace every picture in colour that the page requests by the colour picture, and that in green by its green."""
+    colour, green = io.BytesIO(), io.BytesIO()
+    drawn_retina().save(colour, "png")
+    drawn_retina().getchannel("G").save(green, "png")
+    page.route("**/colour.png", lambda route: route.fulfill(body=colour.getvalue(), content_type="image/png"))
+    page.route("**/picture.png", lambda route: route.fulfill(body=green.getvalue(), content_type="image/png"))

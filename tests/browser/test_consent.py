@@ -99,4 +99,6 @@ def test_visit_is_copied_to_usb_drive(open_page: Open, real: Real) -> None:
     expect(page.locator(".film [role=note]")).to_have_text("Copied to USB STICK.")
     (folder,) = real.stick.iterdir()
     assert folder.name == f"{visit['number']}-{visit['id']}"
-    assert {path.name for path in folder.iterdir()} == {"R-centre-1.png", "R-centre-1.json", "visit.json", "SHA256SUMS"}
+    assert {path.name for path in folder.iterdir()} == {
+        "R-centre-1.png", "R-centre-1-colour.png", "R-centre-1.json", "visit.json", "SHA256SUMS",
+    }  # fmt: skip

@@ -414,3 +414,31 @@ def test_viewer_module_is_loaded_on_demand_and_retried(open_page: Open, real: Re
     after_debounce(page)
     take_picture(page)  # properties that were set before the module was loaded take effect
     expect(page.locator("#picture")).to_have_attribute("data-painter", "gl")
+
+
+def test_a_picture_is_in_colour_and_red_free_is_the_one_in_green(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real, reduced_motion="reduce")
+    take_picture(page)
+    wait_until_drawn(page, "colour 0 0")
+    pic, redfree = page.locator("#picture"), page.get_by_role("button", name="Red-free")
+    expect(page.get_by_role("button", name="Colour")).to_have_attribute("aria-pressed", "true")
+    red, green, blue = pixel(pic)
+    assert red > 1.5 * max(green, blue)
+    page.get_by_role("button", name="Zoom in").tap()
+    redfree.tap()
+    wait_until_drawn(page, "red-free 0 0")
+    red, green, blue = pixel(pic)
+    assert red == green == blue > 40
+    expect(pic).to_have_attribute("data-zoom", "1.50")
+    page.get_by_role("button", name="Details").tap()
+    details = page.get_by_role("dialog")
+    expect(details).to_contain_text("green, red, blue (predicted, not measured)")
+    expect(details).not_to_contain_text("one colour of light")
+    for name, file in (("Picture in colour (PNG)", "colour.png"), ("Picture (PNG)", "picture.png")):
+        href = details.get_by_role("link", name=name, exact=True).get_attribute("href") or ""
+        assert href.endswith(f"/{file}")
+    details.get_by_role("button", name="Close").tap()
+    page.keyboard.press("g")
+    wait_until_drawn(page, "colour 0 0")
+    red, green, _ = pixel(pic)
+    assert red > 1.5 * green

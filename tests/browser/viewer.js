@@ -3,7 +3,7 @@
   const { PictureRenderer } = await import(new URL("components/viewer/renderer.js", document.querySelector("script[type=module]").src).href);
   const { openWebgl } = await import(new URL("components/viewer/renderer_webgl.js", document.querySelector("script[type=module]").src).href);
   const { drawLoupe, drawPicture } = await import(new URL("components/viewer/canvas.js", document.querySelector("script[type=module]").src).href);
-  const answer = await fetch("/api/captures/any/picture.png");
+  const answer = await fetch("/api/captures/any/colour.png");
   const picture = await createImageBitmap(await answer.blob());
   const pixels = (source) => {
     const canvas = Object.assign(document.createElement("canvas"), { width: source.width, height: source.height });

@@ -9,6 +9,7 @@ kept/update/            the state of an update
 records/files.json      the content of all of these as read by the code
 records/schema.sql      the tables
 kept-r0006/data/        a data folder of an earlier release, with the schema in its name: captures of one frame
+kept-r0006-burst/data/  another one: captures of four frames in green
 records/files-r0006.json    its content as that release read it
 """
 
@@ -53,7 +54,8 @@ from tests.unit.test_archive import WHO, calibration
 
 KEPT = Path(__file__).parent / "kept"
 # Data folders of earlier releases, by schema.
-EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in ("r0004", "r0005", "r0006")}
+VERSIONS = ("r0004", "r0005", "r0006", "r0006-burst")
+EARLIER = {version: Path(__file__).parent / f"kept-{version}" / "data" for version in VERSIONS}
 SCHEMA = compare.RECORDS / "schema.sql"
 DAY_S = 86400.0
 NOON = datetime(2026, 3, 2, 12, tzinfo=UTC)

@@ -35,7 +35,7 @@ def captures() -> list[dict[str, Any]]:
         log.ask("GET /api/captures", f"/api/captures?before={UNKNOWN_CAPTURE}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{made['id']}")
         log.ask("GET /api/captures/{id}", f"/api/captures/{UNKNOWN_CAPTURE}")
-        for name in ("picture.png", "raw.tiff", "dark.tiff", "report.json", "quick.jpg"):
+        for name in ("picture.png", "colour.png", "raw.tiff", "raw-red.tiff", "dark.tiff", "report.json", "quick.jpg"):
             log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/{name}")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/other.png")
         log.ask("GET /api/captures/{id}/{name}", f"/api/captures/{made['id']}/RAW.TIFF")
@@ -178,7 +178,25 @@ def exports() -> list[dict[str, Any]]:
         log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=str(device.stick)))
         _diary(log)
         _backups(log)
+        _montages(log)
         return log.exchanges
+
+
+def _montages(log: Transcript) -> None:
+    """Record the montage of two fields of view of one eye, and of an eye without pictures."""
+    send, montage = log.instrument.send, "GET /api/visits/{id}/montage/{eye}"
+    picture, visit = f"{montage}/picture.png", send("POST", "/api/visits", json=log.key()).json()["id"]
+    at = f"/api/visits/{visit}"
+    send("PATCH", at, json=log.key(field="consent", value="agreed"))
+    for slot in ("R-centre", "R-nerve"):
+        assert send("POST", "/api/captures", json=log.key(eye="OD", visit=visit, slot=slot)).status_code == 201
+    log.ask(montage, f"{at}/montage/OS", note="no picture of this eye")
+    log.ask(picture, f"{at}/montage/OS/picture.png")
+    until(lambda: send("GET", f"{at}/montage/OD").json()["state"] != "computing")
+    log.ask(montage, f"{at}/montage/OD")
+    log.ask(picture, f"{at}/montage/OD/picture.png", racing=("size",), note="its size follows the measured shift")
+    log.ask(montage, f"/api/visits/{UNKNOWN_VISIT}/montage/OD")
+    log.ask(montage, f"{at}/montage/left")
 
 
 def _backups(log: Transcript) -> None:
@@ -431,7 +449,7 @@ def security() -> list[dict[str, Any]]:
         log.ask("POST /api/visits", json=log.key(), headers={"Origin": "http://eye.local"})
         log.ask("POST /api/visits", content=b"{}", headers=json_type | {"Content-Length": "-1"})
         for operation in operations(device.app.openapi()):
-            path = operation.split(" ")[1].format(id="x", name="x.png")
+            path = operation.split(" ")[1].format(id="x", name="x.png", eye="OD")
             log.ask(operation, path, note="a foreign host name", headers=foreign)
         return log.exchanges
 

@@ -12,7 +12,7 @@ NAMED = (  # names are numbered by first appearance, so that equal names stay eq
     ("visit", r"\b\d{8}T\d{6}-[0-9a-f]{6}\b"),
     ("id", r"\b(?!0{8})[0-9a-f]{16}\b"),
 )
-MEASURED = {"report", "numbers", "verdict", "measured", "found", "x-aim"}  # floats below these keys are measured
+MEASURED = {"report", "numbers", "verdict", "measured", "found", "placed", "x-aim"}  # floats below them are measured
 COUNTS = {"free_bytes", "size_bytes", "space_left", "people_left", "takes_s", "took_s", "left_s", "spent_s"}
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
 MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier

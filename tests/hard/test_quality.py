@@ -66,7 +66,9 @@ def test_flickering_light_is_reported_and_gives_no_refraction(
     flickered = report_of(calibration, np.round(black_dn + (counts - black_dn) * swing[:, None]).astype(np.uint16))
     assert good.quality["banding"] < 0.0013 < flickered.quality["banding"]
     assert any("steady light" in warning for warning in flickered.warnings)
-    assert flickered.refraction_dpt is None
+    assert flickered.refraction_dpt is not None
+    assert flickered.refraction_dpt["sphere"] is None
+    assert flickered.refraction_dpt["refused"] is not None
     assert flickered.quality["resolution_um"] is None
 
 

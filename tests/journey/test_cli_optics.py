@@ -65,7 +65,7 @@ def test_budget_of_a_head_reports_fit_and_misfit(capsys: pytest.CaptureFixture[s
 def test_eye_determines_scale_and_margin(capsys: pytest.CaptureFixture[str]) -> None:
     report = printed(capsys, "--sensor", "quantalux", "--eye-mm", 25, "--pupil-mm", 3)
     assert "28.0 um/px eye of 25 mm" in row(report, "scale on the retina")
-    assert "0.40 mm the iris stays filled within 34.4 deg" in row(report, "pupil margin")
+    assert "0.40 mm the iris stays filled within 25.3 deg" in row(report, "pupil margin")
     assert "OUTSIDE this pupil" in row(report, "ring at the pupil")
     assert "never fills" in row(printed(capsys, "--sensor", "quantalux", "--pupil-mm", 2), "pupil margin")
 

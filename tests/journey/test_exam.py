@@ -26,7 +26,7 @@ from services.records.capture_report import report_as_json
 from tests.journey.asking import live_picture
 
 RAWS = ("raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff")
-FILES = {*RAWS, "dark.tiff", "picture.png", "quick.jpg", "report.json"}
+FILES = {*RAWS, "raw-red.tiff", "dark.tiff", "picture.png", "colour.png", "quick.jpg", "report.json"}
 KEY = "0123456789abcdef"
 
 
@@ -48,11 +48,20 @@ def test_a_press_keeps_a_picture_whose_every_file_reads_back(old_rig: Any) -> No
     assert report["bin"] == 1
     assert [frame["used"] for frame in report["frames"]] == [True] * 4
     assert sum(frame["weight"] for frame in report["frames"]) == pytest.approx(1)
+    channels = {one["name"]: (one["predicted"], one["reason"]) for one in report["channels"]}
+    assert channels == {"green": (False, None), "red": (False, None), "blue": (True, None)}
     assert "photochemical_dose" in report["limits_unchecked"]
-    assert report["dose_j_per_cm2"] == pytest.approx(98.9e-6 * 4 * 0.1, rel=1e-3)  # default radiometry, four exposures
+    dose_j_per_cm2 = (98.9e-6 * 4 + 3.18e-6) * 0.1  # default radiometry: four exposures in green, one in red
+    assert report["dose_j_per_cm2"] == pytest.approx(dose_j_per_cm2, rel=1e-3)
     day = report["dose_24h_j_per_cm2"]  # the reservation is settled, up to rounding
     assert report["dose_j_per_cm2"] <= day["OS"] * (1 + 1e-9) < report["dose_stop_j_per_cm2"]
-    assert report["seconds"]["expose"] == pytest.approx(0.5)
+    assert report["seconds"]["expose"] == pytest.approx(0.6)
+    _, red = read_raw_tiff(old_rig.store.read(kept.id, "raw-red.tiff"))
+    assert red.illumination == Illumination("red")
+    with Image.open(BytesIO(old_rig.store.read(kept.id, "colour.png"))) as picture:
+        assert (picture.mode, picture.info["predicted"], picture.info["simulated"]) == ("RGB", "blue", "true")
+        red_mean, green_mean, blue_mean = np.asarray(picture).mean(axis=(0, 1))
+        assert red_mean > 1.5 * green_mean > 1.2 * blue_mean, "the hue of a fundus"
     with Image.open(BytesIO(old_rig.store.read(kept.id, "picture.png"))) as picture:
         picture.load()
         assert min(picture.size) > 60

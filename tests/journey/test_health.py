@@ -16,6 +16,7 @@ def test_health_lists_every_check_and_a_fault_fails_its_check(old_rig: Any, wait
         "camera", "lamp", "calibration", "captures", "database", "space",
         "battery", "heat", "clock", "speed", "sending", "backup",
         "light_limits",
+        "settings", "power",
     }  # fmt: skip
     old_rig.world.faults.add("camera.missing")
     live_picture(old_rig.exam, 0, wait_s=0.0)

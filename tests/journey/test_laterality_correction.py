@@ -149,13 +149,15 @@ def test_the_export_follows_the_move(rig: Any) -> None:
     answer = rig.request("GET", f"/api/visits/{visit}/export.zip")
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         files = {name.split("/")[1]: archive.read(name) for name in archive.namelist()}
-    assert set(files) == {"L-nerve-1.png", "L-nerve-1.json", "visit.json", "SHA256SUMS"}
+    assert set(files) == {"L-nerve-1.png", "L-nerve-1-colour.png", "L-nerve-1.json", "visit.json", "SHA256SUMS"}
     report = json.loads(files["L-nerve-1.json"])
     assert (report["eye"], report["slot"], report["moved"][0]["from_eye"]) == ("OS", "L-nerve", "OD")
-    with Image.open(io.BytesIO(files["L-nerve-1.png"])) as shown:
-        assert str(shown.info["note"]).startswith("OS ")
-        kept = Image.open(io.BytesIO(rig.store.read(wrong, "picture.png")))
-        assert np.array_equal(np.asarray(shown), np.asarray(kept))
+    for name, of in (("L-nerve-1.png", "picture.png"), ("L-nerve-1-colour.png", "colour.png")):
+        kept = Image.open(io.BytesIO(rig.store.read(wrong, of)))
+        with Image.open(io.BytesIO(files[name])) as shown:
+            assert str(shown.info["note"]).startswith("OS ")
+            assert shown.info.get("predicted") == kept.info.get("predicted")
+            assert np.array_equal(np.asarray(shown), np.asarray(kept))
 
 
 def test_a_changed_note_changes_no_pixel_and_no_mark() -> None:

@@ -52,8 +52,9 @@ def test_an_exported_visit_is_removed_and_brought_back(rig: Rig, ask: Callable[.
     assert may["oldest_day"] == may["newest_day"]
     done = ask("POST").json()
     assert (done["visits"], done["undoable_captures"], done["undoable_bytes"]) == (0, 1, may["size_bytes"])
-    gone = rig.request("GET", picture)
-    assert (gone.status_code, gone.json()["code"]) == (410, "store.removed")
+    for name in ("picture.png", "colour.png", "raw-3.tiff", "raw-red.tiff"):
+        gone = rig.request("GET", f"/api/captures/{capture}/{name}")
+        assert (gone.status_code, gone.json()["code"]) == (410, "store.removed")
     assert rig.request("GET", f"/api/captures/{capture}/quick.jpg").status_code == 200
     checks = {one["name"]: one["ok"] for one in rig.request("GET", "/api/health").json()["checks"]}
     assert checks["captures"]

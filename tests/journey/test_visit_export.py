@@ -56,9 +56,11 @@ def test_the_zip_holds_pictures_reports_and_valid_checksums_and_no_identifying_f
     check(folder)
     names = {path.name for path in folder.iterdir()}
     pictures = {f"R-centre-{number}.{kind}" for number in (1, 2) for kind in ("png", "json")}
+    pictures |= {f"R-centre-{number}-colour.png" for number in (1, 2)}
     assert names == {"visit.json", "SHA256SUMS"} | pictures
     for number, capture in enumerate(visit["slots"]["R-centre"]["captures"], 1):
         assert (folder / f"R-centre-{number}.png").read_bytes() == rig.store.read(capture, "picture.png")
+        assert (folder / f"R-centre-{number}-colour.png").read_bytes() == rig.store.read(capture, "colour.png")
     exported = json.loads((folder / "visit.json").read_text())
     assert exported["fields"] == {"age": 54, "consent": "agreed"}
     assert exported["slots"] == visit["slots"]

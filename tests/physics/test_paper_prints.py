@@ -6,7 +6,7 @@ The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which
 import pytest
 
 from services.lab.paper.bench import Bench
-from services.lab.paper.printed import edge_signs
+from services.lab.paper.edges import edge_signs
 from services.lab.paper.report import EXPERIMENTS
 
 pytestmark = pytest.mark.paper

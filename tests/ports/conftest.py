@@ -16,7 +16,7 @@ from device.clock import Clock, SystemClock, VirtualClock
 from device.config.head_file import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.drivers.guardian import Guardian
 from device.drivers.pi_camera import PiCamera
-from device.drivers.ring import Apa102Ring
+from device.drivers.ring import Apa102Ring, LedRing, Tlc5971Ring
 from device.drivers.v4l2_camera import V4l2Camera
 from device.head import hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
@@ -55,7 +55,7 @@ class Rig:
         """Turn the lamp off and close all parts."""
         self.light.off()
         self.camera.close()
-        if isinstance(self.light, Apa102Ring):
+        if isinstance(self.light, LedRing):
             self.light.close()
 
 
@@ -106,6 +106,15 @@ def ring_rig() -> Rig:
     return Rig(emulated_camera(emulated_buses(), light), light, SystemClock())
 
 
+def sink_rig() -> Rig:
+    """Return picamera2's camera, lit by TLC5971 drivers over the real spidev on the second emulated bus."""
+    from tests.ports.emulators.wires import SINKS, emulated_buses
+
+    emulated_buses().set_faults()
+    light = Tlc5971Ring(SINKS, Guardian(SINKS.device, chip="tlc5971"), lease_s=30)
+    return Rig(emulated_camera(emulated_buses().sinks, light), light, SystemClock())
+
+
 def emulated_camera(lamp: Callable, light: Light, *, wide: bool = False) -> PiCamera:
     """Return picamera2's camera on a new emulated sensor, which is lit as `lamp` reports."""
     import libcamera
@@ -137,6 +146,7 @@ IMPLEMENTATIONS: dict[str, Callable[[], Rig]] = {
     "picamera2 as on a Pi 4": pi_rig,
     "picamera2 as on a Pi 5": partial(pi_rig, wide=True),
     "picamera2, spidev": ring_rig,
+    "picamera2, spidev, TLC5971": sink_rig,
     "v4l2, GREY": partial(v4l2_rig, "GREY", 8),
     "v4l2, Y10": partial(v4l2_rig, "Y10 ", 10),
     "v4l2, Y12": partial(v4l2_rig, "Y12 ", 12),

@@ -15,6 +15,7 @@ from tests.ports.conftest import small_head
 from tests.ports.emulators.memory import MemoryAllocator
 from tests.ports.emulators.sensor import Sensor
 from tests.ports.emulators.timeline import Timeline
+from tests.raspberry_pi import IMX708_LOWEST_GAIN
 
 SHOT = ExposureSettings(0.02)
 PATIENCE_S = 2.0  # the first frame of a camera took more than 0.2 s on a busy machine
@@ -124,3 +125,24 @@ def test_a_stalled_camera_is_reopened_once_and_then_raises_camera_stalled(bench)
 
 def test_row_padding_does_not_reach_the_counts(bench):
     assert bench.open().expose(SHOT).counts.max() < 0xA5A5 >> 4
+
+
+def test_a_sensor_whose_lowest_gain_is_above_one_gives_frames(bench):
+    """Defect 13: an IMX708 begins at 1.123, which was never the gain that was asked for."""
+    bench.sensor.lowest_gain = IMX708_LOWEST_GAIN
+    assert bench.open().expose(SHOT).counts.mean() > 0
+
+
+def test_a_colour_sensor_where_a_monochrome_one_is_expected_is_refused(bench):
+    bench.sensor.arrangement = 0
+    with pytest.raises(CameraMismatch, match=r"has colour filters \(RGGB\)") as caught:
+        bench.open()
+    assert "bayer = true" in caught.value.remedy
+
+
+def test_an_expected_mosaic_is_read_as_the_sensor_gives_it(bench):
+    """The raw counts stay those of the sensor; `reconstruct --bayer` takes them apart."""
+    bench.sensor.arrangement = 0
+    camera = bench.open(bayer=True)
+    assert camera.facts == {"sensor": "imx296", "format": "SRGGB12", "mosaic": "RGGB"}
+    assert camera.expose(SHOT).counts.shape == camera.shape

@@ -33,9 +33,26 @@ CORRECTED = {
     "moved": [{"from_eye": "OS", "from_slot": "L-centre", "eye": "OD", "at": "2026-03-02T12:16:00+00:00", "by": None}],
     "confirmed": {"eye": "OD", "at": "2026-03-02T12:17:00+00:00", "by": "tablet 2"},
 }
+FRAMES = {
+    "frames": [{"index": 0, "used": True, "shift_px": [0.0, 0.0], "weight": 1.0, "reason": None}],
+    "channels": [{"name": "red", "shift_px": None, "predicted": False, "reason": "no PSF in red light"}],
+}
+ORIGIN = {
+    "device": {
+        "uuid": "5cfb0f4e-7a59-4c36-9d8b-6f4c6f1a2b3c", "serial": "10000000a1b2c3d4", "software": "0.2.0",
+        "head": "Simulated head", "calibration_id": "81d7eff650299a58", "calibrated_at": None, "clock": "not_set",
+    },
+}  # fmt: skip
+FIGURES = (
+    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
+)  # fmt: skip
+CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
+REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
     SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | REFUSED,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER,
 ]  # fmt: skip
 KEYS = sorted(RELEASES[-1])
 
@@ -96,11 +113,12 @@ def test_the_report_of_each_release_is_read_and_missing_entries_have_their_defau
     if "laterality" not in stored:
         assert (report.laterality, report.budget_s) == (default.laterality, default.budget_s)
     assert (report.moved != (), report.confirmed is not None) == ("moved" in stored, "confirmed" in stored)
+    assert (report.device is not None) == ("device" in stored)
 
 
 def test_an_empty_report_has_every_default_and_no_correction() -> None:
     assert read_report({}) == CaptureReport()
-    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED)
+    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED) - set(FRAMES) - set(ORIGIN)
 
 
 @given(stored_reports(), st.sampled_from(["R-nerve", "L-nerve"]))

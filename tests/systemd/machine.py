@@ -145,11 +145,11 @@ def installed(opt: Path) -> list[str]:
 
 
 @contextmanager
-def booted(folder: Path) -> Iterator[Machine]:
-    """Yield a machine with our units installed as systemd/README.md says; its changes are discarded at the end."""
+def booted(folder: Path, *more: str) -> Iterator[Machine]:
+    """Yield a machine with our units installed as in systemd/README.md, with nspawn options `more`; nothing is kept."""
     opt = folder / "opt"
     opt.mkdir()
-    with boot_tree(root(), folder / "console", *installed(opt)) as machine:
+    with boot_tree(root(), folder / "console", *installed(opt), *more) as machine:
         _install(machine)
         yield machine
 

@@ -18,12 +18,13 @@ from tests.systemd.machine import UNIT, Blanked, Machine, booted
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
 
 LAMP = ["--device", "/dev/spidev0.0"]
+BUS = "--bind=/dev/null:/dev/spidev0.0"  # nothing writes to it: the recorder ends before
 ASK = "import urllib.request as u; print(u.urlopen('http://127.0.0.1:8000{}', timeout=60).read().decode())"
 
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    with booted(tmp_path_factory.mktemp("machine")) as machine:
+    with booted(tmp_path_factory.mktemp("machine"), BUS) as machine:
         yield machine
 
 
@@ -35,13 +36,13 @@ def running(machine: Machine) -> Machine:
     return machine
 
 
-def blanked_after(machine: Machine, end_s: float, why: str) -> Blanked:
+def blanked_after(machine: Machine, end_s: float, why: str, patience_s: float = 30.0) -> Blanked:
     """Return the first run of the blanker after `end_s` for reason `why`; print the delay."""
 
     def answers() -> list[Blanked]:
         return [one for one in machine.blanked() if one.at_s > end_s and one.why == why]
 
-    machine.until(lambda: bool(answers()))
+    machine.until(lambda: bool(answers()), patience_s)
     first = answers()[0]
     assert first.words == LAMP
     print(f"{why}: dark {1000 * (first.at_s - end_s):.0f} ms later")  # noqa: T201  # figure quoted in the README
@@ -65,7 +66,7 @@ def test_blanker_runs_before_the_instrument(running: Machine) -> None:
     first = running.blanked()[0]
     started_us = int(running.show(UNIT, "ExecMainStartTimestampMonotonic")[0])
     assert first.at_s < started_us / 1e6
-    assert first.words == LAMP
+    assert first.words == [*LAMP, "--insist"]
 
 
 def test_instrument_runs_unprivileged_and_without_network(running: Machine) -> None:
@@ -117,7 +118,7 @@ def test_udev_rule_mounts_and_unmounts_a_usb_drive(machine: Machine) -> None:
 
 def test_idle_instrument_feeds_the_watchdog(running: Machine) -> None:
     pid = running.main_pid()
-    time.sleep(12)  # longer than WatchdogSec
+    time.sleep(32)  # longer than WatchdogSec
     assert running.main_pid() == pid
     assert running.show(UNIT, "NRestarts") == ["0"]
 
@@ -125,8 +126,8 @@ def test_idle_instrument_feeds_the_watchdog(running: Machine) -> None:
 def test_hung_instrument_is_killed_blanked_and_restarted(running: Machine) -> None:
     pid = running.main_pid()
     hung_s = running.signal(SIGSTOP)
-    blanked = blanked_after(running, hung_s, "watchdog")
-    assert 7 < blanked.at_s - hung_s < 11  # WatchdogSec minus one beat, plus up to 1 s on a busy machine
+    blanked = blanked_after(running, hung_s, "watchdog", 45)
+    assert 27 < blanked.at_s - hung_s < 31  # WatchdogSec minus one beat, plus up to 1 s on a busy machine
     running.until(lambda: running.show(UNIT, "ActiveState") == ["active"], 60)
     assert running.main_pid() not in (0, pid)
     assert "watchdog" in running.journal()

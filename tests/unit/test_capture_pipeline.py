@@ -1,7 +1,8 @@
 """Capture pipeline by itself, in virtual time: exposure, verdict, steps of the reconstruction, record, live picture."""
 
+from collections.abc import Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,18 +10,18 @@ import pytest
 
 from device.clock import VirtualClock
 from device.config.head_file import load_head
-from device.errors import CameraMissing, LightFault
+from device.errors import CameraMissing, CameraStalled, LightFault
 from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
-from device.recon.reconstructor import RoundDone, StageResult
+from device.recon.reconstructor import RoundDone, StageResult, Step
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Reconstruction
+from device.values import Colour, ExposureSettings, Frame, Illumination, Reconstruction
 from services.instrument.capture import ExposedCapture, Press
-from services.instrument.capture_pipeline import CapturePipeline
+from services.instrument.capture_pipeline import NO_PSF, CapturePipeline, expose
 from services.records.capture_target import CaptureTarget
 from tests.journey.conftest import SMALL_HEAD
 from tests.property.exam_sequences import ROUND_S, ROUNDS, TINY, Conditions, PlainFeedback, TinyReconstructor
@@ -129,3 +130,64 @@ def test_a_live_picture_is_exposed_in_the_aiming_colour(bench: Bench) -> None:
     assert jpeg[:2] == b"\xff\xd8"
     assert aim.code == "noeye"
     assert bench.world.illumination is None
+
+
+class NoColours:
+    """Reconstruction of other colours of a head whose calibration has none."""
+
+    others: tuple[Colour, ...] = ()
+
+    def steps(self, green: Iterator[Step], *_: object, **__: object) -> Iterator[Step]:
+        return green
+
+
+class FailsInRed:
+    """Camera that stalls while the lamp is red."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._camera, self._world = bench.head.camera, bench.world
+        self.shape = self._camera.shape
+
+    def prepare(self, shot: ExposureSettings) -> None:
+        self._camera.prepare(shot)
+
+    def expose(self, shot: ExposureSettings) -> Frame:
+        glow = self._world.illumination
+        if glow is not None and glow.colour == "red":
+            raise CameraStalled("no frame came")
+        return self._camera.expose(shot)
+
+
+def test_other_colours_are_taken_between_the_lit_and_the_dark_frame_and_their_dose_counts(bench: Bench) -> None:
+    head = bench.head
+    green = expose(head, ("OD",), bench.clock, count=2)
+    both = expose(head, ("OD",), bench.clock, count=2, colours=["red"])
+    assert [frame.illumination for frame in both.lit] == [Illumination("green")] * 2
+    assert both.colours["red"].illumination == Illumination("red")
+    assert both.dark.illumination is None
+    numbers = [frame.number for frame in (*both.lit, both.colours["red"], both.dark)]
+    assert numbers == sorted(numbers)
+    red_j_per_cm2 = head.light.hazard.dose_j_per_cm2(Illumination("red"), head.spec.camera.exposure_s)
+    assert both.dose_j_per_cm2 - green.dose_j_per_cm2 == pytest.approx(red_j_per_cm2, rel=1e-3)
+    spent = head.light.ledger.spent_j_per_cm2("OD")
+    assert spent == pytest.approx(green.dose_j_per_cm2 + both.dose_j_per_cm2, rel=1e-3)
+    assert bench.world.illumination is None
+
+
+def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) -> None:
+    exposure = expose(replace(bench.head, camera=FailsInRed(bench)), ("OD",), bench.clock, count=3, colours=["red"])
+    assert (len(exposure.lit), dict(exposure.colours)) == (3, {})
+    assert exposure.missing == {"red": "no frame came"}
+    assert exposure.dark.illumination is None
+    assert bench.world.illumination is None
+
+
+def test_a_colour_without_a_psf_is_not_lit_and_its_reason_kept(bench: Bench) -> None:
+    with_colours = CapturePipeline(
+        bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, PlainFeedback(),
+        colours=NoColours(),
+    )  # fmt: skip
+    exposure = with_colours.expose("OD", colours=["red"])
+    assert (dict(exposure.colours), exposure.missing) == ({}, {"red": NO_PSF})
+    assert bench.pipeline.expose("OD", colours=["red"]).missing == {}, "a pipeline of one colour by design"
+    assert bench.world.frames == 4

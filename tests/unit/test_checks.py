@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from device.errors import BusFault, CameraMissing, HeadMismatch, StoreFull
 from services.health.checks import CHECKS, StatusSnapshot, run_checks
+from services.health.collector import read_throttled_bits
 from services.health.probe import table
 from services.records.recovery_report import RecoveryReport
 
@@ -15,8 +17,8 @@ SPEED = [check.__name__ for check in CHECKS].index("speed")
 NOON = datetime(2026, 11, 21, 12, tzinfo=UTC)
 HEALTHY = StatusSnapshot(
     state="aim", problem=None, lamp_is_dark=True, calibration=None, store=None, captures_left=400, people_left=100,
-    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock_was_set=False,
-    newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0),
+    battery=0.8, emptiest=0.05, head_c=31.0, warmest_c=55.0, computer_c=62.0, now=NOON, clock="not_set",
+    newest=datetime(2026, 11, 20, tzinfo=UTC), presses=[(1.5, -3.5)] * 100, unsent=(4, 0), throttled_bits=0xE0000,
     unsaved_since=datetime(2026, 11, 14, 12, tzinfo=UTC),
 )  # fmt: skip
 FAULTS: list[tuple[str, dict[str, Any]]] = [
@@ -40,6 +42,10 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("database", {"recovery": RecoveryReport(conflicts=["v"])}),
     ("database", {"recovery": RecoveryReport(missing=["c"])}),
     ("backup", {"unsaved_since": datetime(2026, 11, 14, 11, tzinfo=UTC)}),
+    ("settings", {"settings_problem": ("diffuscope.toml is not TOML", "Correct the file on the card.")}),
+    ("power", {"throttled_bits": 0x50005}),
+    ("power", {"throttled_bits": 0x10000}),
+    ("power", {"throttled_bits": 0x4}),
 ]
 
 
@@ -96,3 +102,26 @@ def test_missing_parts_of_a_head_are_no_failure() -> None:
 def test_an_update_is_judged_by_checks_of_the_release_only() -> None:
     names = {check.name for check in run_checks(HEALTHY) if check.of_release}
     assert names == {"camera", "lamp", "calibration", "captures"}
+
+
+@pytest.mark.parametrize(
+    ("content", "bits"), [("50005", 0x50005), ("0\n", 0), ("", None), ("nonsense", None), (None, None)]
+)
+def test_the_state_of_the_supply_is_read_from_the_firmware(
+    tmp_path: Path, content: str | None, bits: int | None
+) -> None:
+    """`soc@107c000000:firmware` is the name of a Raspberry Pi 5, `soc:firmware` that of earlier ones."""
+    if content is not None:
+        (tmp_path / "soc@107c000000/soc@107c000000:firmware").mkdir(parents=True)
+        (tmp_path / "soc@107c000000/soc@107c000000:firmware/get_throttled").write_text(content)
+    assert read_throttled_bits(tmp_path) == bits
+
+
+def test_blue_light_is_named_with_its_hazard() -> None:
+    """Only if the programme lists it."""
+    plain, blue = (
+        next(check for check in run_checks(replace(HEALTHY, takes_blue_light=on)) if check.name == "light_limits")
+        for on in (False, True)
+    )
+    assert "blue" not in plain.value
+    assert "45 times the hazard of green" in blue.value

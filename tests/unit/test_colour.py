@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from device.recon.colour import ChannelName, guided_filter, join_colours, predicted_blue
-from device.values import Image
+from device.recon.colour import guided_filter, join_colours, predicted_blue
+from device.values import ChannelName, Image
 from tests.moving_retina import OTHER_RETINA, RETINA, field, seen
 
 RED = np.asarray(0.6 + 0.4 * RETINA, np.float32)  # less contrast than green, as in a fundus

@@ -7,10 +7,11 @@ import pytest
 from device.config.radiometry import BeamSpec, RadiometrySpec
 from device.errors import LightLimit, SpecError
 from device.light_safety.hazard import LIMITS, Beam, Hazard, light_limits, radiometry, worst_beam
-from device.values import Illumination
+from device.values import Colour, Illumination
 
 # All twelve LEDs at full drive through the paper's optics; retinal irradiance in W/cm2.
 TABLE = {"red": Beam(0.622, 0.301e-3, 1e-3), "green": Beam(0.522, 0.257e-3, 1e-3), "blue": Beam(0.467, 0.635e-3, 1e-3)}
+EVERY_COLOUR: tuple[Colour, ...] = ("red", "green", "blue")
 
 
 @pytest.fixture
@@ -121,3 +122,14 @@ def test_a_damaged_limits_file_raises_spec_error(tmp_path: Path, original: str, 
 def test_a_missing_limits_file_raises_spec_error(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="cannot be read"):
         light_limits(tmp_path / "limits.toml")
+
+
+def test_the_highest_level_of_a_colour_is_permitted_and_a_higher_one_is_not(hazard: Hazard) -> None:
+    for colour in EVERY_COLOUR:
+        level = hazard.highest_level(colour)
+        hazard.refuse(Illumination(colour, level))
+        if level < 1:
+            with pytest.raises(LightLimit):
+                hazard.refuse(Illumination(colour, level + 0.001))
+    assert hazard.highest_level("blue") < 1, "full drive is above the limit"
+    assert hazard.highest_level("red") == 1

@@ -89,7 +89,7 @@ WRONG = {
     "pitch_um = 5.04": ("pitch_um = nan", "camera.pitch_um: Input should be a finite number"),
     "full_well_e = 23000": ("full_well_e = inf", "camera.full_well_e"),
     "iris_um = 3200": ("iris_um = -1", "optics.iris_um"),
-    'colour = "green"': ('colour = "infrared"', "light.colour: Input should be 'red', 'green' or 'blue'"),
+    'colour = "green"': ('colour = "infrared"', "light.colour: Input should be 'red', 'green', 'blue' or 'amber'"),
     "max_on_s = 1.0": ("max_on_s = 3600", "light.max_on_s"),
     "seed = 1": ('seed = "one"', "sim.seed"),
 }

@@ -27,6 +27,8 @@ def designs() -> Iterator[tuple[str, Design]]:
     for name, sensor in known_sensors().items():
         yield name, design_of_sensor(PATH, sensor)
     for head in sorted((HARDWARE / "heads").glob("*.toml")):
+        if load_head(head).optics is None:
+            continue  # a bench without an eye has no light path
         yield f"head-{head.stem}", design_of_head(PATH, load_head(head))
 
 

@@ -85,3 +85,24 @@ def test_pictures_that_cannot_be_joined_are_refused() -> None:
         make_montage([first, np.full_like(first, np.nan)])
     with pytest.raises(FrameError, match="black"):
         make_montage([first, np.zeros_like(first)])
+    with pytest.raises(FrameError, match="1 to 64 pictures, not 0"):
+        make_montage([])
+    with pytest.raises(FrameError, match="8 x 8 pixels shows no vessels"):
+        make_montage([first[:8, :8]])
+    for wrong in (first[0], np.stack([first] * 4, axis=2)):
+        with pytest.raises(FrameError):
+            make_montage([wrong])
+
+
+def test_pictures_in_colour_are_placed_by_their_green_channel_and_keep_their_colour() -> None:
+    first, second = (gaze(WIDE_RETINA, shift, 0, k) for k, shift in enumerate([(0.0, 0.0), (20.0, 60.0)]))
+    joined = make_montage([np.stack([2 * one, one, one / 2], axis=2) for one in (first, second)])
+    assert joined.placed[1].shift_px == pytest.approx((20, 60), abs=0.6)
+    red, green, blue = (joined.picture[..., channel][joined.picture[..., 1] > 0.2] for channel in range(3))
+    assert red == pytest.approx(2 * green, rel=1e-4)
+    assert blue == pytest.approx(green / 2, rel=1e-4)
+
+
+def test_pictures_without_detail_stay_apart() -> None:
+    disc = (gaze(WIDE_RETINA, (0, 0)) > 0).astype(np.float32)
+    assert not make_montage([disc, disc]).placed[1].used

@@ -121,3 +121,65 @@ def test_shifted_photograph_is_dark_outside_its_edge(tmp_path) -> None:
     red = found.reflectance["red"][150]
     assert red[150 + round(8 * PX_PER_DEG)] == pytest.approx(1, abs=0.01)
     assert red[150 - round(12 * PX_PER_DEG)] == 0
+
+
+@pytest.mark.parametrize("eye", ["OD", "OS"])
+def test_a_turned_eye_shows_the_same_retina_and_what_is_beyond_its_field(eye) -> None:
+    sim, lens = SimSpec(object=ObjectSpec(kind="retina", haemorrhages=2)), optics(33.4)
+    turn_px = (5, -31)  # rows, columns: whole pixels, so that both are the same without interpolation
+    turn_deg = (turn_px[1] / PX_PER_DEG, turn_px[0] / PX_PER_DEG)
+    straight = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG)
+    turned = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG, turn_deg)
+    moved = np.roll(straight.reflectance["green"], turn_px, axis=(0, 1))
+    both = ndimage.binary_erosion((moved > 0) & (turned.reflectance["green"] > 0), iterations=6)
+    assert both.sum() > 0.6 * straight.field.sum()
+    # the ends of vessels at the edge of the field of the straight view are continued, which changes their taper
+    assert np.quantile(np.abs(moved - turned.reflectance["green"])[both] / moved[both], 0.99) < 0.01
+    assert (turned.reflectance["green"] > 0).sum() == (straight.reflectance["green"] > 0).sum()
+    assert straight.disc is not None
+    assert turned.disc == pytest.approx((straight.disc[0] + turn_px[0], straight.disc[1] + turn_px[1]))
+
+
+def test_cut_retina_is_dark_above_and_below_and_unchanged_inside() -> None:
+    whole, cut = seen(), seen(cut_deg=(40.0, 20.0))
+    rows = whole.field.shape[0]
+    deep = np.abs(np.arange(rows) - (rows - 1) / 2) < 10 * PX_PER_DEG - 1
+    beyond = np.abs(np.arange(rows) - (rows - 1) / 2) > 10 * PX_PER_DEG + 1
+    for colour, plane in whole.reflectance.items():
+        assert (cut.reflectance[colour][deep] == plane[deep]).all()
+        assert cut.reflectance[colour][beyond].max() == 0
+    assert cut.field.sum() < whole.field.sum()
+    assert not cut.vessels[~cut.field].any()
+    assert (cut.disc, cut.fovea) == (whole.disc, whole.fovea)
+
+
+@pytest.mark.parametrize("size", [(3, 200), (200, 3), (64, 64), (1, 1)])
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16", "I", "F"])
+def test_photograph_of_any_shape_and_depth_keeps_its_brightness(tmp_path, size, mode) -> None:
+    """Half of white in every mode but "1": within the rounding of 8 bits and of a CMYK conversion."""
+    path = tmp_path / "even.tif"
+    if mode in ("I;16", "I", "F"):
+        half = {"I;16": np.uint16(32768), "I": np.int32(32768), "F": np.float32(0.5)}[mode]
+        values = np.full(size[::-1], half)
+        values.flat[0] = 1.0 if mode == "F" else half
+        Pictures.fromarray(values).save(path)
+        level = 1.0 if mode == "F" and size == (1, 1) else 0.5
+    else:
+        Pictures.new("RGB", size, (128, 128, 128)).convert(mode).save(path)
+        level = None if mode == "1" else 0.5
+    for cut_deg in (None, (30.0, 20.0)):
+        found = seen(kind="image", image=path, cut_deg=cut_deg)
+        middle = [float(plane[150, 150]) for plane in found.reflectance.values()]
+        assert np.isfinite(middle).all()
+        if level is not None and size != (1, 1) and 3 not in size:
+            assert middle == pytest.approx([level] * 3, abs=0.02)
+
+
+def test_photograph_with_a_cut_keeps_its_shape(tmp_path) -> None:
+    """3:2, a square in its middle: it stays a square, and is as wide as the photograph's width says."""
+    picture = np.zeros((200, 300), np.uint8)
+    picture[75:125, 125:175] = 255
+    Pictures.fromarray(picture).save(tmp_path / "square.png")
+    green = seen(kind="image", image=tmp_path / "square.png", cut_deg=(30.0, 20.0)).reflectance["green"] > 0.5
+    rows, cols = np.flatnonzero(green.any(axis=1)), np.flatnonzero(green.any(axis=0))
+    assert len(rows) == len(cols) == pytest.approx(30 * PX_PER_DEG * 50 / 300, abs=2)

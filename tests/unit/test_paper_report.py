@@ -50,11 +50,27 @@ def test_number_that_is_not_reproduced_is_not_counted_as_held() -> None:
     assert not missed.holds
     assert "1 of 1 assertions hold; numbers of the paper that are not reproduced: 1. These are marked." in page
     assert '<a href="#X1">X1</a> A &lt;made up&gt; title <b class=open>not reproduced</b>' in page
-    assert "<td>not reproduced</td><td>SSIM .59</td>" in page
+    assert "<td>not reproduced</td><td>SSIM .59</td><td><b class=label-not-reproduced>not reproduced</b></td>" in page
     assert "NR" in table(both)
     assert all_hold(both), "it is known, so the command does not fail"
     assert attempted("SSIM", 0.6, 0.49, 0.69, "SSIM .59").status == "holds"
     assert attempted("SSIM", float("nan"), 0.49, 0.69, "SSIM .59").status == "not reproduced"
+
+
+def test_every_row_has_a_label_and_the_reason_of_its_limit_or_a_star() -> None:
+    rows = (
+        above("a", 0.9, 0.88, "said"), above("b", 0.9, 0.88), above("c", 0.9, 0.88, "said").put_in("given"),
+        above("d", 0.9, 0.88).limit_from("half a pixel"), attempted("e", 0.1, 0.4, 0.6, ".5").because("no figure"),
+    )  # fmt: skip
+    assert [claim.label for claim in rows] == ["as written", "ours", "put in", "ours", "not reproduced"]
+    page = html(ran(*rows), 1)
+    assert "Labels of the 5 rows: 1 as written, 1 put in, 1 not reproduced, 2 ours." in page
+    assert "&gt; 0.88<small>half a pixel</small>" in page
+    assert page.count("&gt; 0.88&nbsp;*") == 3
+    assert "<b class=label-not-reproduced>not reproduced</b><small>no figure</small>" in page
+    adapted = Experiment("X1", "t", "s", "p", lambda bench: Outcome(rows), "a drawn retina").labelled(Outcome(rows))
+    assert [claim.label for claim in adapted.claims] == ["adapted", "ours", "put in", "ours", "not reproduced"]
+    assert adapted.claims[0].why == "a drawn retina"
 
 
 def test_page_is_self_contained_and_escapes_its_texts() -> None:
@@ -88,7 +104,7 @@ def test_report_of_one_experiment_is_written(tmp_path) -> None:
     progress = []
     found = run_experiments(tmp_path / "new", VirtualClock(), progress.append, ["N"])
     assert [one.experiment.key for one in found] == ["N"]
-    assert progress == ["N: 10 of 10 assertions hold"]
+    assert progress == ["N: 8 of 8 assertions hold"]
     assert "The paper&#x27;s numbers" in (tmp_path / "new" / "report.html").read_text()
 
 

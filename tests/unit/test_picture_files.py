@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from device.errors import FrameError, SettingError
 from device.values import EYES, Illumination
-from services.imaging.picture_files import MARK, raw_tiff, read_raw_tiff, to_jpeg, to_png
+from services.imaging.picture_files import MARK, raw_tiff, read_png, read_raw_tiff, to_jpeg, to_png
 from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metadata
 
 SHAPES = [(120, 160), (270, 480), (600, 600), (1080, 1920), (480, 270), (100, 130), (500, 130), (270, 480, 3)]
@@ -113,6 +113,19 @@ def test_the_window_ignores_the_dark_around_and_single_hot_pixels() -> None:
     assert np.abs(shown - alone)[80:120, 20:90].max() <= 2
 
 
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_stored_picture_is_read_as_light_without_its_mark(simulated: bool) -> None:
+    picture = np.full((200, 300), 0.5, np.float32)
+    picture[:2, :2] = [[0.1, 0.9], [0.1, 0.9]]  # the window
+    light = read_png(to_png(np.repeat(picture[..., None], 3, axis=2), simulated))
+    assert light.shape == (200, 300, 3)
+    assert light[:2, 1].min() > 0.99
+    even = light[100, 150]
+    assert (light[-4:, :10] == 0).all() == simulated
+    assert np.ptp(even) == 0
+    assert (np.abs(light[2:150] - even) < 1e-6).all()
+
+
 def test_neutral_stays_neutral() -> None:
     shown = pixels_of(to_png(np.repeat(retina((60, 80))[..., None], 3, axis=2), simulated=False))
     assert (shown == shown[..., :1]).all()
@@ -198,7 +211,7 @@ def test_a_raw_frame_is_a_tiff_that_others_read_and_is_made_smaller() -> None:
     assert read_raw_tiff(data)[1] == RawMetadata(simulated=True)
 
 
-@pytest.mark.parametrize(("release", "files"), [("kept", 25), ("kept-r0004", 10)], ids=("kept", "kept-r0004"))
+@pytest.mark.parametrize(("release", "files"), [("kept", 30), ("kept-r0004", 10)], ids=("kept", "kept-r0004"))
 def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(release: str, files: int) -> None:
     stored = sorted((KEPT / release / "data" / "captures").glob("[0-9]*/*.tiff"))
     assert len(stored) == files
@@ -206,7 +219,8 @@ def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(
         with tifffile.TiffFile(path) as tiff:
             written = tiff.pages.first.description
         metadata = read_raw_tiff(path.read_bytes())[1]
-        assert metadata.illumination == (Illumination("green") if path.name.startswith("raw") else None)
+        glow = Illumination("red" if path.name == "raw-red.tiff" else "green")
+        assert metadata.illumination == (glow if path.name.startswith("raw") else None)
         assert metadata.id == path.parent.name
         assert metadata_text(metadata) == written
 

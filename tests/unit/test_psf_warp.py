@@ -6,7 +6,7 @@ import pytest
 from device.clock import VirtualClock
 from device.errors import SettingError
 from device.recon.estimation.psf_warp import InterpolatedOtf, transform, warped
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction import NoRefraction, RefractionEstimator
 from device.recon.estimation.shading import Shading
 from device.recon.model.forward_model import Model, otf
 from device.recon.model.grid import Grid
@@ -85,8 +85,9 @@ def test_restoring_the_stored_otf_restores_the_picture(method: str) -> None:
 def test_a_frame_without_structure_has_no_refraction() -> None:
     cal = scenes.calibration(PSF.pixels, geometry=GEOMETRY, field_deg=20.0, sensor=Sensor(gain_e_per_dn=5.0))
     refractor = RefractionEstimator(cal, SHAPE, scenes.PLANNER, 0)
-    assert refractor.find(np.zeros(SHAPE, np.uint16)) is None
-    assert refractor.find((np.random.default_rng(1).poisson(2500, SHAPE) // 5).astype(np.uint16)) is None
+    assert isinstance(refractor.find(np.zeros(SHAPE, np.uint16)), NoRefraction)
+    noise = (np.random.default_rng(1).poisson(2500, SHAPE) // 5).astype(np.uint16)
+    assert isinstance(refractor.find(noise), NoRefraction)
 
 
 def test_refraction_is_refused_without_geometry_or_field() -> None:

@@ -9,10 +9,10 @@ import jsonschema_rs
 import pytest
 
 from device.light_safety.dose_report import DoseReport
-from device.values import Report
+from device.values import ChannelUse, Report
 from services.lab import report_schema
 from services.lab.reconstruct_file import FileReport
-from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection
+from services.records.capture import CaptureReport, EyeConfirmation, EyeCorrection, RecordOrigin
 from services.records.capture_report import report_as_json
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -41,12 +41,15 @@ def test_every_key_of_every_report_has_a_description() -> None:
     schema = report_schema.report_schema()
     assert list(described(schema)) == []
     light = DoseReport(limits_unchecked=("photochemical_dose",))
-    full = CaptureReport(light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation())
+    made = Report("none", channels=(ChannelUse("green", (0.0, 0.0)),))
+    full = CaptureReport(
+        made, light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation(), device=RecordOrigin()
+    )
     properties = schema["properties"]
     assert isinstance(properties, dict)
     files = {one.name for one in fields(FileReport)}
     assert set(properties) == files | {*report_as_json(full), "simulated"}
-    assert schema["required"] == [one.name for one in fields(Report) if one.name != "frames"]
+    assert schema["required"] == [one.name for one in fields(Report) if one.name not in report_schema.LATER]
 
 
 @pytest.mark.parametrize("file", KEPT, ids=lambda path: f"{path.parents[3].name}-{path.parent.name}")

@@ -21,6 +21,11 @@ BAD = {  # text added to a scene, and the required words of the error
         f'[sim.object]\nimage = "{(SCENES / "healthy.toml").as_posix()}"',
         ("sim.object", 'kind = "image"', '"retina"'),
     ),
+    "a cut ruler": (
+        '[sim.object]\nkind = "ruler"\ncut_deg = [40, 30]',
+        ("sim.object", "cut_deg", '"retina" or "image"', '"ruler"'),
+    ),
+    "an empty cut": ("[sim.object]\ncut_deg = [40, 0]", ("sim.object.cut_deg", "above 0", "below 120")),
     "a tiny pupil": ("[sim.eye]\npupil_um = 200", ("sim.eye.pupil_um", "200", "at least 1000", "at most 9000")),
     "a pupil beside the iris": (
         "[sim.eye]\npupil_um = 2000\ndecentred_um = 4000",

@@ -276,3 +276,21 @@ def test_a_still_eye_gives_equal_frames():
     moving, frames = lit_frames(0.05)
     assert moving.eyes.drift_px == 0
     assert all(np.array_equal(frames[0], frame) for frame in frames)
+
+
+def test_a_simulated_eye_turns_its_disc_into_the_middle_for_the_field_of_the_nerve():
+    eyes = World(small_head(), VirtualClock())
+    for eye in ("OD", "OS"):
+        eyes.present_eye(eye, "centre")
+        straight, light = eyes.retina.disc, eyes.electrons_per_s("green")
+        eyes.present_eye(eye, "nerve")
+        middle = (np.array(eyes.retina.field.shape) - 1) / 2
+        assert np.hypot(*(np.array(eyes.retina.disc) - middle)) < 0.01
+        assert np.hypot(*(np.array(straight) - middle)) > 9 * eyes.geometry.px_per_deg
+        assert not np.array_equal(eyes.electrons_per_s("green"), light)
+
+
+def test_a_screen_does_not_turn_to_a_fixation_target():
+    screen = World(small_head(object=ObjectSpec(kind="point")), VirtualClock())
+    screen.present_eye("OD", "nerve")
+    assert screen.eyes.turn_deg == (0.0, 0.0)

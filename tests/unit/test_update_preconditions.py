@@ -2,12 +2,20 @@
 
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 from threading import Thread
 
 import pytest
 
-from services.errors import UpdateCapturesAtRisk, UpdateDuringExam, UpdateError, UpdateFailed, UpdatePowerLow
-from services.update.preconditions import refuse_while_in_use
+from services.errors import (
+    UpdateCapturesAtRisk,
+    UpdateDuringExam,
+    UpdateError,
+    UpdateFailed,
+    UpdatePowerLow,
+    UpdateWrongDevice,
+)
+from services.update.preconditions import refuse_old_bootloader, refuse_while_in_use
 
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
 NO_JSON = [b"", b"not JSON", b'{"visits": [', b"\xff\xfe\xfd"]
@@ -84,3 +92,19 @@ def test_an_answer_of_another_form_refuses_the_update_with_a_remedy(name: str, b
         failed_checks(**{name: body})
     assert isinstance(refused.value, UpdateError)
     assert refused.value.remedy == UpdateFailed.default_remedy
+
+
+@pytest.mark.parametrize(("built", "accepted"), [("2024-09-23", False), ("2024-10-31", False), ("2024-11-05", True)])
+def test_an_update_needs_a_bootloader_of_november_2024(tmp_path: Path, built: str, accepted: bool) -> None:
+    file = tmp_path / "build-timestamp"
+    file.write_bytes(int(datetime.fromisoformat(f"{built}T12:00Z").timestamp()).to_bytes(4, "big"))
+    if accepted:
+        refuse_old_bootloader(file)
+        return
+    with pytest.raises(UpdateWrongDevice, match=f"is of {built}") as refused:
+        refuse_old_bootloader(file)
+    assert "Bootloader (Pi 5 family)" in refused.value.remedy
+
+
+def test_a_computer_without_a_bootloader_in_its_device_tree_may_be_updated(tmp_path: Path) -> None:
+    refuse_old_bootloader(tmp_path / "build-timestamp")

@@ -1,6 +1,7 @@
 // Picture area: live preview and taken picture in the same place, without layout shift, and the prompt line below.
 
 import { icon } from "./icons.js";
+import { finalPicture } from "../core/api.js";
 import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
 import { slotLabel, topAlert, alertBar } from "./components.js";
 import { html } from "../vendor/lit-html.js";
@@ -37,11 +38,11 @@ export function pictureArea(state, actions) {
           aria-label=${pictureName(state, shot)}
           .head=${state.status}
           .subject=${shot?.key ?? null}
-          .redfree=${state.redfree}
+          .redfree=${state.redfree && !shot?.capture?.links.colour}
           .brightness=${state.brightness}
           .contrast=${state.contrast}
           .loupe=${state.loupe}
-          .src=${sourceOf(shot)}
+          .src=${sourceOf(shot, state.redfree)}
           @drawn=${actions.pictureDrawn}
           @fault=${actions.pictureFault}
           @zoomed=${actions.zoomed}
@@ -53,8 +54,8 @@ export function pictureArea(state, actions) {
   `;
 }
 
-function sourceOf(shot) {
-  if (shot?.capture) return { url: shot.capture.links.picture, mark: "final" };
+function sourceOf(shot, redfree) {
+  if (shot?.capture) return finalPicture(shot.capture, redfree);
   return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
 }
 

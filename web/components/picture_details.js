@@ -8,15 +8,35 @@ const dialog = () => document.querySelector("#details");
 export const open = () => dialog()?.showModal();
 const close = () => dialog()?.close();
 
+// A predicted channel was computed from the others; one with a reason is not in the picture.
+function channelText({ name, predicted, reason }) {
+  const colour = t(`colour.${name}`);
+  if (predicted) return t("detail.channels.predicted", { colour });
+  return reason ? t("detail.channels.missing", { colour }) : colour;
+}
+
+const signed = (dpt) => `${dpt < 0 ? "−" : "+"}${number(Math.abs(dpt), 2)}`;
+
+/** Return the refraction of a report as text: sphere / cylinder x axis, or the mean sphere of a report without a cylinder. */
+export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylinder, axis_deg: axis, refused = null }) {
+  if (refused !== null || sphere == null || sd == null) return t("detail.refraction.none");
+  const mean = { mean: signed(sphere), sd: number(sd, 2) };
+  if (cylinder == null) return t("detail.refraction.mean", mean);
+  return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
+}
+
 export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
   const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
   const used = frames.filter((one) => one.used).length;
+  const channels = report.channels ?? [];
   const rows = [
     ["method", report.method],
     ["rounds", report.rounds],
     ["stopped", report.stopped],
     ...(frames.length ? [["frames", t("detail.frames.value", { used, all: frames.length })]] : []),
+    ...(channels.length ? [["channels", channels.map(channelText).join(", ")]] : []),
+    ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
     ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
     ["calibration", calibration],
     ["id", id],
@@ -28,7 +48,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
   return html`<dialog id="details" aria-labelledby="details-title">
     <h2 id="details-title">${t("result.details")}</h2>
     ${(report.warnings ?? []).map((one) => html`<p class="warning">${icon("warn")} ${one}</p>`)}
-    ${grey ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
+    ${grey && !links.colour ? html`<p class="muted">${t("result.grey")}</p>` : nothing}
     <dl>${rows.map(([key, value]) => html`<dt>${t(`detail.${key}`)}</dt><dd>${value}</dd>`)}</dl>
     <p class="links">
       ${visit?.finished_at
@@ -36,7 +56,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
         : html`<button type="button" id="other-eye" @click=${move}>
             ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
           </button>`}
-      ${["picture", "raw", "report"].map((key) => html`<a class="button" href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
+      ${["colour", "picture", "raw", "report"].filter((key) => links[key]).map((key) => html`<a class="button" href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
     </p>
     <button class="primary" type="button" @click=${close}>${t("menu.close")}</button>
   </dialog>`;

@@ -1,6 +1,6 @@
 // User actions by tap or key: one object of handlers that templates and keyboard share.
 
-import { captureFileUrl, fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
+import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, saveSetting, set, currentShot } from "./state.js";
 import { displayNumber, applyKey } from "./numbers.js";
@@ -100,15 +100,8 @@ const examActions = {
   copyTo: visits.copyTo,
 };
 
-// Cache of one source object per capture, so that a render does not reload a picture.
-const finals = new Map();
 
 const pictureActions = {
-  finalSource(id) {
-    if (!finals.has(id)) finals.set(id, { url: captureFileUrl(id, "picture.png"), mark: "final" });
-    return finals.get(id);
-  },
-
   // Show the mark "final" only after the viewer has drawn the final picture.
   pictureDrawn({ detail }) {
     set({ picture: detail.mark, grey: detail.mark === "final" && detail.grey });

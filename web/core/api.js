@@ -29,6 +29,9 @@ async function requestJson(path, options) {
 export const getStatus = () => requestJson("/api/status");
 export const getProtocol = () => requestJson("/api/protocol");
 export const getVisit = (id) => requestJson(`/api/visits/${encodeURIComponent(id)}`);
+const montageUrl = (visit, eye) => `/api/visits/${encodeURIComponent(visit)}/montage/${encodeURIComponent(eye)}`;
+export const getMontage = (visit, eye) => requestJson(montageUrl(visit, eye));
+export const montagePictureUrl = (visit, eye, digest) => `${montageUrl(visit, eye)}/picture.png?${digest}`;
 export const getVisits = (query) => requestJson(`/api/visits?${new URLSearchParams(query)}`);
 export const getCapture = (id) => requestJson(`/api/captures/${encodeURIComponent(id)}`);
 export const getOutbox = () => requestJson("/api/outbox");
@@ -50,9 +53,12 @@ export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) 
   });
 }
 
-/** Request or renew the control lease, which one page holds at a time; `take` takes it from another page. */
+/**
+ * Request or renew the control lease, which one page holds at a time; `take` takes it from another page. A device whose
+ * clock is not set takes the time of this browser.
+ */
 export const requestControl = (take) =>
-  send("POST", "/api/controller", take ? { key: controllerKey(), take } : { key: controllerKey() });
+  send("POST", "/api/controller", { key: controllerKey(), now: new Date().toISOString(), ...(take && { take }) });
 
 /** Release the control lease when the page closes; a beacon is sent even after the page is gone. */
 export const releaseControl = () =>
@@ -104,6 +110,13 @@ function parseAim(header) {
 }
 
 /** Fetch a picture and decode it. */
+/**
+ * Return the source for <eye-pic> of a capture: its picture in colour, or red-free the one in green light. A capture
+ * without a picture in colour has only the latter, and the viewer's own red-free tool.
+ */
+export const finalPicture = ({ links: { picture, colour } }, redfree) =>
+  colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
+
 export async function getBitmap(url, signal) {
   const response = await fetch(url, { signal });
   if (!response.ok) throw new Error(`picture ${response.status}`);

@@ -49,6 +49,7 @@ export const store = createStore({
   note: "",
   picked: Object.freeze([]), // the two captures to compare
   compared: Object.freeze([]), // records of these two captures
+  montages: Object.freeze({}), // of the visit on the pictures screen, by eye
   folders: null, // USB drives for a copy
   zipped: false, // the browser was asked to save a ZIP file
   copied: null,

@@ -1,6 +1,6 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
-import { newIdempotencyKey, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
+import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
 import { eyeOf, get, lostShots, moveShot, set, pendingShots } from "./state.js";
 import { navigate } from "./router.js";
 import { lowerAlerts, raiseAlert } from "./alerts.js";
@@ -26,6 +26,21 @@ function storeVisit(visit) {
 
 /** Reload a visit. */
 export const refreshVisit = (id) => alertOnError(async () => storeVisit(await getVisit(id)));
+
+const MONTAGE_POLL_MS = 2000; // a montage takes some seconds, and waits while the camera is used
+let montagePoll = 0;
+
+/** Load the montage of each eye of the visit on the pictures screen; ask again while one is being computed. */
+export async function refreshMontages(visit) {
+  const isShown = () => get().route.screen === "film" && get().route.visit === visit;
+  const eyes = [...new Set((get().protocol?.slots ?? []).map(({ eye }) => eye))];
+  const answers = await Promise.all(eyes.map(async (eye) => [eye, await alertOnError(() => getMontage(visit, eye))]));
+  if (!isShown()) return;
+  set({ montages: Object.freeze(Object.fromEntries(answers.filter(([, answer]) => answer))) });
+  const waits = answers.some(([, answer]) => answer?.state === "computing");
+  clearTimeout(montagePoll);
+  if (waits) montagePoll = setTimeout(() => isShown() && refreshMontages(visit), MONTAGE_POLL_MS);
+}
 
 /** Load the visits that match the query, and the counts of the day. */
 export async function refreshList(query) {

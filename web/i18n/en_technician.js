@@ -280,6 +280,8 @@ export const TECHNICIAN = {
   "health.sending": "Sending",
   "health.backup": "Backup",
   "health.light_limits": "Light limits",
+  "health.settings": "Settings",
+  "health.power": "Power",
   "health.painter": "Pictures on this tablet are drawn by",
   "health.painter.gl": "the graphics chip",
   "health.painter.2d": "the processor, because the graphics chip is missing or draws wrong",

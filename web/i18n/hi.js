@@ -158,6 +158,7 @@ export const WORDS = {
   "result.details.warn": "विवरण: चेतावनी के साथ",
 
   "tool.plain": "जैसी ली",
+  "tool.colour": "रंगीन",
   "tool.redfree": "लाल रहित",
   "tool.loupe": "लेंस",
   "tool.brightness": "चमक",
@@ -209,6 +210,13 @@ export const WORDS = {
   "compare.swap": "{name} दिखाएँ",
   "film.name.n": "{eye} · {part}, तस्वीर {n}",
   "film.used": "यही मानी गई",
+  "montage.computing": "तस्वीरें जोड़ी जा रही हैं…",
+  "montage.none": "एक ही तस्वीर है: जोड़ने को कुछ नहीं।",
+  "montage.joined": "{n} तस्वीरें जोड़कर एक बनाई गई।",
+  "montage.apart": "नहीं जुड़ीं: तस्वीरें आँख के अलग-अलग हिस्से दिखाती हैं।",
+  "montage.failed": "तस्वीरें नहीं जुड़ सकीं। हर एक को अलग देखें।",
+  "montage.leftout": "दूसरे हिस्से की तस्वीर छोड़ दी गई।",
+  "montage.name": "{eye}: {n} तस्वीरें जोड़कर एक",
 
   "send.title": "भेजना",
   "send.off": "इस यंत्र से कुछ नहीं भेजा जाता। कॉपी या सेव करें।",
@@ -341,4 +349,9 @@ export const WORDS = {
   "say.other": "अब दूसरी आँख।",
   "say.rest": "आँखें बंद करके आराम कीजिए।",
   "say.finished": "हो गया। धन्यवाद।",
+
+  "detail.refraction": "अपवर्तन (केवल शोध के लिए)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
+  "detail.refraction.mean": "औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
+  "detail.refraction.none": "इस तस्वीर में नापा नहीं जा सकता",
 };

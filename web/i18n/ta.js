@@ -167,6 +167,7 @@ export const WORDS = {
   "result.details.warn": "விவரங்கள்: எச்சரிக்கையுடன்",
 
   "tool.plain": "எடுத்தபடி",
+  "tool.colour": "வண்ணம்",
   "tool.redfree": "சிவப்பின்றி",
   "tool.loupe": "லென்ஸ்",
   "tool.brightness": "ஒளிர்வு",
@@ -219,6 +220,13 @@ export const WORDS = {
   "compare.swap": "{name} காட்டு",
   "film.name.n": "{eye} · {part}, படம் {n}",
   "film.used": "இதுவே கணக்கில்",
+  "montage.computing": "படங்கள் இணைக்கப்படுகின்றன…",
+  "montage.none": "ஒரே படம்: இணைக்க எதுவும் இல்லை.",
+  "montage.joined": "{n} படங்கள் ஒன்றாக இணைக்கப்பட்டன.",
+  "montage.apart": "இணையவில்லை: படங்கள் கண்ணின் வெவ்வேறு பகுதிகளைக் காட்டுகின்றன.",
+  "montage.failed": "படங்களை இணைக்க முடியவில்லை. ஒவ்வொன்றாகப் பார்க்கவும்.",
+  "montage.leftout": "வேறு பகுதியின் படம் சேர்க்கப்படவில்லை.",
+  "montage.name": "{eye}: {n} படங்கள் ஒன்றாக இணைந்தவை",
 
   "send.title": "அனுப்புதல்",
   "send.off": "இந்தக் கருவியிலிருந்து எதுவும் அனுப்பப்படுவதில்லை. நகலெடுக்கவும்.",
@@ -353,4 +361,9 @@ export const WORDS = {
   "say.other": "இப்போது மற்றக் கண்.",
   "say.rest": "கண்களை மூடி ஓய்வெடுங்கள்.",
   "say.finished": "முடிந்தது. நன்றி.",
+
+  "detail.refraction": "ஒளிவிலகல் (ஆய்வுக்கு மட்டும்)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
+  "detail.refraction.mean": "சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
+  "detail.refraction.none": "இந்தப் படத்தில் அளக்க முடியாது",
 };

@@ -158,6 +158,7 @@ export const WORDS = {
   "result.details.warn": "వివరాలు: హెచ్చరికతో",
 
   "tool.plain": "తీసినట్టు",
+  "tool.colour": "రంగులో",
   "tool.redfree": "ఎరుపు లేకుండా",
   "tool.loupe": "భూతద్దం",
   "tool.brightness": "వెలుగు",
@@ -209,6 +210,13 @@ export const WORDS = {
   "compare.swap": "{name} చూపించు",
   "film.name.n": "{eye} · {part}, చిత్రం {n}",
   "film.used": "ఇదే లెక్కలో",
+  "montage.computing": "చిత్రాలు కలుపుతున్నాము…",
+  "montage.none": "ఒకే చిత్రం: కలపడానికి ఏమీ లేదు.",
+  "montage.joined": "{n} చిత్రాలు ఒకటిగా కలిశాయి.",
+  "montage.apart": "కలవలేదు: చిత్రాలు కంటి వేర్వేరు భాగాలను చూపుతున్నాయి.",
+  "montage.failed": "చిత్రాలను కలపలేకపోయాము. ఒక్కొక్కటిగా చూడండి.",
+  "montage.leftout": "వేరే భాగం చిత్రం చేర్చలేదు.",
+  "montage.name": "{eye}: {n} చిత్రాలు ఒకటిగా కలిపినవి",
 
   "send.title": "పంపడం",
   "send.off": "ఈ పరికరం నుండి ఏమీ పంపబడదు. కాపీ చేయండి.",
@@ -341,4 +349,9 @@ export const WORDS = {
   "say.other": "ఇప్పుడు రెండో కన్ను.",
   "say.rest": "కళ్ళు మూసుకుని విశ్రాంతి తీసుకోండి.",
   "say.finished": "అయిపోయింది. ధన్యవాదాలు.",
+
+  "detail.refraction": "వక్రీభవనం (పరిశోధన కోసం మాత్రమే)",
+  "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
+  "detail.refraction.mean": "సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
+  "detail.refraction.none": "ఈ చిత్రంలో కొలవడం సాధ్యం కాదు",
 };

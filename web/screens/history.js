@@ -1,7 +1,7 @@
 // History screens: patients of a day, pictures of a patient, comparison of two pictures with synchronised zoom. Loaded
 // on demand.
 
-import { visitZipUrl } from "../core/api.js";
+import { finalPicture, montagePictureUrl, visitZipUrl } from "../core/api.js";
 import { patientList } from "./home.js";
 import { outcomeTexts, reopenButton } from "./outcome.js";
 import { icon } from "../components/icons.js";
@@ -60,6 +60,7 @@ export function film(state, actions) {
       <h2>${t("film.title", { number: displayNumber(visit.number) })}</h2>
       ${visit.outcome ? html`<p>${outcomeTexts(state).filter(Boolean).join(" · ")}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("film.none")}</p>`}
+      ${Object.entries(state.montages).map(([eye, made]) => montage(state, actions, eye, made))}
       <div class="ends">
         ${picked.length === 2
           ? html`<button class="primary" type="button" id="compare" @click=${actions.compare}>${t("film.compare")}</button>`
@@ -101,6 +102,25 @@ function captureItem(state, actions, { slot, id }) {
       ${icon(on ? "check" : "circle")} ${t(on ? "film.picked" : "film.compare")}
     </button>
   </li>`;
+}
+
+/** Montage of one eye: the joined pictures, or the reason why there are none; nothing without pictures of this eye. */
+function montage({ visit }, actions, eye, { state, digest, pictures, placed }) {
+  if (!pictures) return nothing;
+  const used = placed.filter((one) => one.used).length;
+  const text = t(`montage.${state}`, { n: used });
+  const leftOut = state === "joined" && used < pictures ? t("montage.leftout") : "";
+  return html`<figure class="montage" data-eye=${eye} data-state=${state}>
+    <figcaption><b>${t(`eye.${eye}`)}</b> <span aria-live="polite">${text} ${leftOut}</span></figcaption>
+    ${state === "joined"
+      ? html`<eye-pic
+          aria-label=${t("montage.name", { eye: t(`eye.${eye}`), n: used })}
+          .subject=${digest}
+          .src=${{ url: montagePictureUrl(visit.id, eye, digest), mark: "final" }}
+          @fault=${actions.pictureFault}
+        ></eye-pic>`
+      : nothing}
+  </figure>`;
 }
 
 function exportControls({ visit, folders, copied, zipped }, actions) {
@@ -158,9 +178,9 @@ function comparedPicture(state, actions, i) {
       aria-label=${captureLabel(state, id)}
       .head=${status}
       .subject=${id}
-      .redfree=${redfree}
+      .redfree=${redfree && !taken?.links.colour}
       .loupe=${loupe}
-      .src=${actions.finalSource(id)}
+      .src=${taken ? finalPicture(taken, redfree) : null}
       @looked=${actions.linkZoom}
       @loupe=${actions.loupeChanged}
     ></eye-pic>

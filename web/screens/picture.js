@@ -14,7 +14,7 @@ export function picture(state, actions) {
   if (!shot) return html`<div class="card making"><p>${t("mark.opening")}</p></div>`;
   if (state.asking) return html`${reasons(state, actions)} ${tiles(state, actions)}`;
   return html`
-    ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions)} ${tiles(state, actions)}
+    ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions, shot)} ${tiles(state, actions)}
     ${chips(state, actions)}
     <div class="actions">${actionButtons(state, actions, shot)}</div>
     ${shot.capture ? (state.modules.details?.detailsDialog(state, actions, shot) ?? nothing) : nothing}
@@ -98,7 +98,7 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 
 // ---- tools
 
-function tools({ redfree, brightness, contrast, loupe, zoom }, actions) {
+function tools({ redfree, brightness, contrast, loupe, zoom }, actions, { capture }) {
   const step = (tool, label, by) => html`
     <div class="step" role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -113,7 +113,7 @@ function tools({ redfree, brightness, contrast, loupe, zoom }, actions) {
       <div class="pair">
         ${[false, true].map(
           (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => actions.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : "tool.plain")}
+            ${t(on ? "tool.redfree" : capture?.links.colour ? "tool.colour" : "tool.plain")}
           </button>`,
         )}
       </div>

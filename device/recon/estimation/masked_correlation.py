@@ -18,6 +18,7 @@ FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of 
 MOST_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
 LEAST_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
 SECOND_SAMPLES = 8  # distance from the peak at which another one begins
+SECOND_OVERLAP = 0.2  # of another place, as much as a picture needs to be placed
 ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search: at most 1 degree off (NUMERICS.md 11)
 REFINEMENTS = 8  # of shift and rotation; they converge in three or four
 
@@ -84,7 +85,7 @@ class MaskedCorrelator:
         peak = float(correlation[row, col])
         at = int(row), int(col)
         place = self._top(correlation, at, 0), self._top(correlation, at, 1)
-        return Match(place, rotation_deg, peak, _second(correlation, int(row), int(col)), float(overlap[row, col]))
+        return Match(place, rotation_deg, peak, _second(correlation, overlap, at), float(overlap[row, col]))
 
     def _of(self, picture: FlatPicture) -> tuple[NDArray[np.complex128], ...]:
         """Return the spectra of detail, field and squared detail."""
@@ -175,9 +176,15 @@ def rotation_matrix(rotation_deg: float) -> Floats:
     return np.array([[c, -s], [s, c]])
 
 
-def _second(surface: Floats, row: int, col: int) -> float:
-    """Return the highest correlation farther than SECOND_SAMPLES from the peak."""
-    far = surface.copy()
+def _second(surface: Floats, overlap: Floats, peak: tuple[int, int]) -> float:
+    """Return the highest maximum farther than SECOND_SAMPLES from the peak, cyclic; -1 without one.
+
+    The ridge of the peak along a vessel is no second place: it has no maximum of its own. Neither is a place where the
+    pictures have less than SECOND_OVERLAP in common, where high correlations are of chance.
+    """
+    size = 2 * SECOND_SAMPLES + 1
+    is_top = (surface >= ndimage.maximum_filter(surface, size, mode="wrap")) & (overlap > SECOND_OVERLAP)
+    far = np.where(is_top, surface, -1.0)
     reach = np.arange(-SECOND_SAMPLES, SECOND_SAMPLES + 1)
-    far[np.ix_((row + reach) % surface.shape[0], (col + reach) % surface.shape[1])] = -1
+    far[np.ix_((peak[0] + reach) % surface.shape[0], (peak[1] + reach) % surface.shape[1])] = -1
     return float(far.max())

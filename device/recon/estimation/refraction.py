@@ -1,41 +1,62 @@
-"""Estimation of the eye's refraction from the frame: the scale of the stored PSF with the highest likelihood.
+"""Estimation of the eye's refraction from the frame: the stretch of the stored PSF with the highest likelihood.
 
-Defocus scales the PSF about its axis (see `psf_warp`). The fine structure of |H|^2 scales inversely; it modulates the
-power spectrum of every frame. The estimate of M minimises the negative log likelihood E (`refraction_likelihood`,
-NUMERICS.md 7.1):
+Defocus and astigmatism stretch the PSF about its axis (see `psf_warp`). The fine structure of |H|^2 is stretched
+inversely; it modulates the power spectrum of every frame. The estimate minimises the negative log likelihood E over
+mean sphere M, cylinder J0, J45 and the field edge e (`refraction_likelihood`, `refraction_edge`, NUMERICS.md 7):
 
-    E(M) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_M|^2 + s2
+    E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
-|H_M|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
+|H_T|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
 the smooth part is blurred by a fixed PSF, the estimate is biased by one third towards that PSF. The smooth part itself
-(`shading`) is fitted with the stored PSF for the coarse search, and with the PSF found by it for the fine search.
+is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found for each fine search.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.refraction_cylinder import find_cylinder
+from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction_field import FieldEdge
 from device.recon.estimation.refraction_likelihood import RefractionLikelihood
+from device.recon.estimation.refraction_uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import Grid, Pair, support_radius_px
 from device.recon.model.kernels import Pixels, Places
-from device.recon.model.preprocessing import Linear
 from device.values import Calibration
 
 SPAN_DPT = 9.0
-FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of the coarse search
-LEAST_NATS = 150.0  # median minus minimum: the PSF of another head gives 110, retinas at 10 ke- at least 1200
+FRINGES = 0.2  # cycles by which the finest structure of |H|^2 moves between two candidates of a search over M
+COARSE_FRINGES = 0.3  # the same of the coarse search with the edge
+COARSE_PARAMETERS = 1  # of the edge in the coarse search: the radius
+LEAST_NATS = 100.0  # median minus minimum of the coarse search
 LEAST_FREQUENCIES = 500
-UPPER_BIAS_DPT = 0.2  # typical difference between the upper half of the band and the whole band
-DISAGREED_DPT = 3.0  # beyond, the likelihood has several minima, and the stored PSF is used
 SD_PER_MISSING_DPT = 0.4  # times the missing share: saturated frames of 11 eyes were off by 1.4 sd (rms) without it
-GAP_FITS = 3  # of the smooth part: the filling of a narrow gap biases M towards the PSF of the fit
-SD_FACTOR = 1.4  # for the correlation of neighbouring frequencies; with it 23 frames have z scores of rms 1.0
+ROUNDS = 3  # of smooth part, search and edge; a gap needs them, since its filling biases M towards the PSF of the fit
+MOST_ROUNDS = 8  # while the edge moves
+SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the rounds
+MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MOST_ROUNDS the edge was not found
+CURVATURE_STEP_DPT = 0.25
+MOST_SD_DPT = 1.5
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Cylinder of the eye as wavefront in dpt, as J0, J45 and their sds; x runs with the columns, y with the rows."""
+
+    j0_dpt: float
+    j0_sd_dpt: float
+    j45_dpt: float
+    j45_sd_dpt: float
 
 
 @dataclass(frozen=True)
@@ -44,33 +65,30 @@ class Refraction:
 
     The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
     (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
-    the coarse grid. `noise_sd_dpt` is the sd from the noise, with SD_PER_MISSING_DPT times the missing share in
-    quadrature; `disagreement_dpt` is |M of the upper half of the band - M of the full band|.
+    the coarse grid. `edge` is the edge of the lit field that was found with M.
+    `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`.
     """
 
     sphere_dpt: float
+    sd_dpt: float
     psf_scale: float
-    noise_sd_dpt: float
     nats: float
     curve: tuple[tuple[float, float], ...]
-    disagreement_dpt: float = 0.0
-
-    @property
-    def sd_dpt(self) -> float:
-        """Standard deviation of M in dpt: `noise_sd_dpt` and the excess disagreement in quadrature.
-
-        The excess is `disagreement_dpt` above UPPER_BIAS_DPT; it detects a false minimum of the likelihood.
-        """
-        more_dpt = max(0.0, self.disagreement_dpt - UPPER_BIAS_DPT)
-        return float(np.hypot(self.noise_sd_dpt, more_dpt))
+    edge: FieldEdge
+    missing_sd_dpt: float
+    cylinder: Cylinder | None = None
 
     @property
     def in_doubt(self) -> bool:
-        """True if the stored PSF is to be used: M is not significant, or the two parts of the band disagree.
+        """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 `sd_dpt`)."""
+        return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
 
-        That is |M| < max(0.12 dpt, 2 `noise_sd_dpt`), or `disagreement_dpt` > DISAGREED_DPT.
-        """
-        return abs(self.sphere_dpt) < max(0.12, 2 * self.noise_sd_dpt) or self.disagreement_dpt > DISAGREED_DPT
+
+@dataclass(frozen=True)
+class NoRefraction:
+    """The refraction of a frame cannot be determined, for this reason (a sentence without a full stop)."""
+
+    reason: str
 
 
 def can_estimate_refraction(calibration: Calibration) -> bool:
@@ -79,22 +97,26 @@ def can_estimate_refraction(calibration: Calibration) -> bool:
 
 
 class RefractionEstimator:
-    """Estimator of the refraction, planned for one calibration and one sensor shape.
+    """Estimator of refraction and field edge, planned for one calibration and one sensor shape.
 
-    SettingError if geometry or field are unknown. `index` selects the stored PSF.
+    SettingError if geometry or field are unknown. `index` selects the stored PSF. With `edge_is_known` the edge of the
+    calibration is used as it is.
     """
 
-    def __init__(self, calibration: Calibration, shape: Pair, planner: Planner, index: int) -> None:
+    def __init__(
+        self, calibration: Calibration, shape: Pair, planner: Planner, index: int, edge_is_known: bool = False
+    ) -> None:
         geometry = calibration.geometry
         if geometry is None or not can_estimate_refraction(calibration):
             raise SettingError("a refraction needs the head's geometry and field", "Give --head HEAD.toml.")
         self.geometry = geometry
-        self.likelihood = RefractionLikelihood(calibration, geometry, shape, planner, index)
-        self._calibration, self._shape, self._index = calibration, shape, index
-        taper, bands = self.likelihood.taper, self.likelihood.bands
+        self._calibration, self._shape, self._planner, self._index = calibration, shape, planner, index
+        self._edges = EdgeLikelihood(calibration, geometry, shape, planner, index, edge_is_known)
+        taper, bands = self._edges.likelihood.taper, self._edges.likelihood.bands
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
+        self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
-        lever = bands.high / self.likelihood.grid.n * 2 * reach_px * geometry.scale_per_dpt
+        lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
 
     @cached_property
@@ -102,46 +124,80 @@ class RefractionEstimator:
         """Defect search of this calibration, for callers of `find` without a search of their own."""
         return DefectFinder(self._calibration, self._shape, self._index)
 
-    def find(self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None) -> Refraction | None:
-        """Estimate the refraction of a frame (rows, cols) in counts; None if it cannot be determined.
+    @cached_property
+    def likelihood(self) -> RefractionLikelihood:
+        """Likelihood within the calibrated field edge, for tests of the head."""
+        return RefractionLikelihood(self._calibration, self.geometry, self._shape, self._planner, self._index)
 
-        None: the band has fewer than LEAST_FREQUENCIES, the fitted level is not positive, the minimum is less than
-        LEAST_NATS below the median, or |M| >= SPAN_DPT. `defects` (flat indices) are left out, see `DefectFinder`.
-        """
-        likelihood = self.likelihood
-        if likelihood.bands.whole.where.size < LEAST_FREQUENCIES:
-            return None
-        frame = likelihood.frame(counts, dark, defects)
-        if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
-            return None
-        likelihood.residual(frame, 0.0)
-        noise = likelihood.noise_power(frame)
-        coarse = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole))
-        sphere_dpt = coarse.grid_search(self.step_dpt)
+    def find(
+        self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None
+    ) -> Refraction | NoRefraction:
+        """Estimate M and the field edge of a frame (rows, cols) in counts; `defects` (flat indices) are left out."""
+        edges, relaxed = self._edges, np.zeros(1)
+        if edges.band.where.size < LEAST_FREQUENCIES:
+            return NoRefraction("the PSF passes too few frequencies")
+        frame = edges.start(counts, dark, defects)
+        if not edges.fit_smooth(relaxed) > 0:
+            return NoRefraction("the frame holds no light of the field")
+        edges.set_noise(relaxed)
+        coarse = Search(lambda m_dpt: edges(np.array([m_dpt]), COARSE_PARAMETERS).nats)
+        m_dpt = coarse.grid_search(self.step_dpt * COARSE_FRINGES / FRINGES)
         if coarse.depth_nats < LEAST_NATS:
-            return None
-        sphere_dpt = coarse.descend(sphere_dpt, self.step_dpt / 2)
-        for _ in range(GAP_FITS if frame.has_gaps else 1):
-            likelihood.fit_smooth(frame, likelihood.otf(likelihood.grid, sphere_dpt))
-            fine = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.whole))
-            for part in (2, 4):
-                sphere_dpt = fine.descend(sphere_dpt, self.step_dpt / part)
-        if abs(sphere_dpt) >= SPAN_DPT:
-            return None
-        vertex_dpt, curvature = fine.fit_parabola(sphere_dpt, self.step_dpt / 4)
-        sd_dpt = min(SD_FACTOR * (self._spread / curvature) ** 0.5, SPAN_DPT) if curvature > 0 else SPAN_DPT
-        sd_dpt = float(np.hypot(sd_dpt, SD_PER_MISSING_DPT * frame.missing))
+            return NoRefraction("the frame does not show the structure of this PSF")
+        m_dpt, moving_samples = self._alternate(m_dpt)
+        if moving_samples > MOVING_SAMPLES or edges.prior.is_at_end(edges.edge):
+            return NoRefraction("the edge of the lit field was not found near its calibrated place")
+        if abs(m_dpt) >= SPAN_DPT:
+            return NoRefraction(f"the refraction is beyond {SPAN_DPT:.0f} dpt")
+        model = quadratic_model(edges, np.array([m_dpt]), CURVATURE_STEP_DPT, self._blocks)
+        if not model.is_minimum:
+            return NoRefraction("the likelihood has no clear minimum")
+        missing_dpt = SD_PER_MISSING_DPT * frame.missing
+        (m_dpt,), (sd_dpt,) = model.minimum, np.hypot(model.sds(self._spread), missing_dpt)
+        if sd_dpt > MOST_SD_DPT:
+            return NoRefraction(f"the standard deviation would be {sd_dpt:.1f} dpt")
+        edge = edges.field_edge(edges.edge_model(model.minimum))
         curve = tuple(sorted(coarse.known.items()))
-        disagreement_dpt = abs(self._minimum_of_upper_band(frame, noise, sphere_dpt) - vertex_dpt)
-        return Refraction(vertex_dpt, self.scale(vertex_dpt), sd_dpt, coarse.depth_nats, curve, disagreement_dpt)
+        return Refraction(
+            float(m_dpt), float(sd_dpt), self.scale(float(m_dpt)), coarse.depth_nats, curve, edge, missing_dpt
+        )
 
-    def _minimum_of_upper_band(self, frame: Linear, noise: float, sphere_dpt: float) -> float:
-        """Return the minimum of the likelihood of the upper half of the band, in dpt, downhill from `sphere_dpt`."""
-        likelihood = self.likelihood
-        upper = Search(lambda m_dpt: likelihood.negative_log_likelihood(frame, noise, m_dpt, likelihood.bands.upper))
-        for part in (1, 2):
-            sphere_dpt = upper.descend(sphere_dpt, self.step_dpt / part)
-        return upper.fit_parabola(sphere_dpt, self.step_dpt / 2)[0]
+    def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
+        """Estimate M, J0 and J45 of the frame for which `find` has just returned `found`."""
+        model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
+        if model is None:
+            return NoRefraction("the likelihood has no clear minimum with a cylinder")
+        sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
+        if sds_dpt.max() > MOST_SD_DPT:
+            return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
+        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = model.minimum.tolist(), sds_dpt.tolist()
+        return replace(
+            found, sphere_dpt=m_dpt, sd_dpt=sd_dpt, psf_scale=self.scale(m_dpt),
+            edge=self._edges.field_edge(self._edges.edge_model(model.minimum)),
+            cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
+        )  # fmt: skip
+
+    def _alternate(self, m_dpt: float) -> tuple[float, float]:
+        """Return M after rounds of smooth part, search over M, and edge, from the M of the coarse search on.
+
+        The second value is the last change of the edge in samples.
+        """
+        step_dpt = self.step_dpt / 2
+        for done in range(1, MOST_ROUNDS + 1):
+            self._edges.fit_smooth(np.array([m_dpt]))
+            fine = Search(self._near(m_dpt))
+            before_dpt, (m_dpt, _) = m_dpt, fine.fit_parabola(fine.descend(m_dpt, step_dpt), step_dpt)
+            change_samples = self._edges.move_edge(self._edges(np.array([m_dpt])).step)
+            step_dpt = self.step_dpt / 4
+            is_settled = change_samples < SETTLED_SAMPLES and abs(m_dpt - before_dpt) < SETTLED_DPT
+            if is_settled or (done >= ROUNDS and change_samples < MOVING_SAMPLES):
+                break
+        return m_dpt, change_samples
+
+    def _near(self, m_dpt: float) -> Callable[[float], float]:
+        """Return the likelihood of M with the linear model of the edge around `m_dpt`."""
+        model = self._edges.edge_model(np.array([m_dpt]))
+        return lambda near_dpt: self._edges.near(np.array([near_dpt]), model).nats
 
     def scale(self, m_dpt: float) -> float:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
@@ -149,7 +205,8 @@ class RefractionEstimator:
 
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
         """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
-        return self.likelihood.otf(grid, m_dpt)
+        otf = self._edges.likelihood.interpolated_otf
+        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
 
 
 class Search:

@@ -5,6 +5,7 @@ frame that `frame` and `fit_smooth` were called with last.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from scipy import ndimage
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.parameter_selection import flat_fit
 from device.recon.estimation.power_law_prior import band
-from device.recon.estimation.psf_warp import InterpolatedOtf, transform
+from device.recon.estimation.psf_warp import InterpolatedOtf, Transform, transform
 from device.recon.estimation.shading import Shading
 from device.recon.model import fused_kernels, kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
@@ -105,21 +106,28 @@ class GapTreatment:
     narrow: Mask | None = None
     filling: Image | None = None
 
+    @property
+    def known_weights(self) -> Image:
+        """The weights, 0 in the narrow gaps."""
+        return self.weights if self.narrow is None else self.weights * ~self.narrow
+
 
 class RefractionLikelihood:
     """Negative log likelihood of a mean sphere M for PSF `index` of one calibration, and one sensor shape."""
 
-    def __init__(self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int) -> None:
+    def __init__(
+        self, calibration: Calibration, geometry: Geometry, shape: Pair, planner: Planner, index: int,
+        sample_um: float = SAMPLE_UM,
+    ) -> None:  # fmt: skip
         self.geometry, self.sensor = geometry, calibration.sensor
-        self._interpolated_otf = InterpolatedOtf(calibration.psfs[index])
-        n = max(1, min(round(SAMPLE_UM / geometry.pitch_um), min(shape) // 16))
+        self.interpolated_otf = InterpolatedOtf(calibration.psfs[index])
+        n = max(1, min(round(sample_um / geometry.pitch_um), min(shape) // 16))
         self.model = tight_model(calibration, shape, n, planner, index)
-        self._shading = Shading(self.model)
         self._preparer = Preprocessor(calibration, self.grid)
         window = self.grid.window
         self.fft: RealFft = planner.plan(window)
         self.taper = taper(window, min(0.5, TAPER_UM / (geometry.pitch_um * n * min(window))))
-        self.bands = SearchBands.of(window, n, self._interpolated_otf)
+        self.bands = SearchBands.of(window, n, self.interpolated_otf)
         self._levels = np.zeros(RINGS)
         self._smooth: Image = np.zeros(self.grid.shape, np.float32)
         self._object, self._otf = (np.zeros(self.model.otf.shape, np.complex64) for _ in range(2))
@@ -133,7 +141,11 @@ class RefractionLikelihood:
 
     def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
         """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
-        return self._interpolated_otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+        return self.interpolated_otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+
+    @cached_property
+    def _shading(self) -> Shading:
+        return Shading(self.model)
 
     def frame(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and set `sample_weights`: good share times taper, per sample."""
@@ -155,12 +167,25 @@ class RefractionLikelihood:
         """
         self.model.refocus(otf)
         self._shading.refocus()
-        level, stray = self._shading.fit(frame, self._smooth)
-        self.model.fft.space[:] = self._smooth
-        self._object[:] = self.model.fft.forward()
+        smooth = np.zeros(self.grid.shape, np.float32)
+        level, stray = self._shading.fit(frame, smooth)
+        self.set_smooth(frame, smooth, stray, otf)
+        return level
+
+    def set_smooth(self, frame: Linear, smooth: Image, stray: float, otf: Spectrum) -> None:
+        """Set the smooth object (grid, before the blur by `otf`) that `residual` subtracts; `stray` is in DN.
+
+        The detail of the frame is continued into narrow gaps.
+        """
+        self.model.otf, self._smooth = otf, smooth
+        self._object = self.object_spectrum(smooth)
         if self._gaps.narrow is not None:
             self._fill_narrow_gaps(frame, stray, self._gaps.narrow)
-        return level
+
+    def object_spectrum(self, image: Image) -> Spectrum:
+        """Return the spectrum of an object on the grid as a new array."""
+        self.model.fft.space[:] = image
+        return self.model.fft.forward().copy()
 
     def _fill_narrow_gaps(self, frame: Linear, stray: float, narrow: Mask) -> None:
         """Set the filling of the gaps to the detail around narrow gaps, continued into them; 0 elsewhere.
@@ -180,19 +205,32 @@ class RefractionLikelihood:
 
         Return the constant stray light in DN.
         """
-        model, grid = self.model, self.grid
-        stretch = transform(self.geometry, m_dpt)
-        self._interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
-        np.multiply(self._object, self._otf, out=model.fft.spectrum)
-        smooth = model.fft.inverse()[grid.slices]
+        return self.residual_of(frame, transform(self.geometry, m_dpt))[1]
+
+    def residual_of(self, frame: Linear, stretch: Transform) -> tuple[float, float]:
+        """Do as `residual` for the eye with this stretch of the PSF; return the scale of the smooth part and the stray
+        light in DN.
+        """
+        grid = self.grid
+        self.interpolated_otf.on_grid(grid.shape, grid.n, stretch, self._otf)
+        smooth = self._seen(self._object)
         level, stray = flat_fit(kernels.flat_fit_sums(frame.y, smooth, frame.good))
-        gaps = self._gaps
-        weights = gaps.weights if gaps.narrow is None else gaps.weights * ~gaps.narrow
-        kernels.residual(frame.y, smooth, weights, level, stray, (0, 0), self.fft.space)
-        if gaps.filling is not None:
-            self.fft.space += gaps.filling
+        kernels.residual(frame.y, smooth, self._gaps.known_weights, level, stray, (0, 0), self.fft.space)
+        if self._gaps.filling is not None:
+            self.fft.space += self._gaps.filling
         self.fft.forward()
-        return stray
+        return level, stray
+
+    def spectrum_of(self, part: Spectrum) -> Spectrum:
+        """Return the tapered spectrum of an object (its spectrum on the grid) through the PSF of the last residual."""
+        np.multiply(self._seen(part), self._gaps.known_weights, out=self.fft.space)
+        return self.fft.forward()
+
+    def _seen(self, part: Spectrum) -> Image:
+        """Return the blurred object in the window, in the units of the FFT without its scale."""
+        fft = self.model.fft
+        np.multiply(part, self._otf, out=fft.spectrum)
+        return fft.inverse()[self.grid.slices]
 
     def negative_log_likelihood(self, frame: Linear, noise_dn2: float, m_dpt: float, part: Band) -> float:
         """Return the negative log likelihood (nats, up to a constant) of the candidate M over `part` of the band.
@@ -203,7 +241,7 @@ class RefractionLikelihood:
         """
         self.residual(frame, m_dpt)
         stretch = transform(self.geometry, m_dpt)
-        otf = self._interpolated_otf.at_frequencies(part.rows, part.cols, part.share, self.grid.n, stretch)
+        otf = self.interpolated_otf.at_frequencies(part.rows, part.cols, part.share, self.grid.n, stretch)
         return fused_kernels.negative_log_likelihood(
             self.fft.spectrum,
             otf,

@@ -135,25 +135,31 @@ def blocks(image: Image, n: int) -> Image:
 
 
 def modes(model: Model) -> Iterator[Image]:
-    """Yield the Zernike polynomials up to radial degree DEGREE on the field's disc, not normalised.
-
-    The constant mode is first; the order is n, then m, ascending (m < 0: sine). Each is float32 of the grid's shape and
-    0 outside the disc.
-    """
+    """Yield the modes of `zernike_modes` on the field's disc, each float32 of the grid's shape and 0 outside it."""
     top, bottom, left, right = model.box
     v = (np.arange(top, bottom)[:, None] - model.grid.centre[0]) / model.grid.radius_samples
     u = (np.arange(left, right)[None] - model.grid.centre[1]) / model.grid.radius_samples
-    radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
     disc = model.mask[top:bottom, left:right]
+    for lit in zernike_modes(v, u):
+        mode = np.zeros(model.grid.shape, np.float32)
+        mode[top:bottom, left:right] = disc * lit
+        yield mode
+
+
+def zernike_modes(v: NDArray[np.floating], u: NDArray[np.floating]) -> Iterator[NDArray[np.floating]]:
+    """Yield the Zernike polynomials up to radial degree DEGREE at (v, u) (down, right) in radii, not normalised.
+
+    The constant mode is first; the order is n, then m, ascending (m < 0: sine). Beyond the unit disc each continues
+    with its value at the edge.
+    """
+    radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
     for n in range(DEGREE + 1):
         for m in range(-n, n + 1, 2):
             turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
-            mode = np.zeros(model.grid.shape, np.float32)
-            mode[top:bottom, left:right] = disc * _radial(n, abs(m), radius) * turn
-            yield mode
+            yield _radial(n, abs(m), radius) * turn
 
 
-def _radial(n: int, m: int, radius: NDArray[np.float64]) -> NDArray[np.float64]:
+def _radial(n: int, m: int, radius: NDArray[np.floating]) -> NDArray[np.floating]:
     total = np.zeros_like(radius)
     for k in range((n - m) // 2 + 1):
         sign, top = (-1) ** k, factorial(n - k)

@@ -1,6 +1,6 @@
 """Effects of the eye: spectral reflectance, corneal reflex, refraction, field curvature, motion during the exposure."""
 
-from math import cos, exp, hypot, pi, radians, sin, tan
+from math import cos, exp, hypot, pi, radians, sin
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
 from device.sim.render import azimuth_and_angle
 from device.values import Image
 
-_TINT_ETA = {"red": 10.0, "green": 0.0, "blue": 5.0}  # vessels keep 1/7 and 4/5 of their green contrast
+_TINT_ETA = {"red": 10.0, "green": 0.0, "blue": 5.0, "amber": 5.0}  # vessels keep 1/7 and 4/5 of their green contrast
 _REFRACTION_ETA_PER_DPT = 3.0
-_GLASS_N = 1.517
 _CURVATURE_ETA_PER_DPT = 5.0  # of the mean over the field: its edge is blurred most, and shows it most
 _CORNEA_R = (0.376 / 2.376) ** 2
 _TISSUE_R = 0.0141  # of the perifovea in green, to which the share refers
@@ -35,7 +34,7 @@ class Tint:
 
     def apply(self, setup: OpticalSetup) -> None:
         """Replace the object by its reflectance in this colour."""
-        setup.object = setup.subject.reflectance[setup.scene.colour]
+        setup.object = setup.subject.plane(setup.scene.colour)
 
 
 class Reflex:
@@ -138,8 +137,8 @@ class RefractiveError:
 class FieldCurvature:
     """Field curvature and oblique astigmatism of an eye in front of a flat surface; OPTICS.md 3.4.
 
-    A thin lens with its stop focuses the edge of the field on spheres of radius R_s = f / (1 + 1/n) and
-    R_t = f / (3 + 1/n). A flat surface lies behind both, so its edge is myopic.
+    The vergences are those of the traced model eye: its lens focuses the edge of the field on curved surfaces. A flat
+    screen lies behind both, so its edge is myopic.
     """
 
     name = "curvature"
@@ -170,11 +169,8 @@ class FieldCurvature:
 
 
 def curvature_dpt(scene: Scene, angle_deg: float) -> tuple[float, float]:
-    """Return sagittal and tangential defocus of a flat surface at an angle from the axis: h^2 / (2 R f^2), dioptres."""
-    f_m = scene.sim.eye.focal_length_um * 1e-6
-    h_m = f_m * tan(radians(angle_deg))
-    sagittal, tangential = ((k + 1 / _GLASS_N) / f_m for k in (1, 3))
-    return h_m**2 * sagittal / (2 * f_m**2), h_m**2 * tangential / (2 * f_m**2)
+    """Return sagittal and tangential defocus of a flat surface at an angle from the axis, dioptres: OPTICS.md 6.4."""
+    return eye.flat_screen_dpt(angle_deg, scene.sim.eye.focal_length_um / 1000)
 
 
 class Motion:

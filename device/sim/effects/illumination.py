@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from device.errors import SpecError
 from device.optics.eye import iris_overlap
 from device.optics.illumination import LEDS
-from device.optics.matrix import chain_of, led_positions_mm, ring
+from device.optics.matrix import EMITTER_MM, geometry_of, led_positions_mm, ring
 from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
 
-EMITTER_MM = 0.25  # width of the green emitter in an APA102-2020; OPTICS.md 3.5 (an estimate)
 STRAY_ETA_PER_SHARE = 320.0  # of the mean signal, where no constant is fitted; a solver that fits one sees less
 _FALLOFF_ETA = 7.0  # at 33.4 degrees on a sensor that the field fills, where the edge keeps 0.84 of the light
 _FALLOFF_TABLE_LOSS = 1 - cos(radians(16.7)) ** 4
@@ -101,7 +100,7 @@ class Leds:
 
 def leds_mm(scene: Scene) -> list[Place]:
     """Return (right, down) of each LED from the axis, mm: the matrix's ring, else 12 on a circle `ring_um` wide."""
-    chain = chain_of(scene.spec)
+    chain = geometry_of(scene.spec)
     if chain is not None:
         at = led_positions_mm(chain)
         return [(at[i][0], -at[i][1]) for i in ring(chain)]

@@ -15,7 +15,7 @@ _SOURCE_ETA, _SOURCE_UM, _SOURCE_POWER = 0.89, 275.0, 1.4  # .08, .21, .89 for 5
 class PupilVignetting:
     """Vignetting at the iris: beam walk at wide angles, and pupils that are small or off the axis; OPTICS.md 1.4, 3.3.
 
-    Beam walk at the diffuser: w(theta) = 0.128 mm max(0, |theta| - 15 deg)^1.44, a fit to the paper's three anchors.
+    Beam walk at the diffuser is that of the ray trace of the relay's lenses (OPTICS.md 6.3): 3.3 mm at 25 degrees.
     """
 
     name = "pupil"

@@ -71,7 +71,7 @@ def captures_router(store: CaptureStore, arbiter: HeadArbiter) -> APIRouter:
         return capture_answer(store.get(id))
 
     @router.get("/api/captures/{id}/{name}", response_class=Response, responses=file_responses(*MEDIA_TYPES.values()))
-    def file(id: str, name: str = InPath(pattern="^[a-z]+(-[0-9]+)?[.](png|jpg|tiff|json)$")) -> Response:
+    def file(id: str, name: str = InPath(pattern="^[a-z]+(-([0-9]+|[a-z]+))?[.](png|jpg|tiff|json)$")) -> Response:
         """Return one file of a capture.
 
         `quick.jpg` of a capture in progress is its quick look. 404 for an unknown capture or file, 500 for a damaged

@@ -5,6 +5,7 @@ from datetime import date
 
 from fastapi import APIRouter, Query
 
+from services.health.clock_request import offer_time
 from services.http.control_lease import ControlLease
 from services.http.schemas.captures import LateralityCorrection, verdict_answer
 from services.http.schemas.common import IdempotentRequest
@@ -176,6 +177,8 @@ def _lease_router(lease: ControlLease) -> APIRouter:
 
         Answers with the public name of the present or last holder (`lease`) and whether this screen holds it (`mine`).
         """
+        if asking.now is not None:
+            offer_time(asking.now)
         state = lease.release(asking.key) if asking.release else lease.acquire(asking.key, asking.take)
         return LeaseAnswer(lease=state.lease, mine=state.mine)
 

@@ -4,7 +4,7 @@ from typing import Self, TypeVar
 
 from pydantic import BaseModel, Field, JsonValue, model_validator
 
-from device.values import Eye
+from device.values import ChannelName, Eye
 from services.http.schemas.common import (
     ID_PATTERN,
     KEY_PATTERN,
@@ -17,6 +17,7 @@ from services.http.schemas.common import (
     Timestamp,
 )
 from services.records.capture import (
+    COLOUR,
     Capture,
     CaptureReport,
     EyeConfirmation,
@@ -55,9 +56,10 @@ class LateralityCorrection(IdempotentRequest):
 
 
 class CaptureLinks(ResponseBody):
-    """URLs of the files of a capture."""
+    """URLs of the files of a capture: `picture` is the one in green light, `colour` the one in colour, if any."""
 
     picture: str
+    colour: OmittedIfNone[str] = None
     raw: str
     report: str
     quick: str
@@ -95,6 +97,19 @@ class FrameAnswer(StoredPart):
     reason: str | None
 
 
+class ChannelAnswer(StoredPart):
+    """One colour of light: its shift from green (rows, cols; pixels), whether it is predicted, not measured.
+
+    `reason`: why the picture has not this colour; null for one that it has. File `raw-red.tiff` is the raw frame of
+    red.
+    """
+
+    name: ChannelName
+    shift_px: tuple[Number, Number] | None
+    predicted: bool
+    reason: str | None
+
+
 class EyeCorrectionAnswer(StoredPart):
     """Move of a capture to the other eye: the eye and slot before, the eye after, time (ISO 8601), and screen."""
 
@@ -118,7 +133,8 @@ class ReportAnswer(StoredPart):
 
     `seconds`: durations by stage; `budget_s`: time budget. `dose_j_per_cm2`: dose of this exposure;
     `dose_24h_j_per_cm2`: dose of each eye in 24 h; `dose_high`: eyes above the warning; `limits_unchecked`: light
-    limits that were not compared with the purchased standard. `frames`: one entry per frame of the burst. `moved`:
+    limits that were not compared with the purchased standard. `frames`: one entry per frame of the burst.
+    `channels`: one entry per colour, also for one that could not be taken; not for a grey picture by design. `moved`:
     corrections of the eye, `confirmed`: its confirmation; both only where they exist.
     """
 
@@ -129,13 +145,14 @@ class ReportAnswer(StoredPart):
     seconds: dict[str, Number]
     psf_index: int
     psf_scale: Number
-    refraction_dpt: dict[str, Number] | None
+    refraction_dpt: dict[str, Number | str | None] | None
     regularisation: dict[str, JsonValue]
     noise_dn: Number | None
     residual: Number | None
     quality: dict[str, JsonValue]
     warnings: list[str]
     frames: OmittedIfNone[list[FrameAnswer]] = None
+    channels: OmittedIfNone[list[ChannelAnswer]] = None
     dose_j_per_cm2: Number | None
     dose_24h_j_per_cm2: dict[str, Number]
     dose_stop_j_per_cm2: Number | None
@@ -181,8 +198,9 @@ def capture_answer(capture: Capture) -> CaptureAnswer:
     """Return a capture with its report, its verdict and the URLs of its files."""
     at, report = f"/api/captures/{capture.id}", capture.report
     links = CaptureLinks(
-        picture=f"{at}/picture.png", raw=f"{at}/raw.tiff", report=f"{at}/report.json", quick=f"{at}/quick.jpg"
-    )
+        picture=f"{at}/picture.png", colour=f"{at}/{COLOUR}" if COLOUR in capture.files else None,
+        raw=f"{at}/raw.tiff", report=f"{at}/report.json", quick=f"{at}/quick.jpg",
+    )  # fmt: skip
     return CaptureAnswer(
         id=capture.id, eye=capture.eye, taken_at=capture.taken_at, simulated=capture.simulated,
         calibration_id=capture.calibration_id, report=report_answer(report), visit=report.visit, slot=report.slot,
@@ -200,6 +218,7 @@ def report_answer(report: CaptureReport) -> ReportAnswer:
         "test": report.is_test, "budget_s": report.budget_s, "verdict": verdict_answer(report.verdict),
         "limits_unchecked": list(report.light.limits_unchecked) or None,
         "frames": [FrameAnswer.model_validate(vars(one)) for one in report.reconstruction.frames] or None,
+        "channels": [ChannelAnswer.model_validate(vars(one)) for one in report.reconstruction.channels] or None,
         "laterality": _stored(LateralityAnswer, report.laterality) if report.laterality else None,
         "moved": [_stored(EyeCorrectionAnswer, one) for one in report.moved] or None,
         "confirmed": _stored(EyeConfirmationAnswer, report.confirmed) if report.confirmed else None,

@@ -2,10 +2,12 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import AwareDatetime, Field
 
 from services.http.schemas.captures import VerdictAnswer
 from services.http.schemas.common import IdempotentRequest, RecordId, ResponseBody, SlotName, Timestamp
+from services.http.schemas.problems import ErrorText
+from services.instrument.visit_montage import MontageState
 from services.records.visit import OutcomeCode
 
 FieldAnswer = str | int | bool | list[str] | None
@@ -41,11 +43,13 @@ class SlotChoice(IdempotentRequest):
 class ControlRequest(IdempotentRequest):
     """Request body of the control lease; `key` is the secret key of the screen.
 
-    `take` takes the lease from another screen, `release` lets it expire.
+    `take` takes the lease from another screen, `release` lets it expire. `now`: time of the browser, which the device
+    takes if nothing else has set its clock.
     """
 
     take: bool = False
     release: bool = False
+    now: AwareDatetime | None = None
 
 
 class LeaseAnswer(ResponseBody):
@@ -108,3 +112,37 @@ class VisitList(ResponseBody):
 
     visits: list[VisitAnswer]
     counts: VisitCounts
+
+
+class PlacedPicture(ResponseBody):
+    """Place of a picture in a montage: what is at (row, column) of the first picture is at that place + `shift_px`.
+
+    `rotation_deg`: counter-clockwise as displayed, about the picture's centre. `peak`: correlation with the picture to
+    which it was registered, `overlap` their common part of the smaller field; null for the first. `reason`: why it is
+    not used.
+    """
+
+    index: int
+    slot: str
+    capture: str
+    used: bool
+    shift_px: tuple[float, float] | None
+    rotation_deg: float | None
+    peak: float | None
+    overlap: float | None
+    reason: str | None
+
+
+class MontageAnswer(ResponseBody):
+    """Montage of the chosen pictures of one eye.
+
+    `state`: `none` with fewer than two pictures, `computing` until it is known (it waits while the camera is used),
+    `joined`, `apart` if no two pictures could be joined, `failed` with `problem`. `digest`: names the set of pictures.
+    `pictures`: their number. `placed`: the place of each, empty before it is known.
+    """
+
+    state: MontageState
+    digest: str
+    pictures: int
+    placed: list[PlacedPicture]
+    problem: ErrorText | None

@@ -127,6 +127,8 @@ class CaseRunner:
         found, clean = (correlation(one, frame.simulated.truth, inside) for one in (picture, self._clean[column]))
         eye = made.report.refraction_dpt
         sphere, sd = (None, None) if eye is None else (eye.get("sphere"), eye.get("sd"))
+        assert not isinstance(sphere, str)
+        assert not isinstance(sd, str)
         return Cell(
             self.eye.name, case.key, column, found, clean - found, "", made.report.warnings, sphere, sd,
             frame.sphere_dpt, dict(made.report.quality),

@@ -15,7 +15,7 @@ from device.clock import SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.recon.assessment.metrics import PictureScorer, Scores
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.refraction import RefractionEstimator
+from device.recon.estimation.refraction import Refraction, RefractionEstimator
 from device.recon.methods import method_named
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
@@ -59,7 +59,8 @@ class Bench:
     def expose(self, name: str, changes: HeadChanges | None = None) -> "SimulatedFrame":
         """Return one frame of a scene with changes."""
         spec = self.scene(name, changes)
-        return SimulatedFrame(spec.name, simulate_exposure(spec))
+        assert spec.sim is not None
+        return SimulatedFrame(spec.name, simulate_exposure(spec), spec.sim.object.cut_deg)
 
     def solve(self, take: "SimulatedFrame", name: str) -> Image:
         """Return the picture by our method `name` with the calibrated PSF, on the samples of the scores."""
@@ -93,7 +94,7 @@ class Bench:
             self._refractor = take.calibration.id, found
         refractor, counts = self._refractor[1], take.staged.counts
         eye = refractor.find(counts, None, refractor.defects(counts))
-        return float("nan") if eye is None else eye.sphere_dpt
+        return eye.sphere_dpt if isinstance(eye, Refraction) else float("nan")
 
     def tikhonov(self, take: "SimulatedFrame", mu: float) -> Image:
         """Return the paper's solution for one weight mu, on the samples of the scores."""
@@ -126,10 +127,14 @@ class Bench:
 
 @dataclass(frozen=True)
 class SimulatedFrame:
-    """A simulated frame with its truth, and the samples on which its pictures are scored."""
+    """A simulated frame with its truth, and the samples on which its pictures are scored.
+
+    `cut_deg` (right, down): rectangle to which the object is cut; only what lies inside is scored.
+    """
 
     name: str
     staged: SimulatedExposure
+    cut_deg: tuple[float, float] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -174,8 +179,13 @@ class SimulatedFrame:
 
     @cached_property
     def inside(self) -> Mask:
-        """Mask of the field without its edge, on the samples of the scores."""
-        return self._disc(field_radius_px(self.calibration) / self.samples_px - RIM_PX) > 0.5
+        """Mask of the field, or of the object cut out of it, without its edge, on the samples of the scores."""
+        field = self._disc(field_radius_px(self.calibration) / self.samples_px - RIM_PX) > 0.5
+        if self.cut_deg is None:
+            return field
+        across, down = (side * self.px_per_deg / 2 - RIM_PX for side in self.cut_deg)
+        rows, cols = (np.abs(np.arange(n) - (n - 1) / 2) for n in field.shape)
+        return np.asarray(field & (rows[:, None] < down) & (cols[None, :] < across))
 
     def _disc(self, radius_px: float) -> Image:
         rows, cols = self.truth.shape

@@ -69,8 +69,8 @@ def human_light(name: str) -> HumanLight:
 
 
 def shipped_heads() -> list[str]:
-    """Return the names of the head files without extension."""
-    return sorted(path.stem for path in resources.HEADS.glob("*.toml"))
+    """Return the names of the head files without extension, without those that have no lamp."""
+    return sorted(path.stem for path in resources.HEADS.glob("*.toml") if load_head(path).light.backend != "none")
 
 
 def simulated_head_changes() -> HeadChanges:

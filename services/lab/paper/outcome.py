@@ -1,20 +1,23 @@
-"""Result types of an experiment: claims with limits, figures, tables and notes."""
+"""Result types of an experiment: claims with limits and labels, figures, tables and notes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from services.lab.paper.bench import Bench
 
 Status = Literal["holds", "does not hold", "not reproduced"]
+Label = Literal["as written", "adapted", "put in", "not reproduced", "ours"]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One measured number with its limits, its status and the paper's value.
+    """One measured number with its limits, its status, its relation to the paper, and the paper's value.
 
     `attempted`: the number is the paper's, and the simulation may miss it. Outside its limits the number is reported as
-    not reproduced: it does not count as held, and the run does not fail.
+    not reproduced: it does not count as held, and the run does not fail. `why`: how the paper's experiment was adapted,
+    why the number is put in, or why it is not reproduced. `derived`: reason of the limit; empty if it was set after the
+    value was seen.
     """
 
     what: str
@@ -24,6 +27,36 @@ class Claim:
     paper: str = ""
     digits: int = 3
     attempted: bool = False
+    given_label: Label | None = None
+    why: str = ""
+    derived: str = ""
+
+    def adapted(self, how: str) -> "Claim":
+        """Return the claim, labelled as one on an adapted experiment."""
+        return replace(self, given_label="adapted", why=how)
+
+    def put_in(self, why: str) -> "Claim":
+        """Return the claim, labelled as circular: its value was given to the simulation."""
+        return replace(self, given_label="put in", why=why)
+
+    def ours(self, why: str = "") -> "Claim":
+        """Return the claim, labelled as one that the paper does not make."""
+        return replace(self, given_label="ours", why=why)
+
+    def because(self, why: str) -> "Claim":
+        """Return the claim with the reason for which its number is not reproduced."""
+        return replace(self, why=why)
+
+    def limit_from(self, reason: str) -> "Claim":
+        """Return the claim with the reason of its limit."""
+        return replace(self, derived=reason)
+
+    @property
+    def label(self) -> Label:
+        """Relation to the paper: by default "as written" if the paper says it, else "ours"."""
+        if self.status == "not reproduced":
+            return "not reproduced"
+        return self.given_label or ("as written" if self.paper else "ours")
 
     @property
     def status(self) -> Status:
@@ -67,13 +100,27 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment of the paper: key, title, one sentence, the paper's statement, and the function that runs it."""
+    """One experiment of the paper: key, title, one sentence, the paper's statement, and the function that runs it.
+
+    `adapted`: how the experiment differs from the paper's; it labels every claim that the paper makes and that has no
+    other label.
+    """
 
     key: str
     title: str
     sentence: str
     paper: str
     run: Callable[[Bench], Outcome]
+    adapted: str = ""
+
+    def labelled(self, outcome: Outcome) -> Outcome:
+        """Return an outcome of this experiment with its claims labelled."""
+        if not self.adapted:
+            return outcome
+        claims = tuple(
+            claim.adapted(self.adapted) if claim.label == "as written" else claim for claim in outcome.claims
+        )
+        return replace(outcome, claims=claims)
 
 
 def above(what: str, value: float, least: float, paper: str = "", digits: int = 3) -> Claim:

@@ -61,6 +61,28 @@ def cutline(take: SimulatedFrame, down_deg: float, pictures: Mapping[str, Image]
                   degrees, scaled)  # fmt: skip
 
 
+def raw_cutlines(takes: Mapping[str, SimulatedFrame], down_deg: float, title: str) -> Figure:
+    """Return a plot of raw frames along the row at `down_deg`, each over its own mean there, as measured."""
+    first = next(iter(takes.values()))
+    degrees = (np.arange(first.raw.shape[1]) - (first.raw.shape[1] - 1) / 2) / first.px_per_deg
+    lines = {}
+    for name, take in takes.items():
+        values = take.raw[take.row(down_deg)].astype(np.float64)
+        lines[name] = values / max(float(values.mean()), 1e-30)
+    return _lines(title, _where(down_deg), "degrees from the axis", "counts over their mean", degrees, lines)
+
+
+def psf_cutlines(psfs: Mapping[str, Image], reach_px: int, title: str) -> Figure:
+    """Return a plot of PSFs along their middle row within `reach_px` of the middle, each over its mean there."""
+    lines = {}
+    for name, psf in psfs.items():
+        row, col = (n // 2 for n in psf.shape)
+        values = psf[row, col - reach_px : col + reach_px + 1].astype(np.float64)
+        lines[name] = values / max(float(values.mean()), 1e-30)
+    pixels = np.arange(-reach_px, reach_px + 1)
+    return _lines(title, "through the axis", "pixels from the axis", "light over its mean", pixels, lines)
+
+
 def _where(down_deg: float) -> str:
     side = "below" if down_deg > 0 else "above"
     return f"{abs(down_deg):g} degrees {side} the axis" if down_deg else "through the axis"

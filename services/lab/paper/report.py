@@ -1,11 +1,13 @@
 """`diffuscope paper`: runs all experiments in order and writes the HTML report."""
 
 from base64 import b64decode
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from html import escape
 from pathlib import Path
+from typing import get_args
 
 from device.clock import Clock
 from device.errors import SettingError
@@ -19,17 +21,20 @@ from services.lab.paper import (  # fmt: skip
     rules,
     screen,
     sensors,
+    traced,
     trainer,
 )
 from services.lab.paper.bench import Bench
-from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Status, Table
+from services.lab.paper.outcome import Claim, Experiment, Figure, Label, Outcome, Status, Table
 from services.lab.paper.style import CLAIMED, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
-ORDER = ("N", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L")
+ORDER = (
+    "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L",
+)  # fmt: skip
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
 CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
-_ALL = (first_order, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
+_ALL = (first_order, traced, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }
@@ -62,7 +67,7 @@ def run_experiments(
         if keys and experiment.key not in keys:
             continue
         begin_s = clock.now_s()
-        outcome = experiment.run(bench)
+        outcome = experiment.labelled(experiment.run(bench))
         ran.append(ExperimentRun(experiment, outcome, clock.now_s() - begin_s))
         _write_pictures(folder, outcome)
         progress(f"{experiment.key}: {summary(outcome.claims)}")
@@ -123,6 +128,7 @@ def html(ran: Sequence[ExperimentRun], merged: int) -> str:
             "experiment "
             "repeated in the simulator. <b>All pictures on this page are simulated.</b></p>",
             f'<p class="verdict">{verdict} {size}; {total_s:.0f} s of computing.</p>',
+            f"<p>Labels of the {len(every)} rows: {_labels(every)}.</p>" if every else "",
             CLAIMED,
             f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
             *(_section(one) for one in ran),
@@ -158,12 +164,28 @@ def _flags(claims: Sequence[Claim]) -> str:
 def _claims(claims: Sequence[Claim]) -> str:
     rows = "".join(
         f"<tr class={CLASSES[claim.status]}><td>{escape(claim.what)}</td><td class=n>{_value(claim)}</td>"
-        f"<td>{escape(claim.limit)}</td><td>{claim.status}</td>"
-        f"<td>{escape(claim.paper) or '&ndash;'}</td></tr>"
+        f"<td>{escape(claim.limit)}{_limit_note(claim)}</td><td>{claim.status}</td>"
+        f"<td>{escape(claim.paper) or '&ndash;'}</td><td>{_label(claim)}</td></tr>"
         for claim in claims
     )
-    head = "<tr><th>assertion<th class=n>here<th>limit<th><th>printed in the paper</tr>"
-    return f"<table class=claims><thead>{head}</thead><tbody>{rows}</tbody></table>"
+    head = "<tr><th>assertion<th class=n>here<th>limit<th>result<th>the paper says<th>label</tr>"
+    return f"<table class=claims><thead>{head}</thead><tbody>{rows}</tbody></table>" if claims else ""
+
+
+def _limit_note(claim: Claim) -> str:
+    """Return as HTML the reason of a limit; a star marks one that was set after the value was seen."""
+    return f"<small>{escape(claim.derived)}</small>" if claim.derived else "&nbsp;*"
+
+
+def _label(claim: Claim) -> str:
+    why = f"<small>{escape(claim.why)}</small>" if claim.why else ""
+    return f"<b class=label-{claim.label.replace(' ', '-')}>{claim.label}</b>{why}"
+
+
+def _labels(claims: Sequence[Claim]) -> str:
+    """Return how many claims have each label, in words."""
+    found = Counter(claim.label for claim in claims)
+    return ", ".join(f"{found[label]} {label}" for label in get_args(Label) if found[label])
 
 
 def _sheet(sheet: Table) -> str:

@@ -134,6 +134,6 @@ EXPERIMENTS = (
         "S11", "Refraction from the frame",
         "The stretch of the caustic that a frame carries tells the eye's mean sphere.",
         "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
-        run_refraction,
+        run_refraction, "the paper promises it; on drawn retinas, with the PSF of an ideal point",
     ),
 )  # fmt: skip

@@ -6,7 +6,7 @@ import sys
 import time
 from dataclasses import dataclass
 
-from tests.ports.emulators.wires import EmulatedBuses
+from tests.ports.emulators.wires import LoggedChain
 
 PATIENCE_S = 5.0
 STEP_S = 0.005
@@ -24,9 +24,9 @@ class KillResult:
 class LitProcess:
     """Child process that takes pictures with the emulated ring."""
 
-    def __init__(self, wires: EmulatedBuses, lease_s: float, end: str = "never") -> None:
+    def __init__(self, wires: LoggedChain, lease_s: float, end: str = "never", chip: str = "apa102") -> None:
         self._wires = wires
-        command = [sys.executable, "-m", "tests.ports.emulators.victim", str(lease_s), end]
+        command = [sys.executable, "-m", "tests.ports.emulators.victim", str(lease_s), end, chip]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         self._read_line(b"ready")
 

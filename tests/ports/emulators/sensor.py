@@ -26,9 +26,11 @@ class Sensor:
     def __init__(self, world: World, lamp: Lamp, *, model: str = "imx296", bits: int = 12, wide: bool = False) -> None:
         self.world, self.lamp, self.model, self.bits, self.wide = world, lamp, model, bits, wide
         self.faults: set[str] = set()
+        self.arrangement = 5  # libcamera's ColorFilterArrangement: 5 is monochrome, 0 a mosaic RGGB
         self.held = False
         self.frames = 0
         self.shortest_frame_us = 2000
+        self.lowest_gain = 1.0
         self._coming: deque[dict[str, float]] = deque()
         self._now: dict[str, float] = {}
 
@@ -40,12 +42,12 @@ class Sensor:
 
     @property
     def formats(self) -> list[str]:
-        packed = f"R{self.bits}_CSI2P"
-        return [packed] if "packed" in self.faults else [f"R{self.bits}", packed]
+        plain = f"{'R' if self.arrangement == 5 else 'SRGGB'}{self.bits}"
+        return [f"{plain}_CSI2P"] if "packed" in self.faults else [plain, f"{plain}_CSI2P"]
 
     @property
     def known(self) -> set[str]:
-        return {"R8", "R10", "R12", "R16", "R10_CSI2P", "R12_CSI2P", "MONO_PISP_COMP1"}
+        return {"SRGGB12", "R8", "R10", "R12", "R16", "R10_CSI2P", "R12_CSI2P", "MONO_PISP_COMP1"}
 
     def granted(self, asked: str) -> str:
         """Return the granted format: a Pi 5 replaces every request by 16-bit words or by its lossy compression."""
@@ -86,7 +88,8 @@ class Sensor:
         counts = self.world.sensor.read(self._electrons(begin_s, end_s), (self.world.scene.seed, self.frames), None)
         self._write(counts, fd, stream)
         return {
-            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": 1.0, "DigitalGain": 1.0,
+            "SensorTimestamp": int(end_s * 1e9), "ExposureTime": exposure_us, "AnalogueGain": self.lowest_gain,
+            "DigitalGain": 1.0,
             "FrameDuration": int((self._free_s - begin_s) * 1e6),
             "SensorBlackLevels": (int(self.world.spec.camera.black_dn) << (SHARE_16 - self.bits),) * 4,
         }  # fmt: skip

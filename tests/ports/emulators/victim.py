@@ -1,4 +1,4 @@
-"""Process that takes pictures with the real ring until it ends: `python -m tests.ports.emulators.victim LEASE_S END`.
+"""Process that takes pictures until it ends: `python -m tests.ports.emulators.victim LEASE_S END CHIP`.
 
 Its phases are those of an exam: aiming in red, a pause, the lit exposure, the dark exposure, the reconstruction. END is
 how it ends by itself inside a lit phase: "hang", "raise", "exit", "heir" (killed, while a child holds all its files),
@@ -13,8 +13,9 @@ import time
 
 from device.config.head_file import ChainSpec
 from device.drivers.guardian import Guardian
-from device.drivers.ring import Apa102Ring
+from device.drivers.ring import Apa102Ring, LedRing, Tlc5971Ring
 from device.values import Illumination
+from tests.ports.emulators.wires import SINKS
 
 AIM_S, PAUSE_S, PICTURE_S, MAKE_S = 0.05, 0.02, 0.1, 0.03
 ENDS_AT_ROUND = 3
@@ -28,10 +29,17 @@ def stop_between_bytecodes(_number: int, _frame: object) -> None:
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def main(lease_s: float, end: str) -> None:
-    signal.signal(signal.SIGUSR1, stop_between_bytecodes)
+def opened(chip: str, lease_s: float) -> LedRing:
+    """Return the ring of a kind of chip on its emulated bus."""
+    if chip == "tlc5971":
+        return Tlc5971Ring(SINKS, Guardian(SINKS.device, chip="tlc5971"), lease_s)
     chain = ChainSpec()
-    ring = Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s)
+    return Apa102Ring(chain, Guardian(chain.device, chain.rows * chain.cols), lease_s)
+
+
+def main(lease_s: float, end: str, chip: str) -> None:
+    signal.signal(signal.SIGUSR1, stop_between_bytecodes)
+    ring = opened(chip, lease_s)
     os.write(1, b"ready\n")
     for turn in itertools.count():
         for glow, lit_s, dark_s in (
@@ -62,4 +70,4 @@ def finish(end: str) -> None:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]), sys.argv[2])
+    main(float(sys.argv[1]), sys.argv[2], sys.argv[3])

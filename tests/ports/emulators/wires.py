@@ -5,37 +5,32 @@ import json
 import os
 import subprocess
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+from device.config.head_file import SinkLedSpec, SinkSpec
 from device.values import Illumination
 from tests.ports.emulators.timeline import segments
 
 SERVE = Path(__file__).parent / "bus" / "serve.py"
 COLOURS = ("red", "green", "blue")
 FULL = 255
+SINKS = SinkSpec(  # the ring of imx296_power.toml on the second bus, with red LEDs instead of amber ones
+    device="/dev/spidev1.0",
+    green=SinkLedSpec(part="green", places=(37, 43, 26, 20), outputs=((0, 1), (3, 4), (6, 7), (9, 10)),
+                      wavelength_um=0.525, power_mw=60, emitter_mm=1.0),
+    red=SinkLedSpec(part="red", places=(44, 34, 19, 29), outputs=((2,), (5,), (8,), (11,)),
+                    wavelength_um=0.622, power_mw=15, emitter_mm=1.0),
+)  # fmt: skip
 
 
-class EmulatedBuses:
-    """SPI and I2C of a Raspberry Pi; `ring` is the number of LEDs at full light."""
+class LoggedChain:
+    """LEDs on one emulated SPI bus: its messages so far, and what is lit, from the log of the buses."""
 
-    def __init__(self, ring: int = 8) -> None:
-        if "umockdev" not in os.environ.get("LD_PRELOAD", ""):
-            raise RuntimeError("there are no buses here: run these tests by `make test`, or under umockdev-wrapper")
-        self.ring = ring
-        self.folder = Path(tempfile.mkdtemp(prefix="wires"))
-        plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
-        command = ["/usr/bin/python3", str(SERVE), str(self.folder)]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=plain)
-        atexit.register(self._end)
-        assert self._process.stdout is not None
-        os.environ["UMOCKDEV_DIR"] = self._process.stdout.readline().strip()
-        self._log = self.folder / "spi.jsonl"
+    def __init__(self, log: Path, glow: Callable[[dict], Illumination | None]) -> None:
+        self._log, self._glow = log, glow
         self._read, self._seen = 0, []
-
-    def set_faults(self, *faults: str) -> None:
-        """Set the active faults; without arguments, clear them."""
-        (self.folder / "faults").write_text("\n".join(faults), encoding="ascii")
 
     @property
     def messages(self) -> list[dict]:
@@ -47,16 +42,41 @@ class EmulatedBuses:
         return self._seen
 
     @property
-    def lit(self) -> dict[str, list[int]]:
-        """Return the LEDs that are lit now."""
+    def lit(self) -> dict:
+        """Return the LEDs of a matrix, or the outputs of TLC5971, that are lit now."""
         return self.messages[-1]["lit"] if self.messages else {}
 
     def __call__(self, begin_s: float, end_s: float) -> list[tuple[Illumination | None, float]]:
-        """Return the ring's illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
+        """Return the illumination between two moments, decoded from the bytes: a Lamp for an emulated sensor."""
         changes = [(0.0, None)] + [(one["at_s"], self._glow(one["lit"])) for one in self.messages]
         return segments(changes, begin_s, end_s)
 
-    def _glow(self, lit: dict[str, list[int]]) -> Illumination | None:
+
+class EmulatedBuses(LoggedChain):
+    """SPI and I2C of a Raspberry Pi: a matrix of APA102, and as `sinks` a TLC5971 on a bus of its own.
+
+    `ring` is the number of LEDs at full light.
+    """
+
+    def __init__(self, ring: int = 8) -> None:
+        if "umockdev" not in os.environ.get("LD_PRELOAD", ""):
+            raise RuntimeError("there are no buses here: run these tests by `make test`, or under umockdev-wrapper")
+        self.ring = ring
+        self.folder = Path(tempfile.mkdtemp(prefix="wires"))
+        super().__init__(self.folder / "spi.jsonl", self._matrix_glow)
+        self.sinks = LoggedChain(self.folder / "sinks.jsonl", sink_glow)
+        plain = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
+        command = ["/usr/bin/python3", str(SERVE), str(self.folder)]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=plain)
+        atexit.register(self._end)
+        assert self._process.stdout is not None
+        os.environ["UMOCKDEV_DIR"] = self._process.stdout.readline().strip()
+
+    def set_faults(self, *faults: str) -> None:
+        """Set the active faults; without arguments, clear them."""
+        (self.folder / "faults").write_text("\n".join(faults), encoding="ascii")
+
+    def _matrix_glow(self, lit: dict[str, list[int]]) -> Illumination | None:
         sums = [sum(levels[channel] for levels in lit.values()) for channel in range(3)]
         most = max(sums)
         return Illumination(COLOURS[sums.index(most)], min(1.0, most / (FULL * self.ring))) if most else None
@@ -66,6 +86,17 @@ class EmulatedBuses:
         self._process.wait()
         assert self._process.stdout is not None
         self._process.stdout.close()
+
+
+def sink_glow(lit: dict[str, float]) -> Illumination | None:
+    """Return the colour of SINKS whose outputs sink the most current, and its level."""
+    levels = {
+        colour: sum(lit.get(str(output), 0.0) for several in leds.outputs for output in several)
+        / sum(map(len, leds.outputs))
+        for colour, leds in SINKS.colours.items()
+    }
+    most = max(levels, key=levels.__getitem__)
+    return Illumination(most, min(1.0, levels[most])) if levels[most] > 0 else None
 
 
 @cache

@@ -23,6 +23,7 @@ export class PictureViewer extends HTMLElement {
   #tools = NEUTRAL;
   #bitmap = null;
   #mark = "";
+  #takenRedfree = false; // the picture itself is in green light only
   #previous = null; // the previous picture during the fade
   #fadeStartMs = 0;
   #loading = new AbortController(); // pending requests of this subject
@@ -78,7 +79,7 @@ export class PictureViewer extends HTMLElement {
     this.showAll();
   }
 
-  /** {url or blob, mark: "quick" | "final"} or null. The mark is published after its pixels are drawn. */
+  /** {url or blob, mark: "quick" | "final", redfree} or null. The mark is published after its pixels are drawn. */
   set src(src) {
     if (src?.url === this.#src?.url && src?.blob === this.#src?.blob) return;
     if (!src) this.#clear();
@@ -130,13 +131,15 @@ export class PictureViewer extends HTMLElement {
 
   // ---- picture and tools
 
-  async #load({ url, blob, mark }) {
+  async #load(src) {
+    const { url, blob, mark } = src;
     const { signal } = this.#loading;
     try {
       const bitmap = await (blob ? createImageBitmap(blob) : getBitmap(url, signal));
-      // The quick look is shown only until the final picture is loaded.
-      if (signal.aborted || (mark === "quick" && this.#mark === "final")) return;
-      this.#show(bitmap, mark);
+      // The quick look is shown only until the final picture is loaded, a final picture only while it is selected.
+      const isLate = mark === "quick" ? this.#mark === "final" : src !== this.#src;
+      if (signal.aborted || isLate) return;
+      this.#show(bitmap, src);
       const grey = pictureRenderer().isGrey(bitmap);
       this.dispatchEvent(new CustomEvent("drawn", { detail: { url, mark, grey } }));
     } catch {
@@ -144,13 +147,14 @@ export class PictureViewer extends HTMLElement {
     }
   }
 
-  #show(bitmap, mark) {
+  #show(bitmap, { mark, redfree }) {
     const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.#releaseBitmap(this.#previous);
     this.#previous = this.#bitmap;
     this.#fadeStartMs = bitmap && !reducedMotion ? performance.now() : -Infinity;
     this.#bitmap = bitmap;
     this.#mark = mark;
+    this.#takenRedfree = Boolean(redfree);
     this.dataset.drawn = ""; // written after the final draw
     this.#publishState();
     this.#redraw();
@@ -168,7 +172,7 @@ export class PictureViewer extends HTMLElement {
     this.#src = null;
     for (const bitmap of [this.#previous, this.#bitmap]) this.#releaseBitmap(bitmap);
     this.#previous = this.#bitmap = null;
-    this.#show(null, "");
+    this.#show(null, { mark: "" });
   }
 
   #setTools(patch) {
@@ -199,7 +203,7 @@ export class PictureViewer extends HTMLElement {
     this.#releaseBitmap(this.#previous);
     this.#previous = null;
     const { redfree, brightness, contrast } = this.#tools;
-    this.dataset.drawn = `${this.#mark} ${redfree ? "red-free" : "colour"} ${brightness} ${contrast}`;
+    this.dataset.drawn = `${this.#mark} ${redfree || this.#takenRedfree ? "red-free" : "colour"} ${brightness} ${contrast}`;
   }
 
   #drawBitmap(context, bitmap) {

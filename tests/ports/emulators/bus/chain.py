@@ -1,4 +1,4 @@
-"""Emulated chain of APA102 LEDs: received data are latched for as long as there is power."""
+"""Emulated chains of APA102 LEDs and of TLC5971 drivers: received data are latched as long as there is power."""
 
 START = bytes(4)
 FULL = 31
@@ -29,3 +29,40 @@ class Chain:
     def lit(self) -> dict[int, tuple[int, int, int]]:
         """Return the lit LEDs with their red, green and blue levels."""
         return {index: levels for index, levels in enumerate(self.levels) if any(levels)}
+
+
+PACKET, OUTPUTS, COMMAND, BLANK = 28, 12, 0x25, 1
+
+
+class Sinks:
+    """Chain of TLC5971 in the mode of the internal clock; dark after power-up, as BLANK is then set."""
+
+    def __init__(self, chips: int = 1) -> None:
+        self.register = bytes(PACKET * chips)
+        self.latched = [(0x94 << 24 | 0x20 << 16).to_bytes(4, "big") + bytes(24)] * chips
+        self.dead: set[int] = set()
+
+    def take(self, wire: bytes) -> None:
+        """Shift in a message; the pause of the clock after it latches every packet that begins with the command."""
+        self.register = (self.register + wire)[-len(self.register) :]
+        for chip in range(len(self.latched)):
+            end = len(self.register) - PACKET * chip
+            packet = self.register[end - PACKET : end]
+            if packet[0] >> 2 == COMMAND:
+                self.latched[chip] = packet
+
+    @property
+    def lit(self) -> dict[int, float]:
+        """Return the outputs that sink current, 0 to 1 of the resistor's current."""
+        found = {}
+        for chip, packet in enumerate(self.latched):
+            head = int.from_bytes(packet[:4], "big")
+            if head >> 21 & BLANK:
+                continue
+            for output in range(OUTPUTS):
+                at = PACKET - 2 * (output + 1)
+                grey = int.from_bytes(packet[at : at + 2], "big") / 0xFFFF
+                level = grey * (head >> 7 * (output % 3) & 0x7F) / 0x7F
+                if level > 0 and OUTPUTS * chip + output not in self.dead:
+                    found[OUTPUTS * chip + output] = round(level, 6)
+        return found

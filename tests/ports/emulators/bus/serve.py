@@ -1,10 +1,12 @@
 """Emulated SPI and I2C buses behind umockdev, in a process of its own: `/usr/bin/python3 serve.py FOLDER`.
 
 Prints the root that UMOCKDEV_DIR must name. Each SPI message is logged in FOLDER/spi.jsonl with its time
-(CLOCK_MONOTONIC, seconds), its bytes and the LEDs that are lit after it; each I2C message in FOLDER/i2c.jsonl with its
+(CLOCK_MONOTONIC, seconds), its bytes and the LEDs that are lit after it; those of the second bus, with a TLC5971, in
+FOLDER/sinks.jsonl, with the outputs that are lit; each I2C message in FOLDER/i2c.jsonl with its
 chip, direction and bytes. FOLDER/faults lists the active faults, one word to a line: "spi.short" (half a message
 arrives), "spi.cut" (the bus answers EIO), "i2c.silent" (no chip answers), "led.N" (LED N is dead), "power" (brown-out:
-the chain loses its latch), "memory.blank" (the EEPROM is as delivered).
+the chain loses its latch and takes nothing), "spi.latchup" (the chain keeps what it shows), "memory.blank" (the EEPROM
+is as delivered).
 """
 
 import json
@@ -16,7 +18,7 @@ from pathlib import Path
 import gi
 
 gi.require_version("UMockdev", "1.0")
-from chain import Chain  # noqa: E402
+from chain import Chain, Sinks  # noqa: E402
 from chips import Eeprom, Words  # noqa: E402
 from gi.repository import GLib, UMockdev  # noqa: E402
 
@@ -25,6 +27,11 @@ EIO, ENXIO, EINVAL, ENOTTY = 5, 6, 22, 25
 DEVICES = """P: /devices/platform/soc/spi0.0/spidev/spidev0.0
 N: spidev0.0
 E: DEVNAME=/dev/spidev0.0
+E: SUBSYSTEM=spidev
+
+P: /devices/platform/soc/spi1.0/spidev/spidev1.0
+N: spidev1.0
+E: DEVNAME=/dev/spidev1.0
 E: SUBSYSTEM=spidev
 
 P: /devices/platform/soc/i2c-1/i2c-dev/i2c-1
@@ -54,8 +61,9 @@ class Bus(UMockdev.IoctlBase):
 class Spi(Bus):
     """SPI controller with its settings and the connected chain."""
 
-    def __init__(self):
+    def __init__(self, power_up, log):
         super().__init__()
+        self.power_up = power_up
         self.settings = {
             1: 0,
             2: 0,
@@ -63,8 +71,8 @@ class Spi(Bus):
             4: 125_000_000,
             5: 0,
         }  # mode, bit order, bits, hertz as in a Pi's device tree, mode32
-        self.chain = Chain()
-        self.log = (FOLDER / "spi.jsonl").open("a", encoding="ascii")
+        self.chain = power_up()
+        self.log = (FOLDER / log).open("a", encoding="ascii")
 
     def answer(self, request, arg):
         size, number = (request >> 16) & 0x3FFF, request & 0xFF
@@ -103,11 +111,15 @@ class Spi(Bus):
         if "spi.cut" in active_faults:
             return -1
         if "power" in active_faults:
-            self.chain = Chain()
-            return len(wire)
+            self.chain = self.power_up()
+            return self.logged(wire)
         self.chain.dead = {int(name[4:]) for name in active_faults if name.startswith("led.")}
         arrived = wire[: len(wire) // 2] if "spi.short" in active_faults else wire
-        self.chain.take(arrived)
+        if "spi.latchup" not in active_faults:
+            self.chain.take(arrived)
+        return self.logged(arrived)
+
+    def logged(self, arrived):
         seen = {"at_s": time.monotonic(), "hz": self.settings[4], "bytes": len(arrived), "lit": self.chain.lit}
         self.log.write(json.dumps(seen | {"mode": self.settings[1], "hex": arrived.hex()}) + "\n")
         self.log.flush()
@@ -181,7 +193,8 @@ class I2c(Bus):
 
 testbed = UMockdev.Testbed.new()
 testbed.add_from_string(DEVICES)
-testbed.attach_ioctl("/dev/spidev0.0", Spi())
+testbed.attach_ioctl("/dev/spidev0.0", Spi(Chain, "spi.jsonl"))
+testbed.attach_ioctl("/dev/spidev1.0", Spi(Sinks, "sinks.jsonl"))
 # 25.0 C; 77.5 % and 3.88 V; a blank EEPROM of 4096 bytes
 chips = {0x48: Words({0: 0x0C80, 15: 0x0117}), 0x36: Words({2: 0xC200, 4: 0x4D80}), 0x50: Eeprom()}
 testbed.attach_ioctl("/dev/i2c-1", I2c(chips))

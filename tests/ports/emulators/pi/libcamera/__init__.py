@@ -92,7 +92,7 @@ class Camera:
 
     @property
     def properties(self):
-        arrangement = properties.draft.ColorFilterArrangementEnum.MONO
+        arrangement = properties.draft.ColorFilterArrangementEnum(self.sensor.arrangement)
         return {
             properties.Model: self.sensor.model, properties.Location: 2, properties.Rotation: 0,
             properties.PixelArraySize: self.sensor.size, properties.ColorFilterArrangement: arrangement,
@@ -104,7 +104,7 @@ class Camera:
         return {
             controls.AeEnable: ControlInfo(False, True, True),
             controls.ExposureTime: ControlInfo(29, 0, None),  # as some builds report for the IMX296: no maximum
-            controls.AnalogueGain: ControlInfo(1.0, 16.0, 1.0),
+            controls.AnalogueGain: ControlInfo(self.sensor.lowest_gain, 16.0, self.sensor.lowest_gain),
             controls.FrameDurationLimits: ControlInfo(self.sensor.shortest_frame_us, 15_534_385, None),
             controls.NoiseReductionMode: ControlInfo(0, 4, 0),
             controls.ScalerCrop: ControlInfo(whole, whole, whole),

@@ -1,0 +1,185 @@
+"""Colour pictures of an instrument: other colours of light, solved after the picture in green and joined to it.
+
+The picture in green is made first, and as if there were no other colour. What is left of the time budget is for the
+others: each is solved with its own PSF, stretched as green's was for the refraction of the eye, and joined to green on
+green's grid (`colour`). NUMERICS.md 10.4.
+"""
+
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from device.clock import Deadline
+from device.errors import FrameError
+from device.recon.colour import ColourPicture, join_colours
+from device.recon.estimation.psf_warp import InterpolatedOtf
+from device.recon.model.field_of_view import field_box, field_radius_px
+from device.recon.model.grid import disc
+from device.recon.model.kernels import Pixels
+from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
+from device.values import ChannelName, ChannelUse, Colour, Image, Reconstruction
+
+NO_TIME = "the time budget left no time for this colour"
+NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
+
+# Mean light of a colour over that of green: medians of the four photographs of NUMERICS.md 10.3, in linear light. They
+# set the hue until the calibration has a white reference: no level of a channel depends on lamp, sensor or diffuser.
+OVER_GREEN = (11.6, 1.0, 0.385)  # red, green, blue
+
+
+@dataclass(frozen=True)
+class ColourReconstruction(Reconstruction):
+    """Reconstruction in green with a picture in colour.
+
+    `colour`: linear float32 (rows, cols, 3), red, green and blue, cropped to the illuminated field.
+    """
+
+    colour: Image
+
+
+class ColourReconstructor:
+    """Solution of the frames in the other colours of light, and their joining to the picture in green.
+
+    `green` is the reconstructor of the pictures in green, `others` that of each other colour: with the PSF of that
+    colour, or `green` itself where one PSF holds for any colour. Between two steps they may make quick looks of other
+    frames. Not thread-safe.
+    """
+
+    def __init__(self, green: Reconstructor, others: Mapping[Colour, Reconstructor]) -> None:
+        calibration, shape = green.calibration, green.shape
+        self.others, self.clock, self.join_cost = others, green.clock, DurationEstimate()
+        self._otfs = {
+            colour: InterpolatedOtf(one.calibration.psfs[one.psf_index])
+            for colour, one in others.items()
+            if one is not green
+        }
+        self.box = field_box(calibration, shape)
+        radius_px, middle = field_radius_px(calibration), ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
+        self._field = disc(shape, middle, radius_px)[self.box]
+        if others:
+            noise = np.random.default_rng(0).random(shape, np.float32)
+            self._join({"green": noise, **dict.fromkeys(others, noise)}, 1)  # measures the cost
+
+    def steps(
+        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
+        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the steps of `green`, a pause after each round of the other colours, and the picture with its colours.
+
+        `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason
+        of each colour without a frame. `deadline` is also that of `green`; it moves by the time of the pauses. The
+        picture is a ColourReconstruction if another colour was solved; its report lists every colour.
+        """
+        run = _Run(self, deadline)
+        made = yield from run.green(green)
+        pictures: dict[Colour, Image] = {"green": made.picture}
+        reasons = dict(missing or {})
+        for colour, counts in frames.items():
+            try:
+                solved = yield from run.solve(colour, counts, dark, made.report.psf_scale)
+            except FrameError as error:
+                reasons[colour] = error.message
+                continue
+            if solved is None:
+                reasons[colour] = NO_TIME
+            else:
+                pictures[colour] = solved
+        gone = tuple(ChannelUse(colour, None, reason=reason) for colour, reason in reasons.items())
+        if len(pictures) == 1:
+            yield replace(made, report=replace(made.report, channels=(ChannelUse("green", (0.0, 0.0)), *gone)))
+            return
+        begin_s = self.clock.now_s()
+        joined, colour_picture = self._join(pictures, made.report.bin)
+        seconds = made.report.seconds | {"colour": run.spent_s + self.clock.now_s() - begin_s}
+        notes = tuple(NOT_REGISTERED.format(name) for name in joined.doubtful)
+        report = replace(
+            made.report, seconds=seconds, channels=(*joined.channels, *gone), warnings=(*made.report.warnings, *notes)
+        )
+        yield ColourReconstruction(made.picture, report, made.simulated or simulated, colour_picture)
+
+    def _join(self, pictures: Mapping[Colour, Image], n: int) -> tuple[ColourPicture, Image]:
+        """Return the channels, joined on the lit field only, and their picture in the hue of photographs."""
+        begin_s = self.clock.now_s()
+        cropped: dict[ChannelName, Image] = {
+            name: np.ascontiguousarray(picture[self.box]) for name, picture in pictures.items()
+        }
+        joined = join_colours(cropped, self._field, n)
+        picture = with_hue_of_photographs(joined.picture, self._field)
+        self.join_cost.add(self.clock.now_s() - begin_s)
+        return joined, picture
+
+    def refocus(self, colour: Colour, scale: float) -> None:
+        """Use the PSF of a colour stretched by `scale` in its last stage; 1 selects the stored PSF.
+
+        A colour that shares green's reconstructor has the PSF of the picture before.
+        """
+        if colour not in self._otfs:
+            return
+        stage = self.others[colour].stages[-1]
+        otf = stage.model.stored
+        if scale != 1:
+            otf = self._otfs[colour].on_grid(stage.grid.shape, stage.grid.n, scale * np.eye(2))
+        stage.refocus(otf, scale)
+
+
+class _Run:
+    """State of one picture: the time that the other colours have taken, and the deadline, which pauses move."""
+
+    def __init__(self, owner: ColourReconstructor, deadline: Deadline | None) -> None:
+        self._owner, self._deadline, self.spent_s = owner, deadline, 0.0
+
+    def green(self, steps: Iterator[Step]) -> Generator[Step, None, Reconstruction]:
+        """Yield the steps before the picture, and return the picture."""
+        for step in steps:
+            if isinstance(step, Reconstruction):
+                return step
+            yield from self._passed_on(step)
+        raise AssertionError("a reconstruction ends with a picture")
+
+    def solve(
+        self, colour: Colour, counts: Pixels, dark: Pixels | None, scale: float
+    ) -> Generator[Step, None, Image | None]:
+        """Yield a pause after each round of one colour, and return its picture; its PSF is stretched by `scale`.
+
+        None if no time is left for it. FrameError for a useless frame.
+        """
+        owner = self._owner
+        one, join_s = owner.others[colour], owner.join_cost.seconds
+        first = one.stages[0]
+        if not self._fits(join_s + first.start_cost.seconds + first.finish_cost.seconds):
+            owner.join_cost.halve_maximum()
+            return None
+        begin_s = owner.clock.now_s()
+        owner.refocus(colour, scale)
+        deadline = None if self._deadline is None else self._deadline.later(-join_s)
+        for step in one.steps(counts, dark, simulated=True, deadline=deadline, refract=False):
+            if isinstance(step, RoundDone):
+                paused_s = owner.clock.now_s()
+                yield from self._passed_on(step)
+                begin_s += owner.clock.now_s() - paused_s
+            elif isinstance(step, Reconstruction):
+                self.spent_s += owner.clock.now_s() - begin_s
+                return step.picture
+        raise AssertionError("a reconstruction ends with a picture")
+
+    def _fits(self, cost_s: float) -> bool:
+        return self._deadline is None or self._deadline.fits(cost_s)
+
+    def _passed_on(self, step: Step) -> Iterator[Step]:
+        """Yield a step; the deadline moves by the time until the consumer continues after a pause."""
+        begin_s = self._owner.clock.now_s()
+        yield step
+        if self._deadline is not None and isinstance(step, RoundDone):
+            self._deadline = self._deadline.later(self._owner.clock.now_s() - begin_s)
+
+
+def with_hue_of_photographs(picture: Image, field: Image) -> Image:
+    """Return a picture (rows, cols, 3) whose red and blue have the mean over the field that photographs have.
+
+    `field` is the lit field, (rows, cols) in 0..1. The mean of green stays. A channel without light stays as it is.
+    """
+    inside = field > 0.5
+    means = picture[inside].mean(axis=0, dtype=np.float64)
+    wanted = means[1] * np.array(OVER_GREEN)
+    return np.asarray(picture * np.where(means > 0, wanted / np.maximum(means, 1e-30), 1), np.float32)

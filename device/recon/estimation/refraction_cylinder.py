@@ -1,0 +1,52 @@
+"""Search for the cylinder of an eye: M, J0 and J45 of the highest likelihood, from the M of `refraction` on.
+
+The fine structure of |H|^2 is stretched differently along the two meridians. Without a cylinder in the model M itself
+is off: 0.15 instead of 0.08 dpt RMS for cylinders up to J = 1.5 dpt.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction_uncertainty import Quadratic, quadratic_model
+
+CIRCLES_DPT = (0.7, 1.4)  # |J| of the first candidates
+AXES = 8
+STEPS_DPT = (0.5, 0.3)  # of descent and quadratic model, in this order
+MOST_DESCENTS = 6
+MOST_CYLINDER_DPT = 3.0  # |J|
+
+Floats = NDArray[np.float64]
+
+
+def find_cylinder(edges: EdgeLikelihood, m_dpt: float, blocks: NDArray[np.int64]) -> Quadratic | None:
+    """Return the quadratic model of the likelihood at the best M, J0 and J45; None without a clear minimum.
+
+    `edges` is the likelihood of a frame whose field edge was found with `m_dpt`; the edge is estimated further.
+    """
+    turns = 2 * np.pi * np.arange(AXES) / AXES
+    first = [np.array([m_dpt, 0.0, 0.0])]
+    first += [np.array([m_dpt, j_dpt * np.cos(turn), j_dpt * np.sin(turn)]) for j_dpt in CIRCLES_DPT for turn in turns]
+    model = edges.edge_model(first[0])
+    eye_dpt = min(first, key=lambda eye_dpt: edges.near(eye_dpt, model).nats)
+    for step_dpt in STEPS_DPT:
+        edges.fit_smooth(eye_dpt)
+        found = quadratic_model(edges, _descend(edges, eye_dpt, step_dpt), step_dpt, blocks)
+        eye_dpt = found.minimum
+        if not found.is_minimum or np.hypot(*eye_dpt[1:]) > MOST_CYLINDER_DPT:
+            return None
+        edges.move_edge(edges(eye_dpt).step)
+    return found
+
+
+def _descend(edges: EdgeLikelihood, eye_dpt: Floats, step_dpt: float) -> Floats:
+    """Return the point downhill from an eye in steps along the three axes, at most MOST_DESCENTS of them."""
+    model = edges.edge_model(eye_dpt)
+    steps = [sign * step_dpt * axis for axis in np.eye(eye_dpt.size) for sign in (-1, 1)]
+    nats = edges.near(eye_dpt, model).nats
+    for _ in range(MOST_DESCENTS):
+        least, k = min((edges.near(eye_dpt + step, model).nats, k) for k, step in enumerate(steps))
+        if least >= nats:
+            break
+        nats, eye_dpt = least, eye_dpt + steps[k]
+    return eye_dpt

@@ -1,0 +1,56 @@
+"""Notation of a refraction: eye's wavefront, power vector of the correcting lens, and sphere, cylinder and axis.
+
+`Refraction` holds the wavefront on the sensor: x with the columns, y with the rows, positive M for myopia. The report
+holds the correcting lens, for the eye as the examiner sees it: x to the right, y up in the stored picture, angles
+counter-clockwise from the right (TABO). So M and J0 change their signs; J45 does not, because y does as well.
+
+Power vector after Thibos, Wheeler and Horner (1997), with a minus cylinder C on the axis alpha and sphere S:
+
+    M = S + C/2,    J0 = -C/2 cos 2 alpha,    J45 = -C/2 sin 2 alpha
+"""
+
+import math
+from typing import NamedTuple
+
+from device.recon.estimation.refraction import NoRefraction, Refraction
+
+REFRACTION_KEYS = (
+    "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
+    "refused",
+)  # fmt: skip
+
+
+class SphereCylinder(NamedTuple):
+    """Correcting lens: sphere and cylinder (not positive) in dpt, and its axis in degrees, above 0 and up to 180."""
+
+    sphere_dpt: float
+    cylinder_dpt: float
+    axis_deg: float
+
+
+def sphere_cylinder(m_dpt: float, j0_dpt: float, j45_dpt: float) -> SphereCylinder:
+    """Return the minus-cylinder notation of the power vector of a correcting lens; axis 180 without a cylinder."""
+    half_dpt = math.hypot(j0_dpt, j45_dpt)
+    axis_deg = math.degrees(math.atan2(j45_dpt, j0_dpt)) / 2 % 180
+    return SphereCylinder(m_dpt + half_dpt, -2 * half_dpt, axis_deg if axis_deg > 0 else 180.0)
+
+
+def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]:
+    """Return `refraction_dpt` of a report: the numbers and no reason, or the reason and no number.
+
+    Without a cylinder its figures are null.
+    """
+    report: dict[str, float | str | None] = dict.fromkeys(REFRACTION_KEYS)
+    if isinstance(found, NoRefraction):
+        return report | {"refused": found.reason}
+    report |= {
+        "sphere": -found.sphere_dpt, "sd": found.sd_dpt,
+        "field_deg": found.edge.diameter_deg, "field_deg_sd": found.edge.diameter_sd_deg,
+    }  # fmt: skip
+    if (cylinder := found.cylinder) is not None:
+        lens = sphere_cylinder(-found.sphere_dpt, -cylinder.j0_dpt, cylinder.j45_dpt)
+        report |= {
+            "j0": -cylinder.j0_dpt, "j0_sd": cylinder.j0_sd_dpt, "j45": cylinder.j45_dpt, "j45_sd": cylinder.j45_sd_dpt,
+            "sphere_sc": lens.sphere_dpt, "cylinder": lens.cylinder_dpt, "axis_deg": lens.axis_deg,
+        }  # fmt: skip
+    return report

@@ -1,0 +1,117 @@
+"""Settings of a card applied at boot: the root file system is volatile, so every boot writes networks, SSH and zone."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+from device.errors import DiffuscopeError
+from services.identity.card_settings import CardSettings, Ethernet, Wifi, head_path, kept_settings, take_settings
+
+CONNECTIONS = "run/NetworkManager/system-connections"
+OUTPUT = "run/diffuscope-settings"  # readable for the instrument: head file, programme, arguments, problem
+HOST_KEY = "ssh_host_ed25519_key"
+
+
+@dataclass(frozen=True)
+class CardBoot:
+    """Settings of a card at one boot; `root` is the root of its file system ("/" or a folder in tests)."""
+
+    root: Path = Path("/")
+
+    @property
+    def kept(self) -> Path:
+        """Folder of the settings on the data partition, which updates do not write."""
+        return self.root / "data/settings"
+
+    def run(self) -> DiffuscopeError | None:
+        """Take the file of the boot partition, apply what is kept, and publish a problem; return it, else None."""
+        release, zones = self.root / "opt/diffuscope", self.root / "usr/share/zoneinfo"
+        problem = take_settings(self.root / "boot/chooser", self.kept, release, zones)
+        try:
+            self._apply(kept_settings(self.kept), release)
+        except DiffuscopeError as error:
+            problem = problem or error
+        self._publish(problem)
+        return problem
+
+    def _apply(self, settings: CardSettings, release: Path) -> None:
+        output, arguments = self.root / OUTPUT, {}
+        for file in sorted(self.kept.glob("*.toml")):
+            if file.name not in ("diffuscope.toml", "update.toml"):
+                self._write_public(file.name, file.read_text(encoding="utf-8"))
+        if settings.head is not None:
+            arguments["HEAD"] = str(_from_root(head_path(settings.head, output, release), self.root))
+        if settings.programme is not None:
+            arguments["PROGRAMME"] = f"--protocol {_from_root(output / settings.programme, self.root)}"
+        self._write_public("instrument.env", "".join(f"{name}={value}\n" for name, value in arguments.items()))
+        if settings.time_zone is not None:
+            zone = self.root / "etc/localtime"
+            zone.unlink(missing_ok=True)
+            zone.symlink_to(f"/usr/share/zoneinfo/{settings.time_zone}")
+        if settings.wifi is not None:
+            self._write_private(f"{CONNECTIONS}/wifi.nmconnection", wifi_profile(settings.wifi))
+        if settings.ethernet is not None:
+            self._write_private(f"{CONNECTIONS}/ethernet.nmconnection", ethernet_profile(settings.ethernet))
+        if (updates := self.kept / "update.toml").exists():
+            shutil.copyfile(updates, self.root / "etc/diffuscope/update.toml")
+        self._apply_ssh(settings)
+
+    def _apply_ssh(self, settings: CardSettings) -> None:
+        """Write the public keys, and create the host key once; ssh.service runs only if the file of keys exists."""
+        if settings.ssh is None:
+            return
+        if not (self.kept / HOST_KEY).exists():
+            words = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(self.kept / HOST_KEY)]
+            subprocess.run(words, check=True)
+        self._write_private("run/diffuscope-ssh/authorized_keys", "".join(f"{key}\n" for key in settings.ssh.keys))
+
+    def _publish(self, problem: DiffuscopeError | None) -> None:
+        """Write the problem for the page and onto the console, or remove an earlier one."""
+        console = self.root / "run/issue.d/settings.issue"
+        for file in (self.root / OUTPUT / "problem.json", console):
+            file.unlink(missing_ok=True)
+        if problem is not None:
+            self._write_public("problem.json", json.dumps({"message": problem.message, "remedy": problem.remedy}))
+            text = f"\n  The settings of the card were not taken: {problem.message}\n  {problem.remedy}\n\n"
+            self._write_private("run/issue.d/settings.issue", text)
+
+    def _write_public(self, name: str, content: str) -> None:
+        """Write a file into OUTPUT, readable for every user; the umask of the unit is 077."""
+        folder = self.root / OUTPUT
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o755)
+        (folder / name).write_text(content, encoding="utf-8")
+        (folder / name).chmod(0o644)
+
+    def _write_private(self, name: str, content: str) -> None:
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch(mode=0o600)
+        path.write_text(content)
+
+
+def wifi_profile(wifi: Wifi) -> str:
+    """Return the NetworkManager profile (keyfile) of a Wi-Fi network."""
+    security = f"\n[wifi-security]\nkey-mgmt=wpa-psk\npsk={_escaped(wifi.password)}\n" if wifi.password else ""
+    head = f"[connection]\nid=wifi\ntype=wifi\n\n[wifi]\nmode=infrastructure\nssid={_escaped(wifi.name)}\n"
+    return f"{head}{security}\n[ipv4]\nmethod=auto\n"
+
+
+def ethernet_profile(ethernet: Ethernet) -> str:
+    """Return the NetworkManager profile (keyfile) of a fixed Ethernet address."""
+    gateway = f",{ethernet.gateway}" if ethernet.gateway else ""
+    dns = f"dns={';'.join(map(str, ethernet.dns))};\n" if ethernet.dns else ""
+    address = f"address1={ethernet.address}{gateway}\n"
+    return f"[connection]\nid=ethernet\ntype=ethernet\n\n[ethernet]\n\n[ipv4]\nmethod=manual\n{address}{dns}"
+
+
+def _escaped(text: str) -> str:
+    """Return a value of a keyfile: backslashes doubled, a leading space as an escape (GLib key files)."""
+    doubled = text.replace("\\", "\\\\")
+    return f"\\s{doubled[1:]}" if doubled.startswith(" ") else doubled
+
+
+def _from_root(path: Path, root: Path) -> Path:
+    return Path("/") / path.relative_to(root)

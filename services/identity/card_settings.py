@@ -1,0 +1,152 @@
+"""Settings of a card: one file `diffuscope.toml` on its first partition, edited on a laptop before the first boot.
+
+Each boot reads the file, keeps it on the data partition, and overwrites the Wi-Fi password in it. An invalid file is
+reported and changes nothing.
+"""
+
+import re
+from ipaddress import IPv4Address, IPv4Interface
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from device import atomic_io
+from device.config.head_file import load_head
+from device.config.toml_file import Table, load_toml
+from device.errors import DiffuscopeError, SpecError
+from services.records.protocol import load_protocol
+
+FILE = "diffuscope.toml"
+PASSWORD = re.compile(rb'^([ \t]*password[ \t]*=[ \t]*)(["\'])(.*?)\2', re.MULTILINE)
+KEPT = re.compile(r"\*+")  # what is left of a password on the first partition
+
+
+class Wifi(Table):
+    """Wi-Fi network that the device joins; without a password: an open network. Stars stand for the kept password."""
+
+    name: str = Field(min_length=1, max_length=32)
+    password: str = Field(default="", max_length=63)
+
+    @model_validator(mode="after")
+    def _password_is_long_enough(self) -> Self:
+        if 0 < len(self.password) < 8:
+            raise ValueError("a Wi-Fi password has 8 to 63 characters")
+        return self
+
+
+class Ethernet(Table):
+    """Fixed address of the Ethernet port; without this table the network assigns one (DHCP)."""
+
+    address: IPv4Interface
+    gateway: IPv4Address | None = None
+    dns: tuple[IPv4Address, ...] = ()
+
+
+class Ssh(Table):
+    """Public keys that may log in as root; without one the SSH server stays off."""
+
+    keys: tuple[str, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _keys_are_public_keys(self) -> Self:
+        for key in self.keys:
+            if not re.fullmatch(r"(ssh-ed25519|ssh-rsa|ecdsa-sha2-\S+|sk-\S+) [A-Za-z0-9+/=]{40,}( [^\n]*)?", key):
+                raise ValueError("a key is the one line of a file such as id_ed25519.pub")
+        return self
+
+
+class CardSettings(Table):
+    """Content of `diffuscope.toml`; an absent key leaves what the card has.
+
+    `head`: a head file of the release, or the name of a file `NAME.toml` beside; `programme`: name of a file beside.
+    """
+
+    time_zone: str | None = Field(default=None, pattern="^[A-Za-z0-9_+-]+(/[A-Za-z0-9_+-]+)*$")
+    head: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+([.]toml)?$")
+    programme: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+[.]toml$")
+    wifi: Wifi | None = None
+    ethernet: Ethernet | None = None
+    ssh: Ssh | None = None
+
+
+def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> DiffuscopeError | None:
+    """Keep the settings of the boot partition in the folder `kept`; return the error of an invalid file, else None.
+
+    `boot`: folder of `diffuscope.toml`; `release`: folder of the installed program; `zones`: folder of the time zones.
+    Without a file nothing changes. After an error the kept settings are as before. The password on the boot partition
+    is overwritten after the settings are durable, so that a power cut loses neither.
+    """
+    source = boot / FILE
+    if not source.exists():
+        return None
+    try:
+        settings = load_toml(source, CardSettings)
+        content = source.read_bytes()
+        if settings.wifi is not None and settings.wifi.password:
+            content = _with_known_password(content, settings.wifi, kept)
+        beside = _files_beside(settings, boot, release, zones)
+        atomic_io.make_folder(kept)
+        kept.chmod(0o700)
+        for name, text in beside.items():
+            atomic_io.write_atomically(kept / name, text, 0o600)
+        atomic_io.write_atomically(kept / FILE, content, 0o600)
+        _overwrite_password(source)
+    except DiffuscopeError as error:
+        return error
+    except OSError as error:
+        return SpecError(f"{FILE} cannot be kept: {error}", "Make room on the card, or write the card again.")
+    return None
+
+
+def kept_settings(kept: Path) -> CardSettings:
+    """Return the settings on the data partition; the defaults if there are none. SpecError if they are damaged."""
+    return load_toml(kept / FILE, CardSettings) if (kept / FILE).exists() else CardSettings()
+
+
+def _with_known_password(content: bytes, wifi: Wifi, kept: Path) -> bytes:
+    """Return the file with the kept password of the network in place of stars; otherwise unchanged.
+
+    SpecError if none is kept, or if the password cannot be overwritten in place.
+    """
+    written = PASSWORD.search(content)
+    if written is None or written[3] != wifi.password.encode():
+        message = f"{FILE}: wifi.password: it cannot be removed from this file again"
+        raise SpecError(message, "Write it on a line of its own, between single quotes if it has a backslash or quote.")
+    if not KEPT.fullmatch(wifi.password):
+        return content
+    before = kept_settings(kept).wifi
+    if before is None or before.name != wifi.name:
+        message = f"{FILE}: wifi.password: no password of {wifi.name!r} is kept"
+        raise SpecError(message, "Write the password into the file.")
+    known = PASSWORD.search((kept / FILE).read_bytes())
+    assert known is not None, "a kept network has a password"
+    return PASSWORD.sub(lambda found: found[1] + known[2] + known[3] + known[2], content, count=1)
+
+
+def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path) -> dict[str, bytes]:
+    """Return the head file and programme beside the settings by name, checked; SpecError for one that is not valid."""
+    if settings.time_zone is not None and not (zones / settings.time_zone).is_file():
+        raise SpecError(f"{FILE}: time_zone: {settings.time_zone!r} is none", "Write one such as Asia/Kolkata.")
+    if settings.programme is not None:
+        load_protocol(boot / settings.programme)
+    if settings.head is not None:
+        load_head(head_path(settings.head, boot, release))
+    names = {path.name for path in boot.glob("*.toml")} - {FILE}  # also the sensors that a head file names
+    return {name: (boot / name).read_bytes() for name in sorted(names)}
+
+
+def head_path(head: str, folder: Path, release: Path) -> Path:
+    """Return the path of a head file: in `folder` if its name ends with `.toml`, else of the release."""
+    return folder / head if head.endswith(".toml") else release / "hardware" / "heads" / f"{head}.toml"
+
+
+def _overwrite_password(source: Path) -> None:
+    """Replace the password in the file by stars of the same length, in place: the old bytes are gone from the card."""
+    content = source.read_bytes()
+    hidden = PASSWORD.sub(lambda found: found[1] + found[2] + b"*" * len(found[3]) + found[2], content)
+    if hidden == content:
+        return
+    with source.open("r+b") as file:
+        file.write(hidden)
+    atomic_io.fsync_file(source)

@@ -1,0 +1,194 @@
+"""Montages of the visits: the chosen pictures of one eye joined to one, computed beside the exam.
+
+A montage is computed in a subprocess of the lowest priority, which is stopped while a picture is taken or live pictures
+are requested. Results are kept in memory by the digests of their pictures, so that another choice, a retake or a
+corrected eye gives another montage, and the removal of a picture needs no further step.
+"""
+
+import hashlib
+import logging
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from threading import Condition, Thread
+from typing import Literal
+
+from device.errors import DiffuscopeError
+from device.recon.montage import Placement, make_montage
+from device.values import Eye
+from services.imaging.picture_files import read_png, to_png
+from services.instrument.background import run_in_subprocess
+from services.records.capture import NO_METHOD
+from services.records.capture_store import CaptureStore
+from services.records.protocol import Protocol
+from services.records.visit import Visit
+
+log = logging.getLogger(__name__)
+
+PICTURE = "picture.png"
+MOST_KEPT = 16  # montages in memory, about 1 MB each
+MOST_WAITING = 8
+POLL_S = 0.2
+
+MontageState = Literal["none", "computing", "joined", "apart", "failed"]
+
+
+@dataclass(frozen=True)
+class VisitPicture:
+    """Chosen picture of a slot; `digest` is the SHA-256 of its file."""
+
+    slot: str
+    capture: str
+    digest: str
+    simulated: bool
+
+
+@dataclass(frozen=True)
+class JoinedPictures:
+    """Places of pictures in their order, and the montage as PNG, None if fewer than two pictures were joined."""
+
+    placed: tuple[Placement, ...]
+    png: bytes | None
+
+
+@dataclass(frozen=True)
+class VisitMontage:
+    """Montage of one eye of a visit at one moment.
+
+    `state`: `none` with fewer than two pictures; `computing`, also while it waits for the camera; `joined`; `apart` if
+    no two pictures could be joined; `failed` with `problem`. `digest` names the set of pictures.
+    """
+
+    pictures: tuple[VisitPicture, ...]
+    digest: str
+    state: MontageState
+    made: JoinedPictures | None = None
+    problem: DiffuscopeError | None = None
+
+
+class MontageMaker:
+    """Montages of a store, computed one after the other in a thread that ends when none is requested.
+
+    The mutex `_lock` guards the waiting requests, the results and `_is_busy`; it is held over no computation.
+    `is_idle` returns whether background work may run.
+    """
+
+    def __init__(self, store: CaptureStore, is_idle: Callable[[], bool]) -> None:
+        self._store, self._is_idle = store, is_idle
+        self._lock = Condition()
+        self._waiting: OrderedDict[str, tuple[VisitPicture, ...]] = OrderedDict()
+        self._kept: OrderedDict[str, JoinedPictures | DiffuscopeError] = OrderedDict()
+        self._is_busy = self._is_closed = False
+
+    def montage(self, visit: Visit, protocol: Protocol, eye: Eye) -> VisitMontage:
+        """Return the montage of the chosen pictures of an eye as far as it is known, and request it if it is not.
+
+        Errors: StoreDamaged, RecordNotFound for a chosen picture whose record cannot be read.
+        """
+        pictures = self._pictures(visit, protocol, eye)
+        digest = hashlib.sha256(" ".join(one.digest for one in pictures).encode()).hexdigest()
+        if len(pictures) < 2:
+            return VisitMontage(pictures, digest, "none")
+        with self._lock:
+            known = self._kept.get(digest)
+            if known is None:
+                self._request(digest, pictures)
+                return VisitMontage(pictures, digest, "computing")
+            self._kept.move_to_end(digest)
+        if isinstance(known, DiffuscopeError):
+            return VisitMontage(pictures, digest, "failed", problem=known)
+        return VisitMontage(pictures, digest, "apart" if known.png is None else "joined", known)
+
+    def close(self) -> None:
+        """End a running computation; its process is killed within a poll interval."""
+        with self._lock:
+            self._is_closed = True
+            self._waiting.clear()
+            self._lock.notify_all()
+            self._lock.wait_for(lambda: not self._is_busy, timeout=5)
+
+    def _pictures(self, visit: Visit, protocol: Protocol, eye: Eye) -> tuple[VisitPicture, ...]:
+        """Return the chosen reconstructed pictures of an eye, in the order of the programme."""
+        found = []
+        for slot in protocol.slots:
+            chosen = visit.slots[slot.id].chosen if slot.eye == eye and slot.id in visit.slots else None
+            if chosen is None:
+                continue
+            capture = self._store.get(chosen.capture)
+            if capture.report.reconstruction.method != NO_METHOD and PICTURE in capture.files:
+                found.append(VisitPicture(slot.id, capture.id, capture.files[PICTURE], capture.simulated))
+        return tuple(found)
+
+    def _request(self, digest: str, pictures: tuple[VisitPicture, ...]) -> None:
+        if self._is_closed:
+            return
+        self._waiting.setdefault(digest, pictures)
+        while len(self._waiting) > MOST_WAITING:  # the screen that asked for it asks again
+            self._waiting.popitem(last=False)
+        if not self._is_busy:
+            self._is_busy = True
+            Thread(target=self._run, name="montage", daemon=True).start()
+
+    def _run(self) -> None:
+        """Compute the requested montages, the latest first, until none is left."""
+        while True:
+            with self._lock:
+                if self._is_closed or not self._waiting:
+                    self._is_busy = False
+                    self._lock.notify_all()
+                    return
+                if not self._is_idle():
+                    self._lock.wait(POLL_S)
+                    continue
+                digest, pictures = next(reversed(self._waiting.items()))
+            try:
+                made: JoinedPictures | DiffuscopeError = self._computed(pictures)
+            except DiffuscopeError as error:
+                log.warning("no montage: %s", error)
+                made = error
+            with self._lock:
+                self._waiting.pop(digest, None)
+                if not self._is_closed:
+                    self._kept[digest] = made
+                while len(self._kept) > MOST_KEPT:
+                    self._kept.popitem(last=False)
+
+    def _computed(self, pictures: Sequence[VisitPicture]) -> JoinedPictures:
+        content = [self._store.read(one.capture, PICTURE) for one in pictures]
+        simulated = any(one.simulated for one in pictures)
+        joined: JoinedPictures = run_in_subprocess(
+            join_pictures, content, simulated, report=lambda _: None, may_run=self._may_run
+        )
+        return joined
+
+    def _may_run(self) -> bool:
+        if self._is_closed:
+            raise DiffuscopeError("the instrument is being switched off", "Wait until it is back.")
+        return self._is_idle()
+
+
+def join_pictures(content: Sequence[bytes], simulated: bool, progress: Callable[[int], None]) -> JoinedPictures:
+    """Return the montage of stored pictures (PNG); `progress` gets the number of placed pictures.
+
+    Pictures of another size than the first one come from another calibration and stay apart. FrameError for a file that
+    is no picture, or black. Numbers are rounded to what they mean: 0.1 pixels and degrees, 0.01 of peak and overlap.
+    """
+    pictures = [read_png(one) for one in content]
+    fitting = [k for k, one in enumerate(pictures) if one.shape == pictures[0].shape]
+    joined = make_montage([pictures[k] for k in fitting], progress)
+    placed = {k: replace(_rounded(one), index=k) for k, one in zip(fitting, joined.placed, strict=True)}
+    for k in range(len(pictures)):
+        if k not in placed:
+            placed[k] = Placement(k, False, None, None, None, None, "it was taken with another calibration")
+    is_joined = sum(one.used for one in placed.values()) > 1
+    png = to_png(joined.picture, simulated, "montage") if is_joined else None
+    return JoinedPictures(tuple(placed[k] for k in range(len(pictures))), png)
+
+
+def _rounded(one: Placement) -> Placement:
+    shift_px = None if one.shift_px is None else (round(one.shift_px[0], 1), round(one.shift_px[1], 1))
+    turn_deg, peak, overlap = (
+        None if value is None else round(value, digits)
+        for value, digits in ((one.rotation_deg, 1), (one.peak, 2), (one.overlap, 2))
+    )
+    return replace(one, shift_px=shift_px, rotation_deg=turn_deg, peak=peak, overlap=overlap)

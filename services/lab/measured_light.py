@@ -1,0 +1,120 @@
+"""Power meter's reading of a ring: its plausibility, its shares of the limits, and the lines of the head file."""
+
+from dataclasses import dataclass
+from math import pi, radians, tan
+from typing import get_args
+
+from device.config.head_file import InstrumentSpec
+from device.config.radiometry import WAIST_CM2, BeamSpec, RadiometrySpec
+from device.errors import SettingError, SpecError
+from device.light_safety.hazard import LED_POWER_UNCERTAINTY, Hazard, light_limits, radiometry
+from device.optics.budget import Design
+from device.optics.illumination import TRANSMISSION_TO_EYE
+from device.optics.light_budget import chain, product
+from device.optics.matrix import lamps_of
+from device.values import Colour
+from services.lab.light_report import LimitShare, limit_shares, permitted_level
+
+PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
+
+
+@dataclass(frozen=True)
+class MeterReading:
+    """Reading of the whole ring in one colour at full drive: power into a pupil of 7 mm, mW, and in the waist.
+
+    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date.
+    """
+
+    colour: Colour
+    power_mw: float
+    waist_mw_per_cm2: float
+    peak_nm: float
+    meter: str
+    guard_factor: float = 1.3
+
+
+@dataclass(frozen=True)
+class MeteredLight:
+    """Judged reading: radiometry for the head file, shares of the limits at full drive, permitted drive."""
+
+    radiometry: RadiometrySpec
+    shares: tuple[LimitShare, ...]
+    permitted_level: float
+
+    @property
+    def is_go(self) -> bool:
+        """Whether the ring may shine at full drive into an eye, as far as its light is concerned."""
+        return self.permitted_level >= 1
+
+
+def in_colour(spec: InstrumentSpec, colour: str) -> InstrumentSpec:
+    """Return the head with another colour for its pictures; SettingError for a word that is no colour."""
+    known: tuple[Colour, ...] = get_args(Colour)
+    found = next((one for one in known if one == colour), None)
+    if found is None:
+        raise SettingError(f"no colour is called {colour!r}", f"Choose one of {', '.join(known)}.")
+    return spec.model_copy(update={"light": spec.light.model_copy(update={"colour": found})})
+
+
+def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> MeteredLight:
+    """Return the judgement of a reading; `design` is that of the head in the reading's colour.
+
+    SpecError for a head without LEDs of its own, or not of that colour. SettingError for a reading that such LEDs
+    cannot give: more power than lossless optics with LEDs twice as bright, more in the waist's disc than in the beam,
+    another wavelength; and for one below a thousandth of what is expected, of a lamp that was off.
+    """
+    lamp = (lamps_of(spec) or {}).get(reading.colour)
+    if lamp is None:
+        raise SpecError(f"{spec.name} has no {reading.colour} LEDs", "Give the head file whose ring was measured.")
+    factors = chain(design)
+    names = [factor.name for factor in factors]
+    expected_mw = product(factors[: names.index("lit retina")])
+    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw)
+    lit_cm2 = pi * (design.eye_mm / 10 * tan(radians(design.optics.field_deg / 2))) ** 2
+    beam = BeamSpec(
+        wavelength_um=reading.peak_nm / 1000, retina_mw_per_cm2=reading.power_mw / lit_cm2,
+        waist_mw_per_cm2=reading.waist_mw_per_cm2,
+    )  # fmt: skip
+    found = RadiometrySpec(
+        measured=reading.meter, guard_factor=reading.guard_factor, **{reading.colour: beam}
+    )  # the other colours stay at their worst
+    limits = light_limits()
+    beams = radiometry(found, design.optics.field_deg, lamps=lamps_of(spec))
+    shares = limit_shares(design, Hazard(beams, limits).beams[reading.colour], limits)
+    return MeteredLight(found, shares, permitted_level(shares))
+
+
+def _refuse_implausible(reading: MeterReading, wavelength_um: float, expected_mw: float) -> None:
+    most_mw = expected_mw * LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE
+    if not expected_mw / 1000 < reading.power_mw <= most_mw:
+        raise SettingError(
+            f"{reading.power_mw:g} mW are not between {expected_mw / 1000:.2g} and {most_mw:.2g} mW, which such a ring "
+            f"can give; {expected_mw:.2g} mW are expected",
+            "Check the meter's range and wavelength, that the lamp was on in this colour, and the head file.",
+        )
+    if reading.waist_mw_per_cm2 * WAIST_CM2 > 1.3 * reading.power_mw:
+        raise SettingError(
+            f"{reading.waist_mw_per_cm2:g} mW/cm2 over a disc of 1 mm are more than the {reading.power_mw:g} mW of "
+            "the whole beam",
+            "Measure both again.",
+        )
+    if abs(reading.peak_nm / 1000 - wavelength_um) > PEAK_TOLERANCE_UM:
+        raise SettingError(
+            f"a peak at {reading.peak_nm:g} nm is not that of LEDs of {1000 * wavelength_um:.0f} nm",
+            "Check the spectrometer, and which LEDs are fitted.",
+        )
+
+
+def words(reading: MeterReading, found: MeteredLight) -> str:
+    """Return the shares of the limits, GO or NO GO, and the lines for the head file."""
+    beam = found.radiometry.beam(reading.colour)
+    assert beam is not None
+    verdict = "GO: full drive keeps every limit" if found.is_go else (
+        f"NO GO at full drive: the guard permits {found.permitted_level:g} of it"
+    )  # fmt: skip
+    return "\n".join([
+        *(f"{one.name:<14} {one.value:>9.3g} of {one.limit:g} {one.unit}: {one.used:.0%}" for one in found.shares),
+        verdict, "", "[light.radiometry]", f'measured = "{reading.meter}"', f"guard_factor = {reading.guard_factor:g}",
+        f"[light.radiometry.{reading.colour}]", f"wavelength_um = {beam.wavelength_um:g}",
+        f"retina_mw_per_cm2 = {beam.retina_mw_per_cm2:.4g}", f"waist_mw_per_cm2 = {beam.waist_mw_per_cm2:g}",
+    ])  # fmt: skip

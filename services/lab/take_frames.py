@@ -1,0 +1,34 @@
+"""Raw frames of a head without its lamp, as `diffuscope frame` takes them: one TIFF, the mean of several exposures."""
+
+from pathlib import Path
+
+import numpy as np
+
+from device.atomic_io import write_atomically
+from device.clock import Clock
+from device.config.head_file import load_head
+from device.head import open_bench
+from device.values import ExposureSettings, Frame
+from services.imaging.picture_files import raw_tiff
+from services.imaging.raw_metadata import RawMetadata
+
+
+def take_frames(head: Path, output: Path, count: int, exposure_s: float | None, clock: Clock) -> Frame:
+    """Write the rounded mean of `count` frames, lamp dark, to a raw TIFF with its metadata; return the last frame.
+
+    `exposure_s` None: that of the head file. The errors of the head's parts, and StoreError if the file cannot be
+    written. The TIFF is marked as simulated only if the frames are.
+    """
+    spec = load_head(head)
+    shot = ExposureSettings(exposure_s or spec.camera.exposure_s)
+    bench = open_bench(spec, clock)
+    try:
+        total = np.zeros(bench.camera.shape, np.float64)
+        for _ in range(count):
+            frame = bench.camera.expose(shot)
+            total += frame.counts
+    finally:
+        bench.close()
+    metadata = RawMetadata(taken_at=clock.wall(), exposure_s=shot.exposure_s, simulated=frame.simulated, head=spec.name)
+    write_atomically(output, raw_tiff(np.rint(total / count).astype(np.uint16), metadata))
+    return frame

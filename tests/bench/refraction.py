@@ -1,0 +1,311 @@
+"""`make bench-refraction DATA=folder`: refraction and field edge from textbook frames, against the acceptance lines.
+
+Frames of photographs behind the textbook optics (`tests/textbook`), M from -6 to 6 dpt, full and a fifth of the light.
+Half of them have a field edge that deviates from the calibration: 0.2 deg too large, 0.1 deg too small, 0.1 deg off
+centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope reconstruct`, and its
+report is scored. Exit status 1 if a line fails.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as Photograph
+
+from device.clock import SystemClock
+from device.recon.model.fft_plans import Planner
+from device.recon.reconstructor import Reconstructor
+from device.values import Calibration, Geometry, Psf, Sensor
+from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees, photographed
+from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
+
+PHOTOGRAPHS = (
+    "skimage/retina.jpg", "hrf/images/06_dr.JPG", "hrf/images/07_h.jpg", "hrf/images/09_g.jpg",
+    "chase/Image_01L.jpg", "chase/Image_05R.jpg", "chase/Image_11L.jpg",
+)  # fmt: skip
+IMX296 = Camera((1088, 1456), 10000.0, 2.2, 10, 60.0)
+QUANTALUX = Camera((1080, 1920), 23000.0, 1.0, 12, 64.0)
+PITCH_UM = {IMX296: 3.45, QUANTALUX: 5.04}
+PSF_FRAMES = 16
+PLANNER = Planner(None, effort="FFTW_ESTIMATE")
+PEAK = 0.85  # of the full well
+
+
+@dataclass(frozen=True)
+class Case:
+    """One frame: sensor, calibrated field in degrees, true edge, eye, light as a share of the usual, and seed."""
+
+    camera: Camera
+    field_deg: float
+    edge: FieldEdge
+    eye: tuple[float, ...]  # M, J0, J45 of the correcting lens, dpt
+    photo: str
+    light: float
+    seed: int
+    zoom: float = 1.0
+    turn_deg: float = 0.0
+
+
+def cases(
+    camera: Camera, field_deg: float, count: int, seed: int, cylinder_dpt: float = 0.0, name: str = ""
+) -> Iterator[Case]:
+    """Yield `count` cases, every second with an edge that deviates from the calibration."""
+    rng = np.random.default_rng((seed, *name.encode(), camera.bits, round(10 * field_deg), round(10 * cylinder_dpt)))
+    for k in range(count):
+        deviations = (
+            FieldEdge(field_deg - 0.2), FieldEdge(field_deg + 0.1), off_centre(field_deg, rng),
+            FieldEdge(field_deg, width_deg=float(rng.uniform(0.3, 2))),
+        )  # fmt: skip
+        turned = bool(rng.integers(2))  # the photograph's own round border is outside the field, or on it
+        yield Case(
+            camera, field_deg, FieldEdge(field_deg) if k % 2 else deviations[k // 2 % 4],
+            (float(rng.uniform(-6, 6)), *(float(j) for j in rng.uniform(-cylinder_dpt, cylinder_dpt, 2))),
+            PHOTOGRAPHS[int(rng.integers(len(PHOTOGRAPHS)))], 1.0 if rng.random() < 2 / 3 else 0.2,
+            int(rng.integers(2**31)), float(rng.uniform(1.15, 1.6)) if turned else 1.0,
+            float(rng.uniform(0, 360)) if turned else 0.0,
+        )  # fmt: skip
+
+
+def off_centre(field_deg: float, rng: np.random.Generator) -> FieldEdge:
+    """Return an edge 0.1 deg off centre in a random direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return FieldEdge(field_deg, float(0.1 * np.cos(angle)), float(0.1 * np.sin(angle)))
+
+
+@cache
+def surface(pitch_um: float, head: int) -> Plane:
+    """Return the diffuser of one head."""
+    return diffuser(Optics(pitch_um), 1280 if pitch_um < 4 else 960, head)
+
+
+@cache
+def measured_psf(pitch_um: float, head: int) -> Psf:
+    """Return the PSF as calibrated: the mean of PSF_FRAMES noisy frames of a point source with a peak of 8000 e-."""
+    light, rng = caustic(Optics(pitch_um), surface(pitch_um, head), Prescription()), np.random.default_rng(head)
+    electrons = light / light.max() * 8000 * PSF_FRAMES
+    noisy = rng.poisson(np.maximum(electrons, 0)) + rng.normal(0, 2 * PSF_FRAMES**0.5, light.shape)
+    return Psf((noisy / noisy.sum()).astype(np.float32))
+
+
+@cache
+def photograph(path: Path) -> Plane:
+    """Return the green channel of a photograph, 0 to 1, cut to the square around its lit circle."""
+    green = np.asarray(Photograph.open(path), np.float64)[..., 1] / 255
+    lit = green > 0.08
+    rows, cols = np.flatnonzero(lit.mean(axis=1) > 0.02), np.flatnonzero(lit.mean(axis=0) > 0.02)
+    side = int(cols[-1] - cols[0] + 1)
+    middle = ((rows[0] + rows[-1]) // 2, (cols[0] + cols[-1]) // 2)
+    padded = np.pad(green, side)
+    r, c = middle[0] + side, middle[1] + side
+    return padded[r - side // 2 : r + side // 2, c - side // 2 : c + side // 2]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A case and what the report says: errors and sds of M, J0, J45 in dpt; NaN and the reason if it was refused."""
+
+    case: Case
+    errors_dpt: tuple[float, ...]
+    sds_dpt: tuple[float, ...]
+    refused: str | None
+
+    @property
+    def line(self) -> str:
+        """One line of text."""
+        case, edge = self.case, self.case.edge
+        found = self.refused or " ".join(
+            f"{error:+.2f}({sd:.2f})" for error, sd in zip(self.errors_dpt, self.sds_dpt, strict=True)
+        )
+        return (
+            f"{case.camera.bits} bit {case.field_deg:g} deg {case.photo[-14:]:>14} zoom {case.zoom:.2f} "
+            f"light {case.light:g} eye {' '.join(f'{value:+.1f}' for value in case.eye)} edge "
+            f"{edge.diameter_deg - case.field_deg:+.1f} {edge.right_deg:+.2f} {edge.down_deg:+.2f} "
+            f"{edge.width_deg:.1f}: {found}"
+        )
+
+
+def score(case: Case, data: Path) -> Scored:
+    """Return the score of one frame."""
+    retina, right_deg, down_deg = scene_of(case, data)
+    counts = expose(case, retina * case.edge.light(right_deg, down_deg))
+    return scored(case, counts, calibrated(case.camera, case.field_deg, head_of(case)))
+
+
+def scored(case: Case, counts: Counts, reconstruct: Reconstructor) -> Scored:
+    """Return the score of counts that a reconstructor is given."""
+    report = reconstruct(counts).report.refraction_dpt
+    assert report is not None
+    refused = report["refused"]
+    if isinstance(refused, str):
+        return Scored(case, (np.nan,) * 3, (np.nan,) * 3, refused)
+    numbers = {name: float(value) for name, value in report.items() if isinstance(value, float)}
+    names = ("sphere", "j0", "j45")
+    errors = tuple(numbers[name] - true for name, true in zip(names, case.eye, strict=True))
+    return Scored(case, errors, (numbers["sd"], numbers["j0_sd"], numbers["j45_sd"]), None)
+
+
+def interval_score(error: Plane, sd: Plane, alpha: float = 0.05) -> float:
+    """Return the mean interval score (Gneiting and Raftery 2007) of the central 95 % intervals, dpt; small is good."""
+    half = 1.96 * sd
+    return float(np.mean(2 * half + 2 / alpha * np.maximum(np.abs(error) - half, 0)))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Acceptance lines of one group: largest RMS error and median sd, dpt."""
+
+    rms_dpt: float
+    sd_dpt: float
+
+
+def summarise(title: str, scored: list[Scored], k: int, limits: Limits) -> bool:
+    """Print the figures of one component of one group beside its lines; return True if all hold."""
+    known = [one for one in scored if one.refused is None]
+    error, sd = (np.array([values[k] for values in column]) for column in (
+        [one.errors_dpt for one in known], [one.sds_dpt for one in known]
+    ))  # fmt: skip
+    z = np.abs(error / sd)
+    rms, median_sd, refused = float(np.sqrt(np.mean(error**2))), float(np.median(sd)), 1 - len(known) / len(scored)
+    within, near = float(np.mean(z < 2)), float(np.mean(z < 1))
+    holds = (
+        rms <= limits.rms_dpt and median_sd <= limits.sd_dpt and refused <= 0.1
+        and 0.93 <= within <= 0.99 and 0.62 <= near <= 0.76
+    )  # fmt: skip
+    print(
+        f"{'ok  ' if holds else 'MISS'} {title}: {len(scored)} frames, RMS {rms:.3f} (at most {limits.rms_dpt:g}), "
+        f"mean {error.mean():+.3f}, below 2 sd {within:.0%} (93 to 99), below 1 sd {near:.0%} (62 to 76), "
+        f"refused {refused:.0%} (at most 10), median sd {median_sd:.3f} (at most {limits.sd_dpt:g}), "
+        f"rms z {float(np.sqrt(np.mean(z**2))):.2f}, beyond 3 sd {int((z > 3).sum())}, "
+        f"interval score {interval_score(error, sd):.2f} dpt", flush=True,
+    )  # fmt: skip
+    return holds
+
+
+@dataclass(frozen=True)
+class Group:
+    """Frames of one sensor and field, with cylinders of up to `cylinder_dpt` in J0 and J45, and their lines."""
+
+    camera: Camera
+    field_deg: float
+    cylinder_dpt: float
+    limits: tuple[Limits, ...]
+
+
+GROUPS = {
+    "imx296-33": Group(IMX296, 33.4, 0.0, (Limits(0.15, 0.12),)),
+    "imx296-45": Group(IMX296, 45.0, 0.0, (Limits(0.2, 0.18),)),
+    "paper-33": Group(QUANTALUX, 33.4, 0.0, (Limits(0.08, 0.12),)),
+    "paper-48": Group(QUANTALUX, 48.3, 0.0, (Limits(0.08, 0.12),)),
+    "imx296-33-cylinder": Group(IMX296, 33.4, 1.5, (Limits(0.2, 0.2), Limits(0.15, 0.2), Limits(0.1, 0.2))),
+    "paper-33-cylinder": Group(QUANTALUX, 33.4, 1.5, (Limits(0.08, 0.2), Limits(0.08, 0.2), Limits(0.08, 0.2))),
+}
+
+
+def head_of(case: Case) -> int:
+    """Return the seed of the diffuser of a case, 1 to 4."""
+    return int(np.random.default_rng(case.seed).integers(1, 5))
+
+
+@cache
+def calibrated(camera: Camera, field_deg: float, head: int) -> Reconstructor:
+    """Return the reconstructor of `diffuscope reconstruct` for a head."""
+    optics = Optics(PITCH_UM[camera])
+    sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, 2.0**camera.bits - 1)
+    geometry = Geometry(optics.pitch_um, optics.distance_um, optics.magnification)
+    calibration = Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
+    return Reconstructor(calibration, camera.shape, PLANNER, SystemClock(), timed=False)
+
+
+def scene_of(case: Case, data: Path) -> tuple[Plane, Plane, Plane]:
+    """Return the retina of a case without its edge, and the field angles (right, down) in degrees."""
+    optics = Optics(PITCH_UM[case.camera])
+    reach_deg = case.edge.diameter_deg + case.edge.width_deg + 3
+    right_deg, down_deg = degrees(optics, round(reach_deg * optics.px_per_deg / 2) * 2)
+    zoom = case.zoom * case.field_deg / float(np.ptp(right_deg))
+    place = data / "fundus" / case.photo
+    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, (0, 0)), right_deg, down_deg
+
+
+def expose(case: Case, scene: Plane, exposure: float = PEAK) -> Counts:
+    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light."""
+    optics = Optics(PITCH_UM[case.camera])
+    psf = caustic(optics, surface(optics.pitch_um, head_of(case)), Prescription.of_power_vector(*case.eye))
+    light = blurred(scene, psf, case.camera.shape)
+    electrons = light / max(float(light.max()), 1e-9) * exposure * case.camera.full_well_e * case.light
+    return case.camera.read(electrons, np.random.default_rng((case.seed, 1)))
+
+
+def faults(seed: int, count: int, data: Path) -> Iterator[tuple[str, Scored]]:
+    """Yield the scores of frames that must be refused or carry their error, by kind, `count` of each."""
+    for k, case in enumerate(cases(IMX296, 33.4, count, seed, name="faults")):
+        case = replace(case, edge=FieldEdge(33.4), light=1.0)
+        retina, right_deg, down_deg = scene_of(case, data)
+        field, radius_deg = case.edge.light(right_deg, down_deg), np.hypot(right_deg, down_deg)
+        second = FieldEdge(12.0, 10.0, 0.0).light(right_deg, down_deg)
+        ring = np.exp(-(((radius_deg - 12) / 0.2) ** 2))
+        oval = FieldEdge(33.4).light(right_deg, down_deg * 1.03)
+        decentred = FieldEdge(33.4, 1.0, 0.0).light(right_deg, down_deg)
+        whole = np.ones_like(field)
+        head = head_of(case)
+        own = calibrated(IMX296, 33.4, head)
+        scenes = {
+            "uniform field": field, "empty disc": field * 1e-3 + 1, "open scene, no edge": retina * whole,
+            "half a lid": retina * field * np.where(down_deg < 0, 0.08, 1.0), "two discs": retina * (field + second),
+            "stray ring": retina * field + 0.5 * ring, "elliptical edge": retina * oval,
+            "disc 1 deg off": retina * decentred,
+        }  # fmt: skip
+        for kind, scene in scenes.items():
+            yield kind, scored(case, expose(case, scene), own)
+        lit = retina * field
+        yield "saturated edge", scored(case, expose(case, lit, 1.5), own)
+        yield "1/50 of the light", scored(case, expose(replace(case, light=0.02), lit), own)
+        yield "PSF of another head", scored(case, expose(case, lit), calibrated(IMX296, 33.4, head % 4 + 1))
+        wrong_deg = 33.4 * (1.2 if k % 2 else 0.8)
+        yield "field wrong by 20 %", scored(case, expose(case, lit), calibrated(IMX296, wrong_deg, head))
+
+
+def judge_faults(seed: int, count: int, data: Path) -> bool:
+    """Print each frame that must be refused or carry its error; return True if the lines hold."""
+    z: list[float] = []
+    refused = 0
+    for kind, one in faults(seed, count, data):
+        refused += one.refused is not None
+        if one.refused is None:
+            z.append(abs(one.errors_dpt[0] / one.sds_dpt[0]))
+        print(f"{kind}: {one.line}", flush=True)
+    beyond = [sum(value > limit for value in z) for limit in (3, 4)]
+    holds = beyond[0] <= 1 and beyond[1] == 0
+    print(
+        f"{'ok  ' if holds else 'MISS'} faults: {len(z) + refused} frames, {refused} refused, {beyond[0]} beyond 3 sd "
+        f"(at most 1), {beyond[1]} beyond 4 sd (none)", flush=True,
+    )  # fmt: skip
+    return holds
+
+
+def main() -> None:
+    """Score the groups; exit status 1 if a line fails."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder with fundus/")
+    parser.add_argument("--frames", type=int, default=60, help="frames of each group")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="*", choices=[*GROUPS, "faults"], default=[*GROUPS, "faults"])
+    arguments = parser.parse_args()
+    held = []
+    for name in arguments.only:
+        if name == "faults":
+            held.append(judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data))
+            continue
+        group, found = GROUPS[name], []
+        for case in cases(group.camera, group.field_deg, arguments.frames, arguments.seed, group.cylinder_dpt):
+            found.append(score(case, arguments.data))
+            print(found[-1].line, flush=True)
+        for k, limits in enumerate(group.limits):
+            held.append(summarise(f"{name} {('M', 'J0', 'J45')[k]}", found, k, limits))
+    raise SystemExit(0 if all(held) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Light budget: the chain is the photon budget taken apart, and no head of the search exceeds a limit."""
+
+from dataclasses import replace
+from math import exp
+from pathlib import Path
+
+import pytest
+
+from device.config.head_file import InstrumentSpec, SinkSpec, load_head
+from device.errors import LightLimit
+from device.head import hazard_of
+from device.light_safety.hazard import Hazard, light_limits
+from device.optics.budget import Design, design_of_head, optical_budget
+from device.optics.illumination import LED, led_at
+from device.optics.light_budget import (
+    CELL_UM,
+    ENOUGH_E,
+    chain,
+    log_sd,
+    possible_gains,
+    product,
+    retina_mw_per_cm2,
+    simulated,
+)
+from device.optics.light_path import load_light_path
+from device.optics.matrix import share_in_pupil
+from device.values import Colour, Illumination
+from services.lab import head_search, light_report
+
+HARDWARE = Path(__file__).parents[2] / "hardware"
+PATH = load_light_path(HARDWARE / "optics.toml")
+HEADS = sorted(path for path in (HARDWARE / "heads").glob("*.toml") if load_head(path).optics is not None)
+
+
+def head(name: str) -> InstrumentSpec:
+    return load_head(HARDWARE / "heads" / f"{name}.toml")
+
+
+def sinks(name: str) -> SinkSpec:
+    found = head(name).light.sinks
+    assert found is not None
+    return found
+
+
+def design(name: str) -> Design:
+    return design_of_head(PATH, head(name))
+
+
+@pytest.mark.parametrize("path", HEADS, ids=lambda path: path.stem)
+def test_the_chain_is_the_photon_budget_times_the_share_in_the_pupil(path: Path) -> None:
+    chosen = design_of_head(PATH, load_head(path))
+    budget = optical_budget(chosen)
+    inside = share_in_pupil(chosen.chain, 0.75, chosen.emitter_mm, chosen.pupil_mm)
+    cell = budget.electrons_per_px * (CELL_UM / chosen.pitch_um) ** 2
+    assert product(chain(chosen)) == pytest.approx(cell * inside, rel=1e-9)
+    assert product(chain(chosen, 0.5, 4)) == pytest.approx(2 * cell * inside, rel=1e-9)
+    assert retina_mw_per_cm2(chain(chosen)) == pytest.approx(budget.light.retina_mw_per_cm2 * inside, rel=1e-9)
+
+
+def test_the_monte_carlo_has_the_quantiles_of_a_log_normal_product() -> None:
+    factors = chain(design("imx296"))
+    sd, found = log_sd(factors), simulated(factors)
+    # The error of a quantile of 20 000 draws is 0.02 sd; five times that.
+    assert found.median == pytest.approx(product(factors), rel=0.1 * sd)
+    assert found.low == pytest.approx(product(factors) * exp(-1.645 * sd), rel=0.1 * sd)
+    assert found.high == pytest.approx(product(factors) * exp(1.645 * sd), rel=0.1 * sd)
+
+
+def test_response_goes_through_the_known_leds() -> None:
+    for led in LED.values():
+        between = led_at(led.wavelength_um, 1.0)
+        assert between.reflectance == pytest.approx(led.reflectance)
+        assert between.quantum_efficiency == pytest.approx(led.quantum_efficiency)
+    assert LED["green"].reflectance < led_at(0.56, 1.0).reflectance < led_at(0.59, 1.0).reflectance
+
+
+def test_a_pupil_cuts_the_image_of_the_ring() -> None:
+    ring = design("imx296_power").chain
+    shares = [share_in_pupil(ring, 0.75, 1.0, pupil_mm) for pupil_mm in (9.0, 7.7, 7.0, 5.0)]
+    assert shares[0] == 1.0
+    assert shares[-1] == 0.0
+    assert shares == sorted(shares, reverse=True)
+
+
+@pytest.mark.parametrize("name", ["imx296", "imx296_power"])
+def test_the_guard_permits_the_level_of_the_report_and_no_more(name: str) -> None:
+    chosen, limits = design(name), light_limits()
+    for beam in (light_report.unmeasured_beam(chosen), light_report.expected_beam(chosen)):
+        level = light_report.permitted_level(light_report.limit_shares(chosen, beam, limits))
+        hazard = Hazard({"green": beam}, limits)
+        hazard.refuse(Illumination("green", level))
+        if level < 1:
+            with pytest.raises(LightLimit):
+                hazard.refuse(Illumination("green", level + 0.002))
+
+
+def test_the_guard_takes_the_power_of_the_heads_own_leds() -> None:
+    """An unmeasured high-power ring must not count as one of APA102: it would be permitted at full drive."""
+    spec = head("imx296_power")
+    hazard = hazard_of(spec)
+    assert hazard.beams["green"] == light_report.unmeasured_beam(design("imx296_power"))
+    colours: tuple[Colour, ...] = ("green", "amber")
+    for colour in colours:
+        lamp = sinks("imx296_power").colours[colour]
+        per_led = hazard_of(head("imx296")).beams["green"].waist_w_per_cm2 / LED["green"].power_mw
+        assert hazard.beams[colour].waist_w_per_cm2 == pytest.approx(per_led * lamp.power_mw)
+    with pytest.raises(LightLimit):
+        hazard.refuse(Illumination("green"))
+    with pytest.raises(LightLimit, match="no blue LEDs"):
+        hazard.refuse(Illumination("blue", 0.01))
+
+
+def test_the_chosen_head_has_enough_light_within_every_limit() -> None:
+    chosen = design("imx296_power")
+    shares = light_report.limit_shares(chosen, light_report.expected_beam(chosen), light_limits())
+    level = light_report.permitted_level(shares)
+    assert product(chain(chosen, level)) >= ENOUGH_E > product(chain(design("imx296")))
+    assert max(share.used for share in shares) * level <= 1
+    assert sinks("imx296_power").most_ma <= head_search.SUPPLY_MA
+
+
+def test_the_search_exceeds_no_limit_and_ranks_enough_light_first() -> None:
+    found = head_search.search(design("imx296"))
+    assert max(one.largest_share for one in found) <= 1
+    enough = [one.light_e >= ENOUGH_E for one in found]
+    assert any(enough)
+    assert enough == sorted(enough, reverse=True)
+    assert all(one.leds * one.choice.current_ma <= head_search.SUPPLY_MA for one in found)
+
+
+def test_the_chain_agrees_with_two_published_instruments() -> None:
+    """OPTICS.md 4.6: 0.13 mJ/cm2 in about 1 s from 0.25 mW at 48 degrees; a phone's flash of 20 to 50 lm at 15 cm."""
+    lit = replace(design("imx296"), optics=design("imx296").optics.model_copy(update={"field_deg": 48.0}))
+    per_mw = next(one.value for one in chain(lit) if one.name == "lit retina")
+    assert 0.25 * per_mw == pytest.approx(0.13, rel=0.1)
+    wide = replace(lit, optics=lit.optics.model_copy(update={"field_deg": 46.0}))
+    into_lens = 0.025**2 / 0.15**2
+    low, high = (
+        1000 * lumens / 250 * into_lens * next(one.value for one in chain(wide) if one.name == "lit retina")
+        for lumens in (20, 50)
+    )
+    assert low < 1.40 < high
+
+
+def test_gains_and_report_name_every_cause(tmp_path: Path) -> None:
+    chosen = design("imx296_power")
+    gains = possible_gains(chain(chosen))
+    assert {"coupling", "pupil", "polarisers", "splitter", "pixel", "exposure", "safety"} == set(gains)
+    assert min(gains.values()) >= 1
+    words, drawn = light_report.table(chosen), light_report.gains_svg(chosen)
+    assert all(one.name in words for one in chain(chosen))
+    assert all(cause in drawn for cause, gain in gains.items() if gain > 1)

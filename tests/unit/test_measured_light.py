@@ -1,0 +1,86 @@
+"""`diffuscope light`: a reading decides go or no go as the guard does, and one that cannot be right is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from device.config.head_file import InstrumentSpec, load_head
+from device.errors import LightLimit, SettingError, SpecError
+from device.head import hazard_of
+from device.values import Illumination
+from services.cli import app
+from services.lab.measured_light import MeteredLight, MeterReading, in_colour, judge, words
+from services.lab.optics_report import design_of
+
+HEADS = Path(__file__).parents[2] / "hardware" / "heads"
+POWER = HEADS / "imx296_power.toml"
+SPEC = load_head(POWER)
+READING = MeterReading("green", 1.3, 43.0, 525.0, "meter X, 2026-11-25")
+
+
+def judged(reading: MeterReading = READING, spec: InstrumentSpec = SPEC) -> MeteredLight:
+    return judge(spec, design_of(spec), reading)
+
+
+def test_the_expected_light_is_a_go_and_twice_as_much_is_none() -> None:
+    assert judged().is_go
+    bright = judged(replace(READING, power_mw=2.6, waist_mw_per_cm2=86))
+    assert not bright.is_go
+    assert 0.5 < bright.permitted_level < 1
+
+
+@given(st.floats(0.05, 13), st.sampled_from([1.3, 2.0]))
+def test_the_guard_of_the_head_decides_as_the_command(power_mw: float, guard_factor: float) -> None:
+    found = judged(replace(READING, power_mw=power_mw, waist_mw_per_cm2=30 * power_mw, guard_factor=guard_factor))
+    light = SPEC.light.model_copy(update={"radiometry": found.radiometry})
+    hazard = hazard_of(SPEC.model_copy(update={"light": light}))
+    hazard.refuse(Illumination("green", found.permitted_level))
+    if not found.is_go:
+        with pytest.raises(LightLimit):
+            hazard.refuse(Illumination("green"))
+
+
+def test_the_printed_lines_are_a_table_of_the_head_file(tmp_path: Path) -> None:
+    found = judged()
+    lines = words(READING, found).partition("\n\n")[2]
+    (head := tmp_path / "head.toml").write_text(f"{POWER.read_text()}\n{lines}\n")
+    read = load_head(head).light.radiometry
+    assert read is not None
+    assert read.green is not None
+    assert read.amber is None
+    assert read.green.retina_mw_per_cm2 == pytest.approx(found.radiometry.green.retina_mw_per_cm2, rel=1e-3)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"power_mw": 0.0005}, "expected"),
+        ({"power_mw": 200.0}, "expected"),
+        ({"waist_mw_per_cm2": 4000.0}, "more than the 1.3 mW"),
+        ({"peak_nm": 620.0}, "not that of LEDs of 525 nm"),
+    ],
+)
+def test_a_reading_that_cannot_be_right_is_refused(changes: dict[str, float], says: str) -> None:
+    with pytest.raises(SettingError, match=says):
+        judged(replace(READING, **changes))  # type: ignore[arg-type]
+
+
+def test_another_colour_is_judged_as_that_of_its_leds() -> None:
+    amber = in_colour(SPEC, "amber")
+    assert judged(MeterReading("amber", 0.3, 12.0, 590.0, "x"), amber).is_go
+    with pytest.raises(SettingError, match="no colour"):
+        in_colour(SPEC, "infrared")
+    with pytest.raises(SpecError, match="no blue LEDs"):
+        design_of(in_colour(SPEC, "blue"))
+
+
+def test_the_command_fails_for_no_go() -> None:
+    base = ["light", "--head", str(POWER), "--waist-mw-per-cm2", "43", "--peak-nm", "525", "--meter", "x"]
+    go, no_go = (CliRunner().invoke(app, [*base, "--power-mw", power]) for power in ("1.3", "4"))
+    assert (go.exit_code, no_go.exit_code) == (0, 1)
+    assert "GO: full drive" in go.stdout
+    assert "NO GO" in no_go.stdout
