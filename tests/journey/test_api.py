@@ -68,7 +68,10 @@ def test_capture_request_answers_201_with_working_links(old_rig: Any) -> None:
         assert made["eye"] == "OD"
         assert made["simulated"] is True
         assert (await client.get(f"/api/captures/{made['id']}")).json() == made
-        media = {"picture": "image/png", "raw": "image/tiff", "quick": "image/jpeg", "report": "application/json"}
+        media = {
+            "picture": "image/png", "colour": "image/png", "raw": "image/tiff", "quick": "image/jpeg",
+            "report": "application/json",
+        }  # fmt: skip
         assert set(made["links"]) == set(media)
         for name, link in made["links"].items():
             file = await client.get(link)
@@ -299,6 +302,7 @@ def test_openapi_lists_every_endpoint(old_rig: Any) -> None:
         "/api/visits": {"get", "post"}, "/api/visits/{id}": {"get", "patch"}, "/api/visits/{id}/could-not": {"post"},
         "/api/visits/{id}/slots": {"post"}, "/api/visits/{id}/finish": {"post"}, "/api/visits/{id}/reopen": {"post"},
         "/api/outbox": {"get"}, "/api/outbox/try": {"post"},
+        "/api/visits/{id}/montage/{eye}": {"get"}, "/api/visits/{id}/montage/{eye}/picture.png": {"get"},
         "/api/exports": {"get"}, "/api/visits/{id}/export.zip": {"get"}, "/api/visits/{id}/export": {"post"},
     }  # fmt: skip
     served = {path: set(verbs) for path, verbs in document["paths"].items()}
