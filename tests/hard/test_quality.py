@@ -93,7 +93,8 @@ def test_a_dim_eye_is_accepted_and_an_even_screen_of_equal_brightness_is_not(tim
     dim = World(with_keys(spec, peak_e=spec.sim.peak_e * times), VirtualClock())
     calibration = simulated_calibration(World(spec, VirtualClock()))
     dim.electrons_per_s("green")
-    assert report_of(calibration, exposed_counts(dim)).warnings == ()
+    warnings = report_of(calibration, exposed_counts(dim)).warnings
+    assert all("refraction" in words for words in warnings), "a refraction with its sd may be uncertain in little light"
     dim.faults.add("eye.closed")
     assert report_of(calibration, exposed_counts(dim)).warnings[0].startswith("No eye was seen")
 

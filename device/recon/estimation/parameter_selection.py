@@ -10,6 +10,7 @@ from device.recon.model.fft_plans import Spectrum
 from device.recon.model.forward_model import Model
 
 SAMPLES = 10_000  # frequencies; 100,000 select the same mu
+EQUAL_SCORES = 1e-6  # relative; the rounding of complex64 spectra. For a PSF that is a point, every mu has one score
 Energies = NDArray[np.float64]
 MU_CANDIDATES = 10.0 ** np.arange(-8, 1.01, 0.25)
 
@@ -59,12 +60,13 @@ class FrequencySample:
 def cross_validated(power: Energies, prior: Energies, delta: Energies, energies: Energies) -> tuple[float, float]:
     """Return the mu of MU_CANDIDATES with the least generalised cross-validation score, and that score.
 
+    Of equal scores the smallest mu, which changes the frame least, so that rounding does not decide.
     GCV(mu) = n sum(phi^2 |Y|^2) / (sum phi)^2, phi = reg / (|H|^2 + reg), reg = mu R + delta. The noise level is not
     needed (NUMERICS.md 3.4).
     """
     scores = np.empty(MU_CANDIDATES.size)
     kernels.cross_validation(power, prior, delta, energies, MU_CANDIDATES, scores)
-    best = int(np.argmin(scores))
+    best = int(np.flatnonzero(scores <= scores.min() * (1 + EQUAL_SCORES))[0])
     return float(MU_CANDIDATES[best]), float(scores[best])
 
 
