@@ -50,6 +50,8 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "run --head {0}/head.toml --send {0}/none.toml", "run --head {0}/head.toml --protocol {0}/none.toml",
     "health --at http://127.0.0.1:9", "health --at http://127.0.0.1:9 --json", "health --at nonsense",
     "probe --head {0}/head.toml", "probe --head {0}/none.toml", "probe",
+    "doctor --head {0}/none.toml", "frame --head {0}/none.toml -o {0}/f.tiff", "frame --head {0}/head.toml -o {0}/f.bmp",
+    "light --head {0}/none.toml --power-mw 1 --waist-mw-per-cm2 1 --peak-nm 525 --meter M", "light",
     "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
     "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2", "archive plan {0}/none -o {0}/plan.toml",

@@ -25,12 +25,27 @@ def read(name: str) -> Any:
     return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def difference(recorded: Any, present: Any) -> str:
-    """Return a unified diff of two records, at most MOST_LINES long; empty for equal records."""
-    texts = [as_text(one).splitlines() for one in (recorded, json.loads(json.dumps(present)))]
+def difference(recorded: Any, present: Any, tolerance: float = 0.0) -> str:
+    """Return a unified diff of two records, at most MOST_LINES long; empty for equal records.
+
+    Floating-point figures are equal if they differ by at most `tolerance` times the recorded one, or times 1.
+    """
+    present = _without_rounding(recorded, json.loads(json.dumps(present)), tolerance)
+    texts = [as_text(one).splitlines() for one in (recorded, present)]
     lines = list(difflib.unified_diff(*texts, "recorded", "present", lineterm="", n=2))
     more = [f"... and {len(lines) - MOST_LINES} lines more"] if len(lines) > MOST_LINES else []
     return "\n".join(lines[:MOST_LINES] + more)
+
+
+def _without_rounding(recorded: Any, present: Any, tolerance: float) -> Any:
+    """Return `present` with the recorded figure wherever its own is equal within the tolerance."""
+    if isinstance(recorded, dict) and isinstance(present, dict):
+        return {key: _without_rounding(recorded.get(key), one, tolerance) for key, one in present.items()}
+    if isinstance(recorded, list) and isinstance(present, list) and len(recorded) == len(present):
+        return [_without_rounding(old, new, tolerance) for old, new in zip(recorded, present, strict=True)]
+    if isinstance(recorded, float) and isinstance(present, float):
+        return recorded if abs(present - recorded) <= tolerance * max(abs(recorded), 1.0) else present
+    return present
 
 
 def _lines(value: Any, depth: int) -> list[str]:

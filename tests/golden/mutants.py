@@ -192,8 +192,8 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(REQUESTS, "            self._live_request = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
-        PIPELINE, "    head.check()\n    shot = ExposureSettings(head.spec.camera.exposure_s)",
-        "    shot = ExposureSettings(head.spec.camera.exposure_s)", scenario("head_lost"),
+        PIPELINE, "    head.check()\n    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)",
+        "    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)", scenario("head_lost"),
     ),
     Mutant(
         PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes",

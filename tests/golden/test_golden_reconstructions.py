@@ -6,7 +6,9 @@ import pytest
 from device.values import Reconstruction
 from tests.golden import compare, reconstructions
 
-TOLERANCE = 1e-5  # of the largest value: the order of sums in an FFT depends on the processor
+# Of the largest value, and of each figure: the order of sums in an FFT depends on the processor, which moves a few
+# counts of the simulated frame by one. 3e-4 of pictures and 5e-4 of figures were seen between two processors.
+TOLERANCE = 2e-3
 
 
 @pytest.fixture(scope="module")
@@ -22,5 +24,7 @@ def test_the_record_holds_every_method(made: dict[str, Reconstruction]) -> None:
 def test_a_picture_and_its_report_are_as_recorded(made: dict[str, Reconstruction], name: str) -> None:
     recorded = reconstructions.picture(name)
     assert float(np.abs(made[name].picture - recorded).max()) <= TOLERANCE * float(np.abs(recorded).max())
-    difference = compare.difference(compare.read("reconstructions")[name], reconstructions.report(made[name]))
+    difference = compare.difference(
+        compare.read("reconstructions")[name], reconstructions.report(made[name]), TOLERANCE
+    )
     assert not difference, difference
