@@ -7,6 +7,7 @@ import numpy as np
 from device.atomic_io import write_atomically
 from device.clock import Clock
 from device.config.head_file import load_head
+from device.errors import SettingError
 from device.head import open_bench
 from device.values import ExposureSettings, Frame
 from services.imaging.picture_files import raw_tiff
@@ -16,9 +17,11 @@ from services.imaging.raw_metadata import RawMetadata
 def take_frames(head: Path, output: Path, count: int, exposure_s: float | None, clock: Clock) -> Frame:
     """Write the rounded mean of `count` frames, lamp dark, to a raw TIFF with its metadata; return the last frame.
 
-    `exposure_s` None: that of the head file. The errors of the head's parts, and StoreError if the file cannot be
-    written. The TIFF is marked as simulated only if the frames are.
+    `exposure_s` None: that of the head file. SettingError for another ending than .tif or .tiff, the errors of the
+    head's parts, and StoreError if the file cannot be written. The TIFF is marked as simulated only if the frames are.
     """
+    if output.suffix.lower() not in (".tif", ".tiff"):
+        raise SettingError(f"{output} is no TIFF file by its name", "Give a name that ends in .tiff.")
     spec = load_head(head)
     shot = ExposureSettings(exposure_s or spec.camera.exposure_s)
     bench = open_bench(spec, clock)
