@@ -117,7 +117,7 @@ def test_new_patient_needs_three_taps_and_no_typing(open_page: Open, real: Real)
     page.locator(".question [data-key='4']").tap()
     page.locator("[data-field=complaints] [data-value=flashes]").tap()
     page.locator("[data-field=complaints] [data-value=none]").tap()
-    expect(page.locator("h1")).to_have_text(re.compile(r"^A[A-Z]{5}0001-3 · Woman, 54$"))
+    expect(page.locator("h1")).to_have_text("A0001-3 · Woman, 54")
     answers = {"consent": "agreed", "sex": "woman", "diabetes": "yes", "diabetes_years": ">10", "vision_os": "CF",
                "age": 54, "complaints": ["none"]}  # fmt: skip
     until(lambda: real.visit()["fields"] == answers)  # the last answer may still be on its way
