@@ -1,7 +1,7 @@
 """Layout stability, labels of pictures and visits, and navigation back."""
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
@@ -119,9 +119,12 @@ def test_no_layout_shift_from_form_input(open_page: Open, real: Real) -> None:
     page.wait_for_selector(".asking")
     chips = [f"[data-value={value}]" for value in ("agreed", "declined", "woman", "man", "flashes", "red")]
     before = boxes(page, *chips, ".question .pad", "[data-field=diabetes]")
+    unanswered: list[Route] = []
+    page.route(f"**/api/visits/{visit['id']}", lambda route: unanswered.append(route))  # the answers stay unsaved
     for selector in ("[data-value=agreed]", "[data-value=woman]", "[data-value=flashes]", "[data-key='5']"):
         page.locator(selector).tap()
     expect(page.locator(".question output")).to_have_text("5")
+    expect(page.locator("#unsaved")).not_to_be_empty()
     assert boxes(page, *chips, ".question .pad", "[data-field=diabetes]") == before
 
 

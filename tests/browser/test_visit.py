@@ -121,7 +121,7 @@ def test_new_patient_needs_three_taps_and_no_typing(open_page: Open, real: Real)
     answers = {"consent": "agreed", "sex": "woman", "diabetes": "yes", "diabetes_years": ">10", "vision_os": "CF",
                "age": 54, "complaints": ["none"]}  # fmt: skip
     until(lambda: real.visit()["fields"] == answers)  # the last answer may still be on its way
-    expect(page.locator("#unsaved")).to_have_count(0)
+    expect(page.locator("#unsaved")).to_be_empty()
 
 
 def test_urgent_complaint_shows_warning(open_page: Open, real: Real) -> None:
@@ -156,7 +156,7 @@ def test_unsaved_fields_are_resent_after_reconnection(open_page: Open, real: Rea
     expect(page.locator("[data-value=man]")).to_have_attribute("aria-pressed", "true")
     page.unroute(f"**/api/visits/{visit}")
     page.locator("[data-value=agreed]").tap()
-    expect(page.locator("#unsaved")).to_have_count(0)
+    expect(page.locator("#unsaved")).to_be_empty()
     assert real.visit()["fields"] == {"sex": "man", "consent": "agreed"}
 
 

@@ -45,7 +45,8 @@ export function person(state, actions) {
         options: options("consent", ["agreed", "declined"]),
         choose: (value) => actions.setField("consent", value),
       })}
-      ${startButton(state, actions)} ${waiting.length ? html`<p class="muted" id="unsaved">${t("save.waiting")}</p>` : nothing}
+      ${startButton(state, actions)}
+      <p class="muted" id="unsaved">${waiting.length ? t("save.waiting") : ""}</p>
       <h2>${t("person.details")}</h2>
       <div class="questions">${questions.map(([name, answers]) => question(state, actions, name, answers))}</div>
       ${textFields(state, actions)}
