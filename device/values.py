@@ -15,7 +15,6 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 Colour = Literal["red", "green", "blue", "amber"]
-ChannelName = Literal["red", "green", "blue", "amber"]  # colours of light in a colour picture
 Eye = Literal["OD", "OS"]
 EYES: tuple[Eye, ...] = ("OD", "OS")
 
@@ -250,7 +249,7 @@ class ChannelUse:
     says why a colour is missing in the picture; None for one that the picture has.
     """
 
-    name: ChannelName
+    name: Colour
     shift_px: tuple[float, float] | None
     predicted: bool = False
     reason: str | None = None

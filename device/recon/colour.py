@@ -14,10 +14,10 @@ from scipy import ndimage
 
 from device.recon.estimation.registration import Registrar, Registration, Shift
 from device.recon.model.resampling import block_mean, moved_back
-from device.values import ChannelName, ChannelUse, Image
+from device.values import ChannelUse, Colour, Image
 
-CHANNELS: tuple[ChannelName, ...] = ("red", "green", "blue", "amber")
-RGB: tuple[ChannelName, ...] = ("red", "green", "blue")  # channels of the picture
+CHANNELS: tuple[Colour, ...] = ("red", "green", "blue", "amber")
+RGB: tuple[Colour, ...] = ("red", "green", "blue")  # channels of the picture
 FLATTEN_PX = 12.0  # colours differ in their shading: less of it is kept than between frames of one colour
 BAND_PER_PX = (0.01, 0.12)
 GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
@@ -40,17 +40,17 @@ class ColourPicture:
 
     picture: Image
     channels: tuple[ChannelUse, ...]
-    doubtful: tuple[ChannelName, ...]
+    doubtful: tuple[Colour, ...]
 
 
-def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) -> ColourPicture:
+def join_colours(pictures: Mapping[Colour, Image], field: Image, n: int) -> ColourPicture:
     """Join linear pictures (rows, cols) of one eye in several colours to one picture in red, green and blue.
 
     `field` is the lit field, (rows, cols) in 0..1; `n` the pixels per sample at which the pictures were solved. The
     reference is green, else the first. Amber stands for a missing red. A missing blue is predicted from red and green;
     a missing red repeats the reference, a missing green repeats red. Both count as predicted.
     """
-    reference: ChannelName = "green" if "green" in pictures else next(iter(pictures))
+    reference: Colour = "green" if "green" in pictures else next(iter(pictures))
     shifts, doubtful = register_colours(pictures, reference, field, n)
     on_grid = {name: moved_back(picture, np.ones_like(picture), shifts[name])[0] for name, picture in pictures.items()}
     guided = {
@@ -67,8 +67,8 @@ def join_colours(pictures: Mapping[ChannelName, Image], field: Image, n: int) ->
 
 
 def register_colours(
-    pictures: Mapping[ChannelName, Image], reference: ChannelName, field: Image, n: int
-) -> tuple[dict[ChannelName, Shift], tuple[ChannelName, ...]]:
+    pictures: Mapping[Colour, Image], reference: Colour, field: Image, n: int
+) -> tuple[dict[Colour, Shift], tuple[Colour, ...]]:
     """Return the shift of each channel from the reference in pixels, and the channels that match no better than chance.
 
     The shift is found twice: the second time on the moved picture, windowed on the same part of the retina.
@@ -76,8 +76,8 @@ def register_colours(
     registrar = Registrar(block_mean(field, n), n, FLATTEN_PX, BAND_PER_PX)
     flats = {name: registrar.flat(block_mean(picture, n)) for name, picture in pictures.items()}
     target = registrar.detail(flats[reference])
-    shifts: dict[ChannelName, Shift] = {}
-    doubtful: list[ChannelName] = []
+    shifts: dict[Colour, Shift] = {}
+    doubtful: list[Colour] = []
     for name, flat in flats.items():
         found = Registration((0.0, 0.0), 1.0, 0.0)
         if name != reference:

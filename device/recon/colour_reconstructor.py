@@ -18,7 +18,7 @@ from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
-from device.values import ChannelName, ChannelUse, Colour, Image, Reconstruction
+from device.values import ChannelUse, Colour, Image, Reconstruction
 
 NO_TIME = "the time budget left no time for this colour"
 NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
@@ -101,7 +101,7 @@ class ColourReconstructor:
     def _join(self, pictures: Mapping[Colour, Image], n: int) -> tuple[ColourPicture, Image]:
         """Return the channels, joined on the lit field only, and their picture in the hue of photographs."""
         begin_s = self.clock.now_s()
-        cropped: dict[ChannelName, Image] = {
+        cropped: dict[Colour, Image] = {
             name: np.ascontiguousarray(picture[self.box]) for name, picture in pictures.items()
         }
         joined = join_colours(cropped, self._field, n)

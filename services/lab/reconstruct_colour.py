@@ -11,7 +11,7 @@ from device.recon.colour import CHANNELS, ColourPicture, join_colours
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
-from device.values import ChannelName, FrameUse, Image
+from device.values import Colour, FrameUse, Image
 from services.lab.reconstruct_burst import load_burst, solve_burst
 from services.lab.reconstruct_file import (
     FileReconstruction,
@@ -30,7 +30,7 @@ from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_cal
 class ChannelSource:
     """Raw and PSF of one frame in one colour of light; files or arrays."""
 
-    name: ChannelName
+    name: Colour
     raw: Source
     psf: Source
 
@@ -60,7 +60,7 @@ def reconstruct_colours(
 
 
 def _refuse_invalid(
-    channels: Mapping[ChannelName, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
+    channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
 ) -> None:
     """Raise SettingError for options that a colour picture does not have, or an output that is an input."""
     if options.calibration is not None or options.psfs or options.bayer is not None:
@@ -77,9 +77,9 @@ def _refuse_invalid(
     refuse_overwriting((options.output, options.report), [*inputs, options.dark, options.flat, options.head])
 
 
-def _by_name(sources: Sequence[ChannelSource]) -> dict[ChannelName, list[ChannelSource]]:
+def _by_name(sources: Sequence[ChannelSource]) -> dict[Colour, list[ChannelSource]]:
     """Return the sources of each channel, in the order in which they were given; SettingError for an unknown name."""
-    channels: dict[ChannelName, list[ChannelSource]] = {}
+    channels: dict[Colour, list[ChannelSource]] = {}
     for one in sources:
         if one.name not in CHANNELS:
             raise SettingError(f"'{one.name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
@@ -116,11 +116,11 @@ def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planne
 
 
 def _joined(
-    sources: Sequence[ChannelSource], channels: Mapping[ChannelName, list[ChannelSource]],
-    made: Mapping[ChannelName, FileReconstruction], options: ReconstructOptions,
+    sources: Sequence[ChannelSource], channels: Mapping[Colour, list[ChannelSource]],
+    made: Mapping[Colour, FileReconstruction], options: ReconstructOptions,
 ) -> FileReconstruction:  # fmt: skip
     """Register the channels, join them, write the picture and return it with its report."""
-    reference: ChannelName = "green" if "green" in made else next(iter(made))
+    reference: Colour = "green" if "green" in made else next(iter(made))
     main = made[reference]
     pictures = {name: one.picture for name, one in made.items()}
     lit = _field(channels[reference][0], main.picture, options)
@@ -146,7 +146,7 @@ def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -
 
 
 def _frames(
-    channels: Mapping[ChannelName, list[ChannelSource]], made: Mapping[ChannelName, FileReconstruction],
+    channels: Mapping[Colour, list[ChannelSource]], made: Mapping[Colour, FileReconstruction],
     sources: Sequence[ChannelSource],
 ) -> tuple[FrameUse, ...]:  # fmt: skip
     """Return what became of every raw, in the order in which they were given."""
@@ -159,7 +159,7 @@ def _frames(
     return tuple(sorted(uses, key=lambda use: use.index))
 
 
-def _warnings(made: Mapping[ChannelName, FileReconstruction], joined: ColourPicture) -> tuple[str, ...]:
+def _warnings(made: Mapping[Colour, FileReconstruction], joined: ColourPicture) -> tuple[str, ...]:
     """Return the warnings of all channels, what is predicted, and what could not be registered."""
     words = [f"{name}: {warning}" for name, one in made.items() for warning in one.report.warnings]
     predicted = [one.name for one in joined.channels if one.predicted]

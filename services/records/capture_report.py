@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TypeVar, get_args
 
 from device.light_safety.dose_report import DoseReport
-from device.values import EYES, ChannelName, ChannelUse, FrameUse, Report
+from device.values import EYES, ChannelUse, Colour, FrameUse, Report
 from services.records.capture import (
     BUDGET_S,
     NO_METHOD,
@@ -186,7 +186,7 @@ def _channels(value: object) -> tuple[ChannelUse, ...]:
 
 
 def _channel(entries: JsonObject) -> ChannelUse:
-    name = one_of(entries.get("name"), *get_args(ChannelName))
+    name = one_of(entries.get("name"), *get_args(Colour))
     shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
     return ChannelUse(name, shift_px, predicted, _checked(entries, "reason", text, None))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.assessment.metrics import fit_intensity
-from device.recon.colour import ChannelName, join_colours, register_colours
+from device.recon.colour import Colour, join_colours, register_colours
 from device.recon.estimation.registration import Shift
 from device.recon.model.grid import disc
 from device.recon.model.resampling import moved_back
@@ -38,10 +38,10 @@ from tests.bench.moving_eye import (
 PEAK_E = {"red": 20000.0, "green": 20000.0, "blue": 5000.0}
 FARTHEST_PX = 7.0
 FITTED = ("06_dr", "07_h", "09_g", "cc0")  # photographs of the coefficients of a predicted blue
-MOVED: tuple[ChannelName, ...] = ("red", "blue")
+MOVED: tuple[Colour, ...] = ("red", "blue")
 EVERY = 7  # pixel whose colour is compared
 
-Pictures = dict[ChannelName, Image]
+Pictures = dict[Colour, Image]
 
 
 def colours(folder: Path, names: Sequence[str] = tuple(FIELDS)) -> None:
@@ -60,7 +60,7 @@ def colours(folder: Path, names: Sequence[str] = tuple(FIELDS)) -> None:
     for k, name in enumerate(names):
         file, place = FIELDS[name]
         planes = photograph(folder / file, place, PAPER)
-        shifts: dict[ChannelName, Shift] = {}
+        shifts: dict[Colour, Shift] = {}
         made: Pictures = {}
         for c in COLOURS:
             row, col = random.uniform(-FARTHEST_PX, FARTHEST_PX, 2)
@@ -81,7 +81,7 @@ def _rms(values: NDArray[np.float64]) -> list[float]:
     return [float(one) for one in np.sqrt((values**2).mean(axis=0))]
 
 
-def _judge(name: str, made: Pictures, planes: Image, shifts: dict[ChannelName, Shift], n: int) -> list[float]:
+def _judge(name: str, made: Pictures, planes: Image, shifts: dict[Colour, Shift], n: int) -> list[float]:
     """Print and return the figures of one field: four rms errors per axis in px, four PSNR, two mean dE00."""
     lit = disc(PAPER.shape, ((PAPER.rows - 1) / 2, (PAPER.cols - 1) / 2), field_px(PAPER) / 2)
     truth: Pictures = {c: retina(planes[..., CHANNEL_PLANE[c]], PAPER) for c in COLOURS}

@@ -16,7 +16,6 @@ from scipy import fft
 from device.config.head_file import OpticsSpec
 from device.optics.diffuser import EMMETROPIA, Refraction, caustic
 from device.optics.illumination import LED
-from device.recon.colour import ChannelName
 from device.recon.model.grid import disc
 from device.values import Calibration, Colour, Counts, Image, Psf, Sensor
 
@@ -157,4 +156,4 @@ def calibrated(sensor: SensorCase, colour: Colour) -> Calibration:
     )  # fmt: skip
 
 
-CHANNEL_PLANE: dict[ChannelName, int] = {"red": 0, "green": 1, "blue": 2}
+CHANNEL_PLANE: dict[Colour, int] = {"red": 0, "green": 1, "blue": 2}

@@ -48,6 +48,12 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     refused(eye_rig.request("GET", picture), 404, "store.unknown")
     second = shoot(eye_rig, visit, "R-nerve")
     shoot(eye_rig, visit, "L-centre")
+    # A montage waits while the camera is used.
+    assert eye_rig.request("GET", f"/api/preview?eye=OD&visit={visit['id']}").status_code in (200, 204)
+    assert not eye_rig.arbiter.is_idle
+    for _ in range(20):
+        assert montage(eye_rig, visit)["state"] == "computing"
+    eye_rig.clock.sleep(AIMING_S + 1)
     joined = known_montage(eye_rig, visit)
     assert (joined["state"], joined["pictures"]) == ("joined", 2)
     assert [one["capture"] for one in joined["placed"]] == [first["id"], second["id"]], "of this eye only"
@@ -68,31 +74,13 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     assert montage(eye_rig, visit)["digest"] == joined["digest"]
     assert montage(eye_rig, visit, "OS")["state"] == "none"
 
-
-def test_another_choice_is_another_montage(eye_rig: Rig) -> None:
-    visit = visit_with_consent(eye_rig)
-    shoot(eye_rig, visit, "R-centre")
-    shoot(eye_rig, visit, "R-nerve")
-    joined = known_montage(eye_rig, visit)
-    assert joined["state"] == "joined"
+    # Another choice of pictures is another montage.
     post(eye_rig, f"/api/visits/{visit['id']}/slots", slot="R-nerve", capture=None)
     assert montage(eye_rig, visit)["state"] == "none", "the picture that was taken out is in no montage"
     again = shoot(eye_rig, visit, "R-nerve")
     retaken = known_montage(eye_rig, visit)
     assert retaken["digest"] != joined["digest"]
     assert retaken["placed"][1]["capture"] == again["id"]
-
-
-def test_a_montage_waits_while_the_camera_is_used(eye_rig: Rig) -> None:
-    visit = visit_with_consent(eye_rig)
-    shoot(eye_rig, visit, "R-centre")
-    shoot(eye_rig, visit, "R-nerve")
-    assert eye_rig.request("GET", f"/api/preview?eye=OD&visit={visit['id']}").status_code in (200, 204)
-    assert not eye_rig.arbiter.is_idle
-    for _ in range(20):
-        assert montage(eye_rig, visit)["state"] == "computing"
-    eye_rig.clock.sleep(AIMING_S + 1)
-    assert known_montage(eye_rig, visit)["state"] == "joined"
 
 
 def test_unknown_visits_and_eyes_are_refused(eye_rig: Rig) -> None:

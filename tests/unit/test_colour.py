@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from device.recon.colour import guided_filter, join_colours, predicted_blue
-from device.values import ChannelName, Image
+from device.values import Colour, Image
 from tests.moving_retina import OTHER_RETINA, RETINA, field, seen
 
 RED = np.asarray(0.6 + 0.4 * RETINA, np.float32)  # less contrast than green, as in a fundus
@@ -18,7 +18,7 @@ def correlation(one: Image, other: Image) -> float:
 
 
 def test_channels_are_moved_to_the_grid_of_green_and_their_shifts_reported() -> None:
-    pictures: dict[ChannelName, Image] = {
+    pictures: dict[Colour, Image] = {
         "red": seen(RED, (3.4, -5.2)), "green": seen(RETINA, (0, 0)), "blue": seen(RETINA, (-60, 2)),
     }  # fmt: skip
     joined = join_colours(pictures, LIT, 2)
@@ -43,7 +43,7 @@ def test_a_channel_that_shows_no_retina_is_not_moved_and_named() -> None:
     ("given", "predicted"),
     [("green", {"red", "blue"}), ("red", {"green", "blue"}), ("blue", {"red", "green"}), ("amber", {"green", "blue"})],
 )
-def test_every_channel_that_was_not_taken_is_marked(given: ChannelName, predicted: set[str]) -> None:
+def test_every_channel_that_was_not_taken_is_marked(given: Colour, predicted: set[str]) -> None:
     joined = join_colours({given: seen(RETINA, (0, 0))}, LIT, 2)
     assert {one.name for one in joined.channels if one.predicted} == predicted
     assert joined.picture.shape == (*LIT.shape, 3)

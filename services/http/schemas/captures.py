@@ -4,7 +4,7 @@ from typing import Self, TypeVar
 
 from pydantic import BaseModel, Field, JsonValue, model_validator
 
-from device.values import ChannelName, Eye
+from device.values import Colour, Eye
 from services.http.schemas.common import (
     ID_PATTERN,
     KEY_PATTERN,
@@ -104,7 +104,7 @@ class ChannelAnswer(StoredPart):
     red.
     """
 
-    name: ChannelName
+    name: Colour
     shift_px: tuple[Number, Number] | None
     predicted: bool
     reason: str | None
