@@ -64,9 +64,12 @@ class Registrar:
         self._inside = (depth > RIM_PX / 2).astype(np.float32)
         self._weight = np.maximum(ndimage.gaussian_filter(self._inside, self._sigma), 0.05)
         self._shape = tuple(fft.next_fast_len(round((1 + REACH) * size), real=True) for size in field.shape)
-        self._rows, self._cols = np.fft.fftfreq(self._shape[0]), np.fft.rfftfreq(self._shape[1])
-        radius = np.hypot(self._rows[:, None], self._cols[None]) / n
-        self._band = ((radius > band_per_px[0]) & (radius < band_per_px[1])).astype(np.float32)
+        rows, cols = np.fft.fftfreq(self._shape[0]), np.fft.rfftfreq(self._shape[1])
+        radius = np.hypot(rows[:, None], cols[None]) / n
+        band = (radius > band_per_px[0]) & (radius < band_per_px[1])
+        self._band = band.astype(np.float32)
+        self._box = np.ix_(band.any(axis=1), band.any(axis=0))  # outside it every detail is 0
+        self._rows, self._cols = rows[band.any(axis=1)], cols[band.any(axis=0)]
 
     def flat(self, picture: Image) -> Image:
         """Return a linear picture (rows, cols) divided by its local mean, minus 1; 0 outside the field."""
@@ -98,16 +101,20 @@ class Registrar:
         around = np.roll(surface, reach, axis=(0, 1))[: 2 * reach[0] + 1, : 2 * reach[1] + 1]
         row, col = np.unravel_index(int(around.argmax()), around.shape)
         best, peak = (float(row - reach[0]), float(col - reach[1])), float(around.max())
+        inside = np.ascontiguousarray(cross[self._box])
         for step in STEPS_SAMPLES:
-            best, peak = self._refined(cross, best, step)
+            best, peak = self._refined(inside, best, step)
         return Registration((best[0] * self._n, best[1] * self._n), peak, float(around.std()))
 
     def _refined(self, cross: Complexes, near: Shift, step: float) -> tuple[Shift, float]:
-        """Return the place and height of the highest correlation on a 9 x 9 lattice of `step` samples around `near`."""
+        """Return the place and height of the highest correlation on a 9 x 9 lattice of `step` samples around `near`.
+
+        `cross` is the cross spectrum at the frequencies of the band's box.
+        """
         rows = near[0] + step * np.arange(-4, 5)
         cols = near[1] + step * np.arange(-4, 5)
-        half = np.where(np.arange(cross.shape[1]) == 0, 1, 2)  # the rfft leaves out the conjugate half
-        by_row = np.exp(2j * np.pi * rows[:, None] * self._rows[None])
+        half = np.where(self._cols == 0, 1, 2)  # the rfft leaves out the conjugate half
+        by_row = np.exp(2j * np.pi * rows[:, None] * self._rows[None]).astype(np.complex64)
         by_col = np.exp(2j * np.pi * self._cols[:, None] * cols[None]) * half[:, None]
         values = (by_row @ cross @ by_col).real
         row, col = np.unravel_index(int(values.argmax()), values.shape)
