@@ -153,20 +153,20 @@ def zernike_modes(v: NDArray[np.floating], u: NDArray[np.floating]) -> Iterator[
     with its value at the edge.
     """
     radius, angle = np.minimum(np.hypot(u, v), 1), np.arctan2(v, u)
+    powers = [np.ones_like(radius)]
+    for _ in range(DEGREE):
+        powers.append(powers[-1] * radius)
+    cosines = [np.cos(m * angle) for m in range(DEGREE + 1)]
+    sines = [np.sin(m * angle) for m in range(DEGREE + 1)]
     for n in range(DEGREE + 1):
         for m in range(-n, n + 1, 2):
-            turn = np.cos(m * angle) if m >= 0 else np.sin(-m * angle)
-            yield _radial(n, abs(m), radius) * turn
+            yield _radial(n, abs(m), powers) * (cosines[m] if m >= 0 else sines[-m])
 
 
-def _radial(n: int, m: int, radius: NDArray[np.floating]) -> NDArray[np.floating]:
-    total = np.zeros_like(radius)
+def _radial(n: int, m: int, powers: list[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Return the radial polynomial of Zernike from the powers 0..n of the radius."""
+    total = np.zeros_like(powers[0])
     for k in range((n - m) // 2 + 1):
-        sign, top = (-1) ** k, factorial(n - k)
-        total += (
-            sign
-            * top
-            / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k))
-            * radius ** (n - 2 * k)
-        )
+        below = factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k)
+        total += (-1) ** k * factorial(n - k) / below * powers[n - 2 * k]
     return total
