@@ -6,6 +6,8 @@ BIN := .venv/bin
 PORT ?= 8000
 # As in systemd/diffuscope.service: the products are small, and waiting threads of BLAS take the cores of other processes.
 export OPENBLAS_NUM_THREADS := 1
+# Hundreds of processes of the tests import the same modules: their bytecode is kept even where the environment forbids it.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
