@@ -7,7 +7,7 @@ is off where the eye has one (NUMERICS.md 7).
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction_edge import Candidate, EdgeLikelihood
 from device.recon.estimation.refraction_uncertainty import Quadratic, quadratic_model
 
 CIRCLES_DPT = (0.7, 1.4)  # |J| of the first candidates
@@ -27,11 +27,15 @@ def find_cylinder(edges: EdgeLikelihood, m_dpt: float, blocks: NDArray[np.int64]
     turns = 2 * np.pi * np.arange(AXES) / AXES
     first = [np.array([m_dpt, 0.0, 0.0])]
     first += [np.array([m_dpt, j_dpt * np.cos(turn), j_dpt * np.sin(turn)]) for j_dpt in CIRCLES_DPT for turn in turns]
-    model = edges.edge_model(first[0])
-    eye_dpt = min(first, key=lambda eye_dpt: edges.near(eye_dpt, model).nats)
+    near = _Near(edges, first[0])
+    eye_dpt = min(first, key=lambda eye_dpt: near(eye_dpt).nats)
     for step_dpt in STEPS_DPT:
         edges.fit_smooth(eye_dpt)
-        found = quadratic_model(edges, _descend(edges, eye_dpt, step_dpt), step_dpt, blocks)
+        near = _Near(edges, eye_dpt)
+        lowest_dpt = _descend(near, eye_dpt, step_dpt)
+        if lowest_dpt is not eye_dpt:
+            near = _Near(edges, lowest_dpt)  # the Hessian needs the linear model of the edge at its own place
+        found = quadratic_model(near, lowest_dpt, step_dpt, blocks)
         eye_dpt = found.minimum
         if not found.is_minimum or np.hypot(*eye_dpt[1:]) > MOST_CYLINDER_DPT:
             return None
@@ -39,14 +43,26 @@ def find_cylinder(edges: EdgeLikelihood, m_dpt: float, blocks: NDArray[np.int64]
     return found
 
 
-def _descend(edges: EdgeLikelihood, eye_dpt: Floats, step_dpt: float) -> Floats:
+class _Near:
+    """Likelihood of the eyes around one, with the linear model of the edge there, computed once for each eye."""
+
+    def __init__(self, edges: EdgeLikelihood, eye_dpt: Floats) -> None:
+        self._edges, self._model = edges, edges.edge_model(eye_dpt)
+        self._known: dict[tuple[float, ...], Candidate] = {}
+
+    def __call__(self, eye_dpt: Floats) -> Candidate:
+        key = tuple(np.round(eye_dpt, 6).tolist())
+        if key not in self._known:
+            self._known[key] = self._edges.near(eye_dpt, self._model)
+        return self._known[key]
+
+
+def _descend(near: _Near, eye_dpt: Floats, step_dpt: float) -> Floats:
     """Return the point downhill from an eye in steps along the three axes, at most MOST_DESCENTS of them."""
-    model = edges.edge_model(eye_dpt)
     steps = [sign * step_dpt * axis for axis in np.eye(eye_dpt.size) for sign in (-1, 1)]
-    nats = edges.near(eye_dpt, model).nats
     for _ in range(MOST_DESCENTS):
-        least, k = min((edges.near(eye_dpt + step, model).nats, k) for k, step in enumerate(steps))
-        if least >= nats:
+        least, k = min((near(eye_dpt + step).nats, k) for k, step in enumerate(steps))
+        if least >= near(eye_dpt).nats:
             break
-        nats, eye_dpt = least, eye_dpt + steps[k]
+        eye_dpt = eye_dpt + steps[k]
     return eye_dpt
