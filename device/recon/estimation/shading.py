@@ -36,12 +36,12 @@ class Shading:
         count = (DEGREE + 1) * (DEGREE + 2) // 2 if known else 1
         top, bottom, left, right = self.box
         self._modes = np.empty((count, (bottom - top) * (right - left)), np.float32)
-        spectra, seen = [], []
+        on_blocks, seen = [], []
         for row, mode in zip(self._modes, modes(model) if known else [model.mask], strict=True):
             row[:] = mode[top:bottom, left:right].ravel()
-            spectra.append(scipy_fft.rfft2(self._torus_of_blocks(mode)))
+            on_blocks.append(self._torus_of_blocks(mode))
             seen.append(blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
-        self._spectra = np.asarray(spectra, np.complex64)
+        self._spectra: NDArray[np.complex64] = scipy_fft.rfft2(np.stack(on_blocks))
         self._ridge = np.full(count + known, RIDGE)
         self._ridge[count:] = STRAY_RIDGE
         self._beyond_blocks = np.stack(seen) - self._blurred_on_blocks()
@@ -67,10 +67,8 @@ class Shading:
         rows, cols = (size // n for size in self._model.grid.shape)
         low = otf[np.fft.fftfreq(rows, 1 / rows).astype(int)][:, : cols // 2 + 1]
         high, wide = (size // n for size in self._model.grid.window)
-        seen = np.empty((len(self._spectra), high * wide), np.float32)
-        for row, spectrum in zip(seen, self._spectra, strict=True):
-            row[:] = scipy_fft.irfft2(spectrum * low, (rows, cols))[:high, :wide].ravel()
-        return seen
+        seen: Image = scipy_fft.irfft2(self._spectra * low, (rows, cols))[:, :high, :wide]
+        return seen.reshape(len(seen), -1)
 
     @property
     def _block(self) -> int:
