@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -298,7 +298,7 @@ class Uncalibrated(Real):
         context = replace(rig.arbiter.context, archive=Archive(rig.store.folder / "nothing"))
         arbiter = HeadArbiter(context, open_exam, lambda: open_bench(rig.world.spec, rig.clock))
         self._undo.callback(arbiter.close)
-        super()._serve(replace(rig, arbiter=arbiter, application=create_app(arbiter, rig.authenticator)))
+        super()._serve(replace(rig, arbiter=arbiter, build_application=partial(create_app, arbiter, rig.authenticator)))
 
 
 class Instruments:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Coroutine, Iterator, Mapping
 from contextlib import ExitStack
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -76,8 +76,13 @@ class Rig:
     exam: ExamService
     arbiter: HeadArbiter
     authenticator: PinAuthenticator
-    application: Application
+    build_application: Callable[[], Application]
     died: Event = field(default_factory=Event)
+
+    @cached_property
+    def application(self) -> Application:
+        """The application; built at the first use, because its 67 routes take longer than many a test."""
+        return self.build_application()
 
     @property
     def app(self) -> FastAPI:
@@ -205,8 +210,8 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         )
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = PinAuthenticator(folder / "technician.json", clock)
-        app = create_app(owner, door, protocol, uploader=carrier, usb_drives=sticks)
-        return Rig(scene, clock, records, event_bus, exam, owner, door, app, died)
+        build_app = partial(create_app, owner, door, protocol, uploader=carrier, usb_drives=sticks)
+        return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
 
     return build_rig
 

@@ -5,6 +5,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,8 +122,8 @@ def problem_without_calibration(rig: Rig, open_exam: Callable[[], ExamService]) 
     context = replace(rig.arbiter.context, archive=Archive(rig.store.folder / "nothing"))
     owner = HeadArbiter(context, open_exam, lambda: open_bench(rig.world.spec, rig.clock))
     try:
-        application = create_app(owner, rig.authenticator)
-        return replace(rig, arbiter=owner, application=application).request("GET", "/api/status").json()["problem"]
+        build = partial(create_app, owner, rig.authenticator)
+        return replace(rig, arbiter=owner, build_application=build).request("GET", "/api/status").json()["problem"]
     finally:
         owner.stop_calibration()
         owner.close()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
@@ -67,13 +68,9 @@ def rig(build: Callable[..., Rig], tmp_path_factory: pytest.TempPathFactory) -> 
 def page(rig: Rig, tmp_path: Path) -> Page:
     board, clock = Board.new(tmp_path / "board"), VirtualClock()
     desk = UpdateRequests(board.state, board.requests, clock, "1.0")
-    application = create_app(
-        rig.arbiter,
-        rig.authenticator,
-        host_names=("eye.local",),
-        technician_routers=(update_routes(desk, rig.authenticator),),
-    )
-    new = replace(rig, application=application)
+    routers = (update_routes(desk, rig.authenticator),)
+    build = partial(create_app, rig.arbiter, rig.authenticator, host_names=("eye.local",), technician_routers=routers)
+    new = replace(rig, build_application=build)
     action = "unlock" if rig.authenticator.has_pin else "pin"
     entered = new.request("POST", f"/api/technician/{action}", json={"pin": "2580"})
     return Page(new, board, clock, {"Cookie": f"technician={entered.cookies['technician']}"})
