@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -120,6 +120,9 @@ test-golden: .venv/ready buses ## Compare HTTP, command line, exam, buses, files
 
 test-exam: .venv/ready ## Run ten thousand random sequences of presses, faults and signals on the exam; N=count.
 	@$(BIN)/python -m tests.property.exam_sequences $(N)
+
+test-light: .venv/ready ## Run a thousand random sequences of presses, aiming and kills against the limits of dose; N=count.
+	@$(BIN)/python -m tests.property.light_sequences $(N)
 
 # An environment of its own: pyfftw imports dask.array wherever Dask is installed, 0.3 s in every process.
 ARCHIVE_LOCK := services/lab/archive/requirements.lock

@@ -36,7 +36,7 @@ SIGNING, RECOVERY = "services/records/record_signing.py", "services/records/reco
 T_LOG, T_RECOVERY = "tests/unit/test_dose_ledger_log.py", "tests/unit/test_recovery.py"
 T_LIGHT = "tests/journey/test_light_requests.py"
 T_GUARD, T_BOOK, T_DOSES = (
-    "tests/unit/test_guard.py", "tests/unit/test_dose_ledger_tables.py", "tests/property/test_guard_dose_limit.py",
+    "tests/unit/test_guard.py", "tests/unit/test_dose_ledger_tables.py", "tests/property/test_light_sequences.py",
 )  # fmt: skip
 T_RECORDS, T_EXAM, T_TRACE = (
     "tests/unit/test_capture_store.py", "tests/journey/test_exam.py", "tests/golden/test_golden_exam.py",

@@ -1,30 +1,42 @@
-"""Dose limit of the guard: no sequence of calls, crashes or clock jumps exceeds it or leaves the lamp on.
+"""Random sequences of light: presses in every mode, aiming, bare contexts, kills, reboots, clock jumps, a full disk.
 
 The reference model integrates the true irradiance on each eye in true time with its own arithmetic. It shares no code
-with the dose ledger and keeps every exposure.
+with the dose ledger and keeps every exposure. `make test-light` runs a thousand sequences with the ledger in its
+database, and prints the dose of a press in each mode.
 """
 
+import logging
+import sys
+import time
+import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
+from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, StoreError, StoreFull
+from device.head import Head, open_head
 from device.light_safety.burst import burst
 from device.light_safety.dose_ledger import DoseLedgerState, Ledger, MemoryLedger, Reserved
 from device.light_safety.guard import AFTERGLOW_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
-from device.values import EYES, ExposureSettings, Eye, Frame, Illumination
+from device.values import EYES, Calibration, Colour, ExposureSettings, Eye, Frame, Illumination, Psf, Sensor
+from services.instrument.capture_pipeline import expose, expose_live
 from services.records import schema
 from services.records.dose_ledger_tables import DoseLedgerStore
+from tests.simulated import small_head_toml
 
 MAX_ON_S, DAY_S = 30.0, 86400.0
 # Bright enough that a few exposures reach the limit; a weight of 1, so that the model needs no table.
@@ -38,6 +50,16 @@ SHARES = {
     "share_without_visit": STOP_WITHOUT_VISIT_J_PER_CM2 / DOSE.limit,
 }
 SMALL = LIMITS.model_copy(update={"photochemical_dose": DOSE.model_copy(update=SHARES)})  # limits that a test can reach
+COLOURS: tuple[Colour, ...] = ("red", "blue")  # that a press may take beside its green frames
+MODES: tuple[tuple[int, tuple[Colour, ...]], ...] = (
+    (1, ()), (4, ()), (4, ("red",)), (4, ("red", "blue")), (16, ("red",)),
+)  # fmt: skip
+SPEC = InstrumentSpec.model_validate(tomllib.loads(small_head_toml("small")))
+CALIBRATION = Calibration((Psf(np.ones((2, 2), np.float32)),), Sensor())
+
+
+class Killed(BaseException):
+    """SIGKILL of the process: nothing of it runs any more, so its lamp stays on until the gate closes."""
 
 
 @dataclass
@@ -60,10 +82,15 @@ class Times:
 
 @dataclass
 class Lamp:
-    """Simulated lamp: it keeps its last colour until another one is set or its gate closes."""
+    """Simulated lamp: it keeps its last colour until another one is set or its gate closes.
+
+    After a kill of its process (`is_orphaned`) only `close_gate` turns it off. `stretches` counts how often it went on.
+    """
 
     glow: Illumination | None = None
     requested: Illumination | None = None
+    is_orphaned: bool = False
+    stretches: int = 0
 
     @property
     def illumination(self) -> Illumination | None:
@@ -74,10 +101,15 @@ class Lamp:
         return self
 
     def off(self) -> None:
-        self.glow = None
+        if not self.is_orphaned:
+            self.glow = None
+
+    def close_gate(self) -> None:
+        self.is_orphaned, self.glow = False, None
 
     def __enter__(self) -> "Lamp":
         self.glow = self.requested
+        self.stretches += 1
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
@@ -93,10 +125,11 @@ class Disk:
 
 
 class LedgerOnDisk:
-    """Wrapper of a ledger on a disk that may be full."""
+    """Wrapper of a ledger on a disk that may be full; after a kill of its process it writes nothing any more."""
 
     def __init__(self, ledger: Ledger, disk: Disk) -> None:
         self._ledger, self._disk = ledger, disk
+        self.is_killed = False
 
     def spent_j_per_cm2(self, eye: Eye) -> float:
         return self._ledger.spent_j_per_cm2(eye)
@@ -106,6 +139,8 @@ class LedgerOnDisk:
         return self._ledger.reserve(eyes, dose_j_per_cm2, stop_j_per_cm2)
 
     def settle(self, reserved: Reserved, given_j_per_cm2: float) -> None:
+        if self.is_killed:
+            return
         self._check()
         self._ledger.settle(reserved, given_j_per_cm2)
 
@@ -115,20 +150,36 @@ class LedgerOnDisk:
 
 
 class TimedCamera:
-    """Camera whose exposures take true time."""
+    """Camera whose exposures take true time; the process is killed in the exposure `kill_at` (None: never)."""
 
-    def __init__(self, owner: "Eyes", slow: float) -> None:
-        self.owner, self.slow = owner, slow
+    def __init__(self, owner: "Eyes", slow: float, kill_at: int | None = None) -> None:
+        self.owner, self.slow, self.kill_at = owner, slow, kill_at
+        self._stretch = owner.lamp.stretches
+
+    def prepare(self, shot: ExposureSettings) -> None:
+        """Nothing: any exposure time is ready."""
 
     def expose(self, shot: ExposureSettings, into: Any = None) -> Frame:
         """Return a frame; it takes `slow` times its exposure, and the guard's timer may expire meanwhile."""
-        self.owner.keep_on(self.slow * shot.exposure_s)
-        lit = self.owner.guarded.illumination
+        owner, duration_s = self.owner, self.slow * shot.exposure_s
+        if owner.lamp.stretches != self._stretch:
+            self._stretch, owner.lit_s = owner.lamp.stretches, 0.0
+        if owner.lamp.glow is None:
+            owner.pass_true_time(duration_s)
+        else:
+            owner.keep_on(duration_s if self.kill_at != 0 else duration_s / 2)
+        if self.kill_at == 0:
+            owner.kill()
+            raise Killed
+        self.kill_at = None if self.kill_at is None else self.kill_at - 1
+        lit = owner.guarded.illumination
         return Frame(np.zeros((2, 2), np.uint16), shot.exposure_s, 1, lit, simulated=True)
 
 
 class Eyes(RuleBasedStateMachine):
-    """State machine of an instrument under random operations."""
+    """State machine of an instrument under random operations; `tally` counts them over all sequences."""
+
+    tally: ClassVar[Counter[str]] = Counter()
 
     def __init__(self) -> None:
         super().__init__()
@@ -146,8 +197,19 @@ class Eyes(RuleBasedStateMachine):
         return MemoryLedger(self.times, DAY_S, self.disk.page, boot=str(self.boots))
 
     def start(self) -> None:
-        ledger = LedgerOnDisk(self.ledger(), self.disk)
-        self.guarded = GuardedLight(self.lamp, self.times, MAX_ON_S, Hazard(BEAMS, SMALL), ledger)
+        self.wrapped = LedgerOnDisk(self.ledger(), self.disk)
+        self.guarded = GuardedLight(self.lamp, self.times, MAX_ON_S, Hazard(BEAMS, SMALL), self.wrapped)
+
+    def head(self, camera: TimedCamera, exposure_s: float) -> Head:
+        """Return the small head with this camera, the guarded lamp and this exposure."""
+        exposures = {"exposure_s": exposure_s, "preview_exposure_s": exposure_s}
+        spec = SPEC.model_copy(update={"camera": SPEC.camera.model_copy(update=exposures)})
+        return Head(spec, camera, self.guarded, CALIBRATION)
+
+    def kill(self) -> None:
+        """Kill the process: neither lamp nor ledger hear of it any more. `crash` ends it."""
+        self.tally["killed while lit" if self.lamp.glow is not None else "killed in the dark"] += 1
+        self.lamp.is_orphaned = self.wrapped.is_killed = True
 
     def teardown(self) -> None:
         self.guarded.off()
@@ -168,6 +230,7 @@ class Eyes(RuleBasedStateMachine):
         try:
             yield
         except (LightLimit, StoreError):
+            self.tally["refused"] += 1
             assert self.lamp.glow is None
 
     @precondition(lambda self: self.open_context is None)
@@ -249,6 +312,41 @@ class Eyes(RuleBasedStateMachine):
             assert self.lamp.glow is None
 
     @precondition(lambda self: self.open_context is None)
+    @rule(
+        eye=st.sampled_from(EYES), count=st.integers(1, 16), colours=st.lists(st.sampled_from(COLOURS), unique=True),
+        exposure_s=st.floats(0.01, 3), slow=st.floats(1, 3), in_visit=st.booleans(),
+        kill_at=st.one_of(st.none(), st.integers(0, 18)), afterglow_s=st.floats(0, AFTERGLOW_S),
+    )  # fmt: skip
+    def press(
+        self, eye: Eye, count: int, colours: list[Colour], exposure_s: float, slow: float, in_visit: bool,
+        kill_at: int | None, afterglow_s: float,
+    ) -> None:  # fmt: skip
+        """Expose as a press does: a burst in green, other colours, a dark frame; a kill may come in any of them."""
+        self.exposed_eyes, self.in_visit = (eye,), in_visit
+        head = self.head(TimedCamera(self, slow, kill_at), exposure_s)
+        try:
+            with self.lamp_is_off_after_a_refusal():
+                made = expose(head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours)
+                assert not self.disk.full, "light without a record"
+                self.tally[f"press of {len(made.lit)} frames and {len(made.colours)} colours"] += 1
+        except Killed:
+            self.crash(0.0, afterglow_s, None)
+
+    @precondition(lambda self: self.open_context is None)
+    @rule(
+        eyes=st.sampled_from([("OD",), ("OS",), ("OD", "OS")]), pictures=st.integers(1, 40),
+        exposure_s=st.floats(0.01, 0.2), in_visit=st.booleans(),
+    )  # fmt: skip
+    def aim(self, eyes: tuple[Eye, ...], pictures: int, exposure_s: float, in_visit: bool) -> None:
+        """Take live pictures, until one is refused."""
+        self.exposed_eyes, self.in_visit = eyes, in_visit
+        head = self.head(TimedCamera(self, 1.0), exposure_s)
+        with self.lamp_is_off_after_a_refusal():
+            for _ in range(pictures):
+                expose_live(head, eyes, self.times, in_visit=in_visit)
+                self.tally["live picture"] += 1
+
+    @precondition(lambda self: self.open_context is None)
     @rule(duration_s=st.one_of(st.floats(0, 120), st.floats(0, 1.2 * DAY_S), st.floats(DAY_S - 1800, DAY_S)))
     def pass_time(self, duration_s: float) -> None:
         self.pass_true_time(duration_s)
@@ -260,10 +358,11 @@ class Eyes(RuleBasedStateMachine):
     )
     def crash(self, off_s: float, afterglow_s: float, reboot_s: float | None) -> None:
         """End the process; the lamp is on until its gate closes; `reboot_s` is the new value of the boot clock."""
+        if not self.lamp.is_orphaned:
+            self.kill()
+        self.guarded.off()  # reaches neither lamp nor ledger, but ends the timer, as the process ends
         self.pass_true_time(afterglow_s)
-        self.lamp.off()
-        if self.guarded._timer is not None:
-            self.guarded._timer.cancel()  # the timer ends with its process
+        self.lamp.close_gate()
         self.times.sleep(off_s)
         if reboot_s is not None:
             self.boots += 1
@@ -320,7 +419,44 @@ class EyesWithDatabase(Eyes):
         return DoseLedgerStore(engine, self.times, DAY_S, boot=str(self.boots))
 
 
-TestEyes = Eyes.TestCase
-TestEyes.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
-TestEyesWithDatabase = EyesWithDatabase.TestCase
-TestEyesWithDatabase.settings = settings(max_examples=6, stateful_step_count=15, deadline=None)
+def run(count: int, machine: type[Eyes], steps: int) -> Counter[str]:
+    """Run `count` random sequences of up to `steps` operations; return how often each happened.
+
+    Raises the AssertionError of the first violation, with its shortest sequence.
+    """
+    machine.tally = Counter()
+    limits = settings(max_examples=count, stateful_step_count=steps, deadline=None, database=None)
+    run_state_machine_as_test(machine, settings=limits)
+    return machine.tally
+
+
+def doses_j_per_cm2(frames: int, colours: tuple[Colour, ...]) -> float:
+    """Return the dose of one press of the simulated head, by the ledger."""
+    clock = VirtualClock()
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "head.toml"
+        file.write_text(small_head_toml("small"))
+        head = open_head(load_head(file), clock, MemoryLedger(clock))
+    try:
+        expose(head, ("OD",), clock, in_visit=True, count=frames, colours=colours)
+        return head.light.ledger.spent_j_per_cm2("OD")
+    finally:
+        head.close()
+
+
+def main() -> int:
+    """Run the sequences with the ledger in its database; print the figures."""
+    logging.disable(logging.WARNING)  # each refused colour is logged
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+    begin_s = time.monotonic()
+    tally = run(count, EyesWithDatabase, 15)
+    sys.stdout.write(f"{count} sequences in {time.monotonic() - begin_s:.0f} s, no violation\n")
+    sys.stdout.write(", ".join(f"{name} {number}" for name, number in sorted(tally.items())) + "\n")
+    for frames, colours in MODES:
+        dose = doses_j_per_cm2(frames, colours)
+        sys.stdout.write(f"{' and '.join([f'{frames} green', *colours])}: {dose:.3g} J/cm2 a press\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
