@@ -105,9 +105,8 @@ class ExamLoop:
 
         Their frames stay on the disk, for the next start.
         """
-        presses = [*(shot.press for shot in self._exposed), *(one.press for one in self._resumed)]
+        presses = [shot.press for shot in self._exposed]
         self._exposed.clear()
-        self._resumed.clear()
         return presses
 
     def _expose_pending(self) -> None:
@@ -308,7 +307,8 @@ def run_exam(
     finally:
         with suppress(LightFault):  # then the guardian process and the restart of this process turn the lamp off
             parts.head.light.off()
-        _fail_waiting(parts.requests, loop)
+        parts.capture_journal.close()
+        _fail_waiting(parts, loop)
         if parts.requests.snapshot.is_closing:
             parts.events.ended(None, failure)
         else:
@@ -316,8 +316,10 @@ def run_exam(
             on_failure()
 
 
-def _fail_waiting(requests: ExamRequests, loop: ExamLoop | None) -> None:
+def _fail_waiting(parts: ExamParts, loop: ExamLoop | None) -> None:
     """Fail the futures of all presses that were not completed, with Busy."""
-    pending = requests.end()
-    for press in [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]:
+    pending = parts.requests.end()
+    presses = [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]
+    presses += [one.press for one in parts.resumed if not one.press.future.done() and one.press not in presses]
+    for press in presses:
         press.future.set_exception(Busy("the instrument was switched off before the picture was taken"))

@@ -24,6 +24,7 @@ from services.records.json_values import JsonObject
 from services.records.record_document import whole_number
 from services.records.storage_errors import storage_errors
 
+UNDERWAY = "underway"  # folder of the journal in the store
 MAX_ATTEMPTS = 2  # starts that try to reconstruct the frames of a capture: they may be what ends the process
 _ATTEMPT = "attempt-{}"
 WITHOUT_KEY = frozenset({"id", "eye", "visit", "slot", "tries"})  # entries of earlier releases
@@ -69,7 +70,7 @@ class CaptureJournal:
     """
 
     def __init__(self, store: CaptureStore) -> None:
-        self._folder = store.folder / "underway"
+        self._folder = store.folder / UNDERWAY
         self._writers: dict[str, FrameWriter] = {}
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
@@ -156,6 +157,12 @@ class CaptureJournal:
         for one in self.interrupted:
             if one.visit is None:
                 self.end(one.id)
+
+    def close(self) -> None:
+        """Wait until the frames of captures that are still in progress are on the disk, for the next opening."""
+        for writer in self._writers.values():
+            writer.finish()
+            writer.close()
 
     def _resumable(self, press: InterruptedCapture) -> ResumableCapture | None:
         """Return an interrupted capture with its frames.

@@ -136,9 +136,7 @@ def test_files_of_the_writer_are_linked_into_the_capture_and_outlast_the_journal
     files = {frame.file.path.name: frame.file for frame in one.frames}
     before = {name: file.path.read_bytes() for name, file in files.items()}
     inode = files["raw.tiff"].path.stat().st_ino
-    kept = store.save(
-        Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {**files, "report.json": b"{}"}
-    )
+    kept = store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {**files, "report.json": b"{}"})
     journal.end(PRESS.id)
     assert {name: store.read(kept.id, name) for name in before} == before
     assert (store.folder / "captures" / kept.id / "raw.tiff").stat().st_ino == inode, "it was written twice"
