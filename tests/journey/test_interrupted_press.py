@@ -209,4 +209,4 @@ def test_sigkill_between_frames_and_during_the_reconstruction(
 
 
 def ready(server: Server) -> None:
-    until(lambda: server.ask("GET", "/api/status")["state"] == "aim", 90)
+    until(lambda: server.ask("GET", "/api/status")["state"] == "aim", 300)
