@@ -1,12 +1,16 @@
 """Sequences of frames: several frames in one illumination, or a lit and a dark frame of each colour."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from device.clock import Clock
 from device.errors import LightCut
 from device.light_safety.guard import GuardedLight
 from device.ports import Camera, Light
 from device.values import EYES, Colour, ExposureSettings, Eye, Frame, Illumination
+
+
+def ignore_frame(_: Frame) -> None:
+    """Do nothing with a frame that was taken."""
 
 
 def burst(
@@ -19,12 +23,14 @@ def burst(
     eyes: Sequence[Eye] = EYES,
     *,
     in_visit: bool = False,
+    taken: Callable[[Frame], None] = ignore_frame,
 ) -> tuple[Frame, ...]:
     """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
-    off. The dose counts for `eyes`, without a visit up to a lower limit. Raises LightCut if the guard has ended the
-    first exposure; a frame that it ended later is left out. The lamp is dark at every exit.
+    off. The dose counts for `eyes`, without a visit up to a lower limit. `taken` is called with each frame after its
+    read-out, while the lamp is on: it must return at once. Raises LightCut if the guard has ended the first exposure; a
+    frame that it ended later is left out. The lamp is dark at every exit.
     """
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):
@@ -35,6 +41,7 @@ def burst(
             if frames and frame.illumination is None:
                 break
             frames.append(require_lit(frame))
+            taken(frame)
             longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
     return tuple(frames)
 

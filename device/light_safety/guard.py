@@ -54,6 +54,13 @@ class GuardedLight:
             return None
         return self._light.illumination
 
+    @property
+    def running_j_per_cm2(self) -> float:
+        """Return the dose of the running stretch of light until now; 0.0 while the lamp is dark."""
+        if self._held is None:
+            return 0.0
+        return self.hazard.dose_j_per_cm2(self._glow, self._clock.now_s() - self._lit_at_s)
+
     def on(self, glow: Illumination, eyes: Sequence[Eye] = EYES, *, in_visit: bool = False) -> LightContext:
         """Return a context with the lamp on from entry to exit; its dose counts for `eyes`.
 

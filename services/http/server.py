@@ -50,6 +50,8 @@ from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol
 from services.records.read_only_store import opened_store
+from services.records.visit_pictures import VisitPictures
+from services.records.visit_repository import VisitRepository
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +120,8 @@ def serve(
         context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
         explorer = AccuracyExplorer(data / "explorer", data / "plans", clock, spec, context.event_bus.publish, measure)
 
-        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer)
+        pictures = VisitRepository(store.engine, protocol, clock).pictures
+        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, pictures)
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
         authenticator = PinAuthenticator(data / "technician.json", clock)
@@ -158,12 +161,14 @@ def _log_start(version: str, store: CaptureStore) -> None:
         log.warning("interrupted captures of the last run are quarantined in torn/: %s", torn)
 
 
-def _open_exam(context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer) -> ExamService:
-    """Open the head with the calibration in force, and return its exam."""
+def _open_exam(
+    context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer, pictures: VisitPictures
+) -> ExamService:
+    """Open the head with the calibration in force, and return its exam; `pictures` has the targets of its captures."""
     head = open_head(with_calibration(context.spec, context.archive.root), context.clock, doses)
     return ExamService(
         head, context.store, context.event_bus, context.clock, plans, context.on_failure, context.watchdog,
-        lambda: explorer.budget_s,
+        lambda: explorer.budget_s, pictures.resumed_target,
     )  # fmt: skip
 
 

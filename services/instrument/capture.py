@@ -2,7 +2,7 @@
 
 import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -16,10 +16,12 @@ from device.recon.assessment.laterality import Laterality
 from device.values import EYES, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
+from services.records.blobs import FileContent, WrittenFile
 from services.records.capture import COLOUR, Capture, CaptureReport, LateralityEstimate, PictureVerdict
 from services.records.capture_journal import InterruptedCapture
 from services.records.capture_report import read_report, report_as_json
 from services.records.capture_target import CaptureTarget, Permit, permit_test_picture
+from services.records.frame_writer import DARK, FIRST
 from services.records.idempotent_requests import key_conflict
 from services.records.json_values import JsonObject
 
@@ -70,22 +72,26 @@ class Press:
 class ExposedCapture:
     """Exposed capture: the lit frames and the dark frame of a press, before reconstruction.
 
-    `expose_s`: duration of all exposures. `light`: dose report. `verdict`: first verdict, on `frame`. `unusable`:
-    reason of each frame that must not enter the picture, by its index. `colours`: one frame in each other colour of
-    light; `missing`: reason of each that was not taken.
+    `dark`: None if the press was interrupted before it. `expose_s`: duration of all exposures. `light`: dose report.
+    `verdict`: first verdict, on `frame`. `unusable`: reason of each frame that must not enter the picture, by its
+    index. `colours`: one frame in each other colour of light; `missing`: reason of each that was not taken. `written`
+    waits for the frames that are being written to the disk, and returns their files by the number of the frame.
+    `notes`: warnings on the exposure for the report.
     """
 
     press: Press
     id: str
     taken_at: datetime
     frames: tuple[Frame, ...]
-    dark: Frame
+    dark: Frame | None
     expose_s: float
     light: DoseReport
     verdict: Verdict
     unusable: Mapping[int, str] = field(default_factory=dict)
     colours: Mapping[Colour, Frame] = field(default_factory=dict)
     missing: Mapping[Colour, str] = field(default_factory=dict)
+    written: Callable[[], Mapping[int, WrittenFile]] = dict
+    notes: tuple[str, ...] = ()
 
     @property
     def frame(self) -> Frame:
@@ -116,36 +122,58 @@ class IdempotencyKeys:
             self._presses.popitem(last=False)
 
 
+def frame_metadata(capture: RawMetadata, frame: Frame) -> RawMetadata:
+    """Return the metadata of a raw frame; `capture`: those of all frames of its capture."""
+    exposure_s, light, simulated = frame.exposure_s, frame.illumination, frame.simulated
+    return replace(capture, exposure_s=exposure_s, illumination=light, simulated=simulated)
+
+
+def lit_name(index: int) -> str:
+    """Return the file name of a lit frame of a capture, by its place in the burst."""
+    return FIRST if index == 0 else f"raw-{index}.tiff"
+
+
+def colour_name(colour: Colour) -> str:
+    """Return the file name of the frame of a capture in another colour of light."""
+    return f"raw-{colour}.tiff"
+
+
 def capture_files(
     capture: Capture, head: str, shot: ExposedCapture, shown: Image, quick: bytes | None, colour: Image | None
-) -> dict[str, bytes]:
+) -> dict[str, FileContent]:
     """Return the files of a capture by name; `shown` is the linear picture of the field, `quick` its quick look (JPEG).
 
     `colour` is the picture in colour, if there is one. `head` is the name of the head. The raw frames and the
     calibration in their metadata suffice to repeat the reconstruction: `raw.tiff` is the first frame of the burst,
-    `raw-1.tiff` the next one, `raw-red.tiff` that in red light.
+    `raw-1.tiff` the next one, `raw-red.tiff` that in red light; without a dark frame there is no `dark.tiff`.
     """
-    frame, note = shot.frame, f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
+    note = f"{capture.eye} {capture.taken_at:%Y-%m-%d}"
     predicted = [one.name for one in capture.report.reconstruction.channels if one.predicted]
-    metadata = RawMetadata(
-        id=capture.id, eye=capture.eye, taken_at=capture.taken_at, exposure_s=frame.exposure_s,
-        illumination=frame.illumination, simulated=frame.simulated, calibration_id=capture.calibration_id, head=head,
-    )  # fmt: skip
     return {
-        **{
-            "raw.tiff" if k == 0 else f"raw-{k}.tiff": picture_files.raw_tiff(one.counts, metadata)
-            for k, one in enumerate(shot.frames)
-        },
-        **{
-            f"raw-{name}.tiff": picture_files.raw_tiff(one.counts, replace(metadata, illumination=one.illumination))
-            for name, one in shot.colours.items()
-        },
-        "dark.tiff": picture_files.raw_tiff(shot.dark.counts, replace(metadata, illumination=None)),
+        **_frame_files(capture, head, shot),
         "picture.png": picture_files.to_png(shown, capture.simulated, note),
         **({} if colour is None else {COLOUR: picture_files.to_png(colour, capture.simulated, note, predicted)}),
         "quick.jpg": quick or picture_files.to_jpeg(shown, QUICK_PX, capture.simulated),
         "report.json": as_json(report_as_json(capture.report) | {"simulated": capture.simulated}),
     }
+
+
+def _frame_files(capture: Capture, head: str, shot: ExposedCapture) -> dict[str, FileContent]:
+    """Return the raw frames of a capture by file name: the file that is on the disk already, or its content."""
+    frames = {lit_name(k): one for k, one in enumerate(shot.frames)}
+    frames |= {colour_name(colour): one for colour, one in shot.colours.items()}
+    frames |= {} if shot.dark is None else {DARK: shot.dark}
+    written = shot.written()
+    shared = RawMetadata(
+        capture.id, capture.eye, capture.taken_at, calibration_id=capture.calibration_id, head=head
+    )  # fmt: skip
+
+    def content(frame: Frame) -> FileContent:
+        if (file := written.get(frame.number)) is not None:
+            return file
+        return picture_files.raw_tiff(frame.counts, frame_metadata(shared, frame))
+
+    return {name: content(frame) for name, frame in frames.items()}
 
 
 def capture_report(
@@ -157,7 +185,7 @@ def capture_report(
     budget in seconds.
     """
     report = CaptureReport(
-        replace(made, seconds={"expose": shot.expose_s, **made.seconds}),
+        replace(made, seconds={"expose": shot.expose_s, **made.seconds}, warnings=(*made.warnings, *shot.notes)),
         shot.light, shot.press.target.visit, shot.press.target.slot,
         PictureVerdict(verdict.word, verdict.code, verdict.numbers),
         None if seen is None else LateralityEstimate(seen.eye, seen.confidence, seen.disc),

@@ -31,6 +31,7 @@ from device.values import (
     EYES,
     Calibration,
     Colour,
+    Counts,
     ExposureSettings,
     Eye,
     Frame,
@@ -42,6 +43,7 @@ from device.values import (
 from services.imaging import picture_files
 from services.instrument.capture import ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
+from services.records.blobs import FileContent
 from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS, CaptureTarget
 
@@ -50,6 +52,13 @@ log = logging.getLogger(__name__)
 PREVIEW_BUDGET_S = 0.2
 PREVIEW_PX = 480
 NO_PSF = "the calibration has no PSF in this colour of light"
+INTERRUPTED = "the instrument stopped before this frame was on the disk"
+
+Taken = Callable[[Frame, float, float], None]  # frame, dose and duration of the press until its read-out
+
+
+def ignore_frame(_: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
+    """Do nothing with a frame that was taken."""
 
 
 class FrameReconstructor(Protocol):
@@ -101,7 +110,7 @@ class FrameFeedback(Protocol):
     def aim(self, counts: Pixels, exposed_s: float) -> Aim:
         """Return the aiming hint after one more live frame."""
 
-    def assess(self, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
+    def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on a raw frame."""
 
     def reassess(self, first: Verdict, report: Report, target: CaptureTarget) -> Verdict:
@@ -115,14 +124,14 @@ class FrameFeedback(Protocol):
 class Exposure:
     """Frames of one press: lit ones, one in each other colour of light, and their dark frame.
 
-    `begin_s` (clock seconds) and `duration_s` are those of all exposures, `dose_j_per_cm2` is their dose. `unusable`
-    holds the reason of each lit frame that must not enter the picture, by its index; `missing` the reason of each other
-    colour that was not taken.
+    `dark` is None if the press was interrupted before it. `begin_s` (clock seconds) and `duration_s` are those of all
+    exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
+    picture, by its index; `missing` the reason of each other colour that was not taken.
     """
 
     lit: tuple[Frame, ...]
     colours: Mapping[Colour, Frame]
-    dark: Frame
+    dark: Frame | None
     begin_s: float
     duration_s: float
     dose_j_per_cm2: float
@@ -152,8 +161,11 @@ class CaptureRecord:
     head: str
     colour: Image | None = None
 
-    def files(self, quick: bytes | None) -> dict[str, bytes]:
-        """Return the encoded files by name; `quick` is the quick look (JPEG), if one was made."""
+    def files(self, quick: bytes | None) -> dict[str, FileContent]:
+        """Return the files by name; `quick` is the quick look (JPEG), if one was made.
+
+        Waits until the frames of the press are on the disk, or have failed to be.
+        """
         return capture_files(self.capture, self.head, self.shot, self.shown, quick, self.colour)
 
 
@@ -175,15 +187,31 @@ class CapturePipeline:
 
     def expose(
         self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
-        field: str | None = None,
+        field: str | None = None, taken: Taken = ignore_frame,
     ) -> Exposure:  # fmt: skip
         """Return up to `count` lit frames, one in each of `colours`, and a dark one, as the function `expose`."""
         count = count if self.bursts is not None else 1
-        able = () if self.colours is None else self.colours.others
-        taken = [colour for colour in colours if colour in able]
-        exposure = expose(self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=taken, field=field)
-        unable = {colour: NO_PSF for colour in colours if self.colours is not None and colour not in able}
+        unable = self._unable(colours)
+        able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
+        exposure = expose(
+            self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field, taken=taken
+        )
         return replace(exposure, missing={**unable, **exposure.missing})
+
+    def resume(self, taken: Exposure, colours: Sequence[Colour]) -> Exposure:
+        """Return the frames of an interrupted press, with the reason of each of its `colours` that has none."""
+        if self.colours is None:
+            return replace(taken, colours={})
+        unable = self._unable(colours)
+        lost = {one: INTERRUPTED for one in colours if one not in taken.colours}
+        able = {colour: frame for colour, frame in taken.colours.items() if colour in self.colours.others}
+        return replace(taken, colours=able, missing={**lost, **unable})
+
+    def _unable(self, colours: Sequence[Colour]) -> dict[Colour, str]:
+        """Return the reason of each of `colours` that the pipeline cannot reconstruct; none without other colours."""
+        if self.colours is None:
+            return {}
+        return {colour: NO_PSF for colour in colours if colour not in self.colours.others}
 
     def assess(self, exposure: Exposure) -> tuple[Exposure, Verdict]:
         """Return the exposure with its first good frame at the front, and the verdict on that frame.
@@ -191,7 +219,7 @@ class CapturePipeline:
         Without a good frame the order stays, and the verdict is that on the first one. Frames with another verdict than
         the first one are marked as unusable.
         """
-        dark, begin_s = exposure.dark.counts, exposure.begin_s
+        dark, begin_s = counts_of(exposure.dark), exposure.begin_s
         verdicts = [self._feedback.assess(frame.counts, dark, begin_s) for frame in exposure.lit]
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
@@ -204,7 +232,7 @@ class CapturePipeline:
 
     def quick_look(self, shot: ExposedCapture) -> Image:
         """Return the picture of the first stage, cropped to the illuminated field; FrameError for a useless frame."""
-        made = self.reconstructor(shot.frame.counts, shot.dark.counts, quick=True)
+        made = self.reconstructor(shot.frame.counts, counts_of(shot.dark), quick=True)
         return crop_to_field(made.picture, self._head)
 
     def reconstruct(self, shot: ExposedCapture, budget_s: float) -> Iterator[Step]:
@@ -220,7 +248,7 @@ class CapturePipeline:
             yield unreconstructed(shot.frame, error)
 
     def _steps(self, shot: ExposedCapture, deadline: Deadline) -> Iterator[Step]:
-        dark, simulated = shot.dark.counts, shot.frame.simulated
+        dark, simulated = counts_of(shot.dark), shot.frame.simulated
         if self.bursts is None or len(shot.frames) == 1:
             green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
         else:
@@ -306,39 +334,69 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (), field: str | None = None,
+    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
 ) -> Exposure:  # fmt: skip
     """Return up to `count` lit frames, one in each of `colours`, and a dark one.
 
     The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
     light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
-    field of view of the programme, to which a simulated eye turns.
+    field of view of the programme, to which a simulated eye turns. `taken` is called with each frame after its
+    read-out and must return at once: the lamp may be on.
 
     Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
     or cannot be on. The lamp is off at every exit.
     """
     head.check()
-    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)
+    run = _Exposing(head, eyes, clock, in_visit, taken)
     announce_eye(head, eyes, field)
-    head.camera.prepare(shot)
-    taken: dict[Colour, Frame] = {}
-    missing: dict[Colour, str] = {}
+    head.camera.prepare(run.shot)
     try:
-        glow = Illumination(head.spec.light.colour)
-        lit = burst(head.camera, head.light, glow, shot, count, clock, eyes, in_visit=in_visit)
-        dose_j_per_cm2 = head.light.given_j_per_cm2
+        lit = run.lit(Illumination(head.spec.light.colour), count)
+        others, missing = run.colours(colours)
+        dark = head.camera.expose(run.shot)
+        run.report(dark)
+        return Exposure(lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing)
+    finally:
+        head.light.off()
+
+
+class _Exposing:
+    """Exposures of one press, with their dose until now; begins with its construction."""
+
+    def __init__(self, head: Head, eyes: tuple[Eye, ...], clock: Clock, in_visit: bool, taken: Taken) -> None:
+        self._head, self._eyes, self._clock, self._in_visit, self._taken = head, eyes, clock, in_visit, taken
+        self.shot = ExposureSettings(head.spec.camera.exposure_s)
+        self.begin_s, self.given_j_per_cm2 = clock.now_s(), 0.0  # of the stretches of light that are over
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds since the begin."""
+        return self._clock.now_s() - self.begin_s
+
+    def report(self, frame: Frame) -> None:
+        """Report a frame after its read-out, with the dose until now."""
+        self._taken(frame, self.given_j_per_cm2 + self._head.light.running_j_per_cm2, self.duration_s)
+
+    def lit(self, glow: Illumination, count: int) -> tuple[Frame, ...]:
+        """Return up to `count` frames in one light."""
+        camera, light = self._head.camera, self._head.light
+        frames = burst(
+            camera, light, glow, self.shot, count, self._clock, self._eyes, in_visit=self._in_visit, taken=self.report
+        )
+        self.given_j_per_cm2 += light.given_j_per_cm2
+        return frames
+
+    def colours(self, colours: Sequence[Colour]) -> tuple[dict[Colour, Frame], dict[Colour, str]]:
+        """Return one frame in each of `colours`, and the reason of each that could not be taken."""
+        taken: dict[Colour, Frame] = {}
+        missing: dict[Colour, str] = {}
         for colour in colours:
             try:
-                glow = Illumination(colour, head.light.hazard.highest_level(colour))
-                (taken[colour],) = burst(head.camera, head.light, glow, shot, 1, clock, eyes, in_visit=in_visit)
-                dose_j_per_cm2 += head.light.given_j_per_cm2
+                (taken[colour],) = self.lit(Illumination(colour, self._head.light.hazard.highest_level(colour)), 1)
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
                 missing[colour] = error.message
-        dark = head.camera.expose(shot)
-        return Exposure(lit, taken, dark, begin_s, clock.now_s() - begin_s, dose_j_per_cm2, missing=missing)
-    finally:
-        head.light.off()
+        return taken, missing
 
 
 def expose_live(
@@ -367,6 +425,11 @@ def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) ->
     """
     if len(eyes) == 1:
         head.present_eye(eyes[0], field)
+
+
+def counts_of(dark: Frame | None) -> Counts | None:
+    """Return the counts of a dark frame; None, for that of the calibration, without one."""
+    return None if dark is None else dark.counts
 
 
 def crop_to_field(image: Image, head: Head) -> Image:

@@ -23,6 +23,7 @@ from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import WireState
 from services.instrument.progress import Progress
 from services.instrument.record_origin import CaptureOrigin
+from services.instrument.resumption import ResumedTarget, refuse_targets, resumed_presses
 from services.instrument.time_budget import SHUTDOWN_TIMEOUT_S
 from services.instrument.watchdog import Watchdog
 from services.records.capture import BUDGET_S, Capture
@@ -36,12 +37,14 @@ class ExamService:
 
     Callable from any thread. The thread `head`, started here, owns the head until `close`; requests before `ready` wait
     until the FFT plans are made. After an error during planning, or after an unexpected exception, `on_failure` is
-    called. `budget_s` returns the time budget of a capture, `plans` is the folder of the FFT plans.
+    called. `budget_s` returns the time budget of a capture, `plans` is the folder of the FFT plans. `resumed_target`
+    returns the target of a capture that a kill has interrupted, whose frames are reconstructed first (resumption.py).
     """
 
     def __init__(
         self, head: Head, store: CaptureStore, event_bus: EventBus, clock: Clock, plans: Path,
         on_failure: Callable[[], None], watchdog: Watchdog, budget_s: Callable[[], float] = lambda: BUDGET_S,
+        resumed_target: ResumedTarget = refuse_targets,
     ) -> None:  # fmt: skip
         self.head, self.store, self.ready = head, store, Event()
         self._watchdog = watchdog
@@ -51,9 +54,12 @@ class ExamService:
         self.calibration_monitor = CalibrationMonitor(
             head, store, event_bus, clock, lambda: requests.snapshot.is_interrupted, watchdog
         )
+        resumed = resumed_presses(self.capture_journal, resumed_target)
+        for one in resumed:
+            requests.remember(one.press)
         parts = ExamParts(
             head, store, clock, watchdog, budget_s, requests, ExamEvents(event_bus, watchdog, self.progress, requests),
-            self.capture_journal, self.calibration_monitor,
+            self.capture_journal, self.calibration_monitor, resumed,
         )  # fmt: skip
         origin = CaptureOrigin(head, store.folder)
         work = parts, lambda: plan_pipeline(head, clock, plans, origin), self.ready.set, on_failure

@@ -1,7 +1,8 @@
 """Loop of the exam: the one thread that owns the head runs its actions one by one, the most urgent first.
 
 A press has priority: between two solver rounds of a running refinement it is exposed and gets its quick look, then the
-refinement resumes. Every way out of an action turns the lamp off.
+refinement resumes. Frames of a press that a kill has interrupted are reconstructed after the presses. Every way out of
+an action turns the lamp off.
 """
 
 import logging
@@ -17,16 +18,19 @@ from device.errors import DiffuscopeError, FrameError, LightFault, StoreError
 from device.head import Head
 from device.recon.reconstructor import RoundDone, StageResult
 from device.values import Reconstruction
-from services.errors import Busy
+from services.errors import Busy, RequestRefused
+from services.imaging.raw_metadata import RawMetadata
 from services.instrument.background import run_in_thread
 from services.instrument.calibration_monitor import CalibrationMonitor
 from services.instrument.capture import ExposedCapture, Press
-from services.instrument.capture_pipeline import CapturePipeline
+from services.instrument.capture_pipeline import CapturePipeline, Exposure
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import ExamEvent
 from services.instrument.frame_feedback import FAILED_VERDICT
+from services.instrument.frame_sink import FrameSink
 from services.instrument.live_pictures import LivePictures
+from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -39,7 +43,11 @@ LIVE_S = 0.4  # interval of progress events and of live pictures during a refine
 
 @dataclass(frozen=True)
 class ExamParts:
-    """Parts of an exam that its service and its loop share; `budget_s` returns the time budget of a reconstruction."""
+    """Parts of an exam that its service and its loop share.
+
+    `budget_s` returns the time budget of a reconstruction. `resumed`: presses of the run before, whose frames are on
+    the disk.
+    """
 
     head: Head
     store: CaptureStore
@@ -50,6 +58,7 @@ class ExamParts:
     events: ExamEvents
     capture_journal: CaptureJournal
     calibration_monitor: CalibrationMonitor
+    resumed: tuple[ResumedPress, ...] = ()
 
 
 class ExamLoop:
@@ -65,6 +74,7 @@ class ExamLoop:
             parts.head.light, parts.clock, pipeline, parts.requests, parts.events, parts.store.refuse_light_in_vain
         )
         self._exposed: deque[ExposedCapture] = deque()
+        self._resumed = deque(parts.resumed)
         self._last_update_s = 0.0
 
     def run(self) -> None:
@@ -80,6 +90,8 @@ class ExamLoop:
             self._expose_pending()
         elif self._exposed:
             self._complete_oldest()
+        elif self._resumed and not now.is_closing:
+            self._resume_oldest()
         elif self._parts.calibration_monitor.has_pending and not now.is_closing:
             self._parts.calibration_monitor.step()
         elif self._live.are_wanted:
@@ -89,7 +101,10 @@ class ExamLoop:
         return True
 
     def fail_exposed(self) -> list[Press]:
-        """Forget the captures that wait for their reconstruction; return their presses, for the caller to fail."""
+        """Forget the captures that wait for their reconstruction; return their presses, for the caller to fail.
+
+        Their frames stay on the disk, for the next start.
+        """
         presses = [shot.press for shot in self._exposed]
         self._exposed.clear()
         return presses
@@ -111,18 +126,25 @@ class ExamLoop:
         self._events.state()
 
     def _expose(self, press: Press, id: str, taken_at: datetime) -> ExposedCapture:
-        press.target.permit()  # again: the consent may have been withdrawn while the press waited
+        head, target = self._parts.head, press.target
+        target.permit()  # again: the consent may have been withdrawn while the press waited
         self._parts.store.refuse_light_in_vain()
-        self._parts.capture_journal.begin(press.journal_entry(id), press.key)
+        entry = press.journal_entry(id)
+        writer = self._parts.capture_journal.begin(entry, press.key, target.frames, target.colours)
+        shared = RawMetadata(id, press.eye, taken_at, calibration_id=head.calibration.id, head=head.spec.name)
         self._events.stage(press, id, "expose")
-        target = press.target
         exposure = self._pipeline.expose(
             press.eye,
             in_visit=target.visit is not None,
             count=target.frames,
             colours=target.colours,
             field=target.field,
+            taken=FrameSink(writer, shared, head.spec.light.colour),
         )
+        return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish)
+
+    def _assessed(self, press: Press, id: str, taken_at: datetime, exposure: Exposure) -> ExposedCapture:
+        """Return the exposed capture with its first verdict, and publish the verdict."""
         exposure, verdict = self._pipeline.assess(exposure)
         self._events.verdict(id, verdict)
         light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
@@ -130,6 +152,30 @@ class ExamLoop:
             press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable,
             exposure.colours, exposure.missing,
         )  # fmt: skip
+
+    def _resume_oldest(self) -> None:
+        """Queue the oldest press of the run before for reconstruction, with the frames that are on the disk."""
+        resumed = self._resumed.popleft()
+        press, id = resumed.press, resumed.id
+        self._requests.advance(ExamEvent.RESUMED)
+        self._events.state()
+        with self._resolving(press, id, ExamEvent.FAILED):
+            self._exposed.append(self._resume(resumed))
+            log.info("an interrupted capture is reconstructed", extra={"about": id})
+
+    def _resume(self, resumed: ResumedPress) -> ExposedCapture:
+        press, id, journal = resumed.press, resumed.id, self._parts.capture_journal
+        try:
+            press.target.permit()  # the consent may have been withdrawn since
+        except RequestRefused:
+            self._end_journal_entry(id)
+            raise
+        journal.count_attempt(id)
+        self._events.stage(press, id, "expose")
+        frames = resumed_frames(resumed.stored, self._parts.head.calibration, self._parts.clock.now_s())
+        exposure = self._pipeline.resume(frames.exposure, press.target.colours)
+        shot = self._assessed(press, id, frames.taken_at, exposure)
+        return replace(shot, written=lambda: resumed.files, notes=frames.notes)
 
     def _complete_oldest(self) -> None:
         """Reconstruct and store the oldest exposure, then resolve the future of its press."""
@@ -148,13 +194,14 @@ class ExamLoop:
         """Turn the lamp off at exit; on an error, apply the event `on_error` to the state and fail the press's future.
 
         A DiffuscopeError is also published on the event bus. Another exception is raised again; its journal entry
-        stays, so that the next start reports the capture as interrupted. LightFault if the lamp cannot be turned off.
+        and frames stay, so that the next start resumes the capture. LightFault if the lamp cannot be turned off.
         """
         try:
             yield
         except DiffuscopeError as error:
             self._events.failed(id, error)
-            self._end_journal_entry(id)
+            with suppress(StoreError):  # then the next start reports the capture as interrupted
+                self._parts.capture_journal.fail(id)
             self._requests.advance(on_error)
             self._events.state()
             press.future.set_exception(error)
@@ -260,7 +307,8 @@ def run_exam(
     finally:
         with suppress(LightFault):  # then the guardian process and the restart of this process turn the lamp off
             parts.head.light.off()
-        _fail_waiting(parts.requests, loop)
+        parts.capture_journal.close()
+        _fail_waiting(parts, loop)
         if parts.requests.snapshot.is_closing:
             parts.events.ended(None, failure)
         else:
@@ -268,8 +316,10 @@ def run_exam(
             on_failure()
 
 
-def _fail_waiting(requests: ExamRequests, loop: ExamLoop | None) -> None:
+def _fail_waiting(parts: ExamParts, loop: ExamLoop | None) -> None:
     """Fail the futures of all presses that were not completed, with Busy."""
-    pending = requests.end()
-    for press in [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]:
+    pending = parts.requests.end()
+    presses = [*(loop.fail_exposed() if loop is not None else []), *([pending] if pending is not None else [])]
+    presses += [one.press for one in parts.resumed if not one.press.future.done() and one.press not in presses]
+    for press in presses:
         press.future.set_exception(Busy("the instrument was switched off before the picture was taken"))

@@ -9,7 +9,9 @@ The diagram is drawn by `diagram` from the table; a test compares it with this d
             STARTING --> AIM : PLANNED
             STARTING_PRESSED --> PRESSED : PLANNED
             AIM --> PRESSED : PRESS
+            AIM --> MAKING : RESUMED
             PRESSED --> EXPOSING : EXPOSE
+            PRESSED --> MAKING_PRESSED : RESUMED
             EXPOSING --> AIM : EXPOSURE_FAILED
             EXPOSING --> MAKING : EXPOSED
             MAKING --> AIM : STORED or FAILED
@@ -63,6 +65,7 @@ class ExamEvent(Enum):
     PLANNED = auto()  # the FFT plans are made
     EXPOSE = auto()  # the exposure of the waiting press begins
     EXPOSED = auto()  # its frames are taken and wait for their reconstruction
+    RESUMED = auto()  # the frames of a press that a kill has interrupted wait for their reconstruction
     EXPOSURE_FAILED = auto()  # its press has failed, nothing is stored
     STORED = auto()  # the exposed capture is stored
     FAILED = auto()  # the exposed capture is lost: its press has failed
@@ -75,7 +78,9 @@ TRANSITIONS: dict[tuple[ExamState, ExamEvent], ExamState] = {
     (ExamState.STARTING, ExamEvent.PLANNED): ExamState.AIM,
     (ExamState.STARTING_PRESSED, ExamEvent.PLANNED): ExamState.PRESSED,
     (ExamState.AIM, ExamEvent.PRESS): ExamState.PRESSED,
+    (ExamState.AIM, ExamEvent.RESUMED): ExamState.MAKING,
     (ExamState.PRESSED, ExamEvent.EXPOSE): ExamState.EXPOSING,
+    (ExamState.PRESSED, ExamEvent.RESUMED): ExamState.MAKING_PRESSED,
     (ExamState.EXPOSING, ExamEvent.EXPOSURE_FAILED): ExamState.AIM,
     (ExamState.EXPOSING, ExamEvent.EXPOSED): ExamState.MAKING,
     (ExamState.MAKING, ExamEvent.STORED): ExamState.AIM,

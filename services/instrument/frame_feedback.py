@@ -32,10 +32,11 @@ class FrameAssessor:
         """Return the aiming hint after one more live frame, exposed at `exposed_s` (clock seconds)."""
         return self._aimer(self._frame_assessor(counts), self._frame_assessor.picture, exposed_s)
 
-    def assess(self, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
+    def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on the raw frame of a capture before its reconstruction.
 
-        `begin_s`: begin of the exposure (clock seconds). FAILED_VERDICT for a frame that cannot be assessed.
+        `dark`: its dark frame; None: the black level of the sensor. `begin_s`: begin of the exposure (clock seconds).
+        FAILED_VERDICT for a frame that cannot be assessed.
         """
         try:
             reading = self._frame_assessor(counts, dark)

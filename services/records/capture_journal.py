@@ -1,19 +1,32 @@
-"""Journal of captures in progress, written before their exposure: after a power cut it lists the captures to repeat."""
+"""Journal of captures in progress, written before their exposure, with the frames that were taken.
 
-from collections.abc import Callable
+    underway/<id>.json        entry of one capture in progress
+    underway/<id>/            its frames, until the capture is stored or has failed (frame_writer.py)
+
+After a kill or a power cut it lists the captures whose frames are reconstructed, and the captures to repeat.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from device import atomic_io
+from device.errors import StoreError
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import digested_json, row_validation
 from services.records.capture_store import CaptureStore
+from services.records.capture_target import FRAMES, OTHER_COLOURS, OtherColour
+from services.records.frame_writer import FrameWriter, StoredFrame, stored_frames
 from services.records.json_values import JsonObject
 from services.records.record_document import whole_number
 from services.records.storage_errors import storage_errors
 
+UNDERWAY = "underway"  # folder of the journal in the store
+MAX_ATTEMPTS = 2  # starts that try to reconstruct the frames of a capture: they may be what ends the process
+_ATTEMPT = "attempt-{}"
 WITHOUT_KEY = frozenset({"id", "eye", "visit", "slot", "tries"})  # entries of earlier releases
 WITHOUT_DIGEST = WITHOUT_KEY | {"key"}
 
@@ -32,16 +45,34 @@ class InterruptedCapture:
     tries: int = 0
 
 
-class CaptureJournal:
-    """Journal with one small file per capture in progress.
+@dataclass(frozen=True)
+class ResumableCapture:
+    """An interrupted capture with at least one lit frame on the disk.
 
-    Entries that exist at the opening belong to interrupted captures and are in `interrupted`; an entry whose capture is
-    in the store is deleted instead. Captures that the store quarantined at its opening are in `interrupted` also
-    without an entry, then with id and eye only. An entry without a visit is reported in one run only: `mark_reported`.
+    `press`: its entry; `key`: idempotency key of its request. `planned`: number of lit frames that were to be taken.
+    `colours`: other colours of light that were to be taken. `frames`: what is on the disk, in order of exposure.
+    """
+
+    press: InterruptedCapture
+    key: str | None
+    planned: int
+    colours: tuple[OtherColour, ...]
+    frames: tuple[StoredFrame, ...]
+
+
+class CaptureJournal:
+    """Journal with one small file, and a folder of frames, per capture in progress.
+
+    Entries that exist at the opening belong to interrupted captures; an entry whose capture is in the store is deleted
+    instead, with its frames. Those with a lit frame are in `resumable`, until `end` or `fail`, the others in
+    `interrupted`; so are captures that the store quarantined at its opening, without an entry with id and eye only. An
+    entry without a visit is reported in one run only: `mark_reported`. In a read-only store nothing is resumed.
     """
 
     def __init__(self, store: CaptureStore) -> None:
-        self._folder = store.folder / "underway"
+        self._folder = store.folder / UNDERWAY
+        self._writers: dict[str, FrameWriter] = {}
+        self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
             atomic_io.make_folder(self._folder)
             paths = sorted(self._folder.glob("*.json"))
@@ -52,28 +83,63 @@ class CaptureJournal:
         for name in store.newly_quarantined:
             if not any(name.startswith(id) for id in found):
                 found[name] = InterruptedCapture(name, _eye_in(name))
-        self.interrupted = tuple(found.values())
+        if store.refusal is None:
+            self._remove_strays()
+            self.resumable = tuple(one for id in self._keys if id in found if (one := self._resumable(found[id])))
+        resumable = {one.press.id for one in self.resumable}
+        self.interrupted = tuple(one for id, one in found.items() if id not in resumable)
 
-    def begin(self, press: InterruptedCapture, key: str | None = None) -> None:
-        """Write the journal entry of the capture `press`, with the idempotency key of its request; durable on return.
+    def begin(
+        self, press: InterruptedCapture, key: str | None = None, planned: int = FRAMES,
+        colours: Sequence[OtherColour] = (),
+    ) -> FrameWriter:  # fmt: skip
+        """Write the journal entry of the capture `press`, durable on return; return the writer of its frames.
 
-        Errors: StoreFull, StoreError.
+        `key`: idempotency key of its request; `planned`, `colours`: as in `ResumableCapture`. Errors: StoreFull,
+        StoreError.
         """
         with storage_errors():
-            content = digested_json.encoded(asdict(press) | {"key": key})
-            atomic_io.write_file(self._folder / f"{press.id}.json", content)
+            entry = asdict(press) | {"key": key, "planned": planned, "colours": list(colours)}
+            atomic_io.write_file(self._folder / f"{press.id}.json", digested_json.encoded(entry))
             atomic_io.fsync_folder(self._folder)
+        writer = self._writers[press.id] = FrameWriter(self._folder / press.id)
+        return writer
+
+    def count_attempt(self, id: str) -> None:
+        """Count one more attempt to reconstruct the frames of an interrupted capture, durably, before it begins.
+
+        After MAX_ATTEMPTS that the process did not survive, the frames are given up. Errors: StoreFull, StoreError.
+        """
+        folder = self._folder / id
+        with storage_errors():
+            atomic_io.write_file(folder / _ATTEMPT.format(_attempts(folder) + 1), b"")
+            atomic_io.fsync_folder(folder)
 
     def end(self, id: str, key: str | None = None) -> None:
-        """Delete the entry of a capture that is stored, has failed, or whose interruption was handled.
+        """Delete the entry and the frames of a capture that is stored or given up, or was handled.
 
         With `key`, also discard the interrupted captures with that idempotency key: the request now has its picture.
         StoreError if the disk refuses.
         """
         with storage_errors():
             (self._folder / f"{id}.json").unlink(missing_ok=True)
+        self.resumable = tuple(one for one in self.resumable if one.press.id != id)
+        self._remove_frames(id)
         if key is not None:
             self.discard(lambda one: self._keys.get(one.id) == key)
+
+    def fail(self, id: str) -> None:
+        """Delete the frames of a capture that has failed, and its entry; one that was resumed is interrupted then.
+
+        StoreError if the disk refuses.
+        """
+        resumed = next((one.press for one in self.resumable if one.press.id == id), None)
+        if resumed is None:
+            self.end(id)
+            return
+        self.resumable = tuple(one for one in self.resumable if one.press.id != id)
+        self.interrupted = (*self.interrupted, resumed)
+        self._remove_frames(id)
 
     def discard(self, is_handled: Callable[[InterruptedCapture], bool]) -> None:
         """Remove the captures for which `is_handled` is true from `interrupted`, and delete their entries."""
@@ -91,6 +157,39 @@ class CaptureJournal:
         for one in self.interrupted:
             if one.visit is None:
                 self.end(one.id)
+
+    def close(self) -> None:
+        """Wait until the frames of captures that are still in progress are on the disk, for the next opening."""
+        for writer in self._writers.values():
+            writer.finish()
+            writer.close()
+
+    def _resumable(self, press: InterruptedCapture) -> ResumableCapture | None:
+        """Return an interrupted capture with its frames.
+
+        None, and its frames are deleted, without a lit one, without a readable entry or after MAX_ATTEMPTS.
+        """
+        folder = self._folder / press.id
+        frames, plan = stored_frames(folder), _plan(self._folder / f"{press.id}.json")
+        if plan is None or not any(one.is_lit for one in frames) or _attempts(folder) >= MAX_ATTEMPTS:
+            with suppress(StoreError):  # then the next opening deletes them
+                self._remove_frames(press.id)
+            return None
+        return ResumableCapture(press, self._keys[press.id], *plan, frames)
+
+    def _remove_strays(self) -> None:
+        """Delete folders of frames without an entry: their capture was stored or has failed."""
+        for folder in self._folder.iterdir():
+            if folder.is_dir() and folder.name not in self._keys:
+                with suppress(StoreError):  # then the next opening deletes them
+                    self._remove_frames(folder.name)
+
+    def _remove_frames(self, id: str) -> None:
+        """End the writing of the frames of a capture, and delete them."""
+        if (writer := self._writers.pop(id, None)) is not None:
+            writer.close()
+        with storage_errors(), suppress(FileNotFoundError):
+            shutil.rmtree(self._folder / id)
 
 
 def _is_kept(store: CaptureStore, id: str) -> bool:
@@ -120,6 +219,21 @@ def _key(path: Path) -> str | None:
     except ValueError:
         return None
     return key if isinstance(key, str) else None
+
+
+def _plan(path: Path) -> tuple[int, tuple[OtherColour, ...]] | None:
+    """Return the number of lit frames, and the other colours, that were to be taken; None if the entry has none."""
+    try:
+        entries = _entries(path)
+        colours = entries["colours"]
+        named = colours if isinstance(colours, list) else []
+        return whole_number(entries["planned"]), tuple(one for one in OTHER_COLOURS if one in named)
+    except (ValueError, KeyError):
+        return None
+
+
+def _attempts(folder: Path) -> int:
+    return len(list(folder.glob(_ATTEMPT.format("*"))))
 
 
 def _entries(path: Path) -> JsonObject:

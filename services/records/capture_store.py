@@ -39,6 +39,7 @@ from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError
 from services.errors import RecordNotFound, RecordRemoved, StoreDamaged
 from services.records import blobs, capture_rows, row_validation, schema
+from services.records.blobs import FileContent
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
 from services.records.quarantine import Quarantine
@@ -125,12 +126,13 @@ class CaptureStore:
     def save(
         self,
         capture: Capture,
-        files: Mapping[str, bytes],
+        files: Mapping[str, FileContent],
         write_rows: RowWriter | None = None,
         request: str | None = None,
     ) -> Capture:
         """Store a capture and its files (name -> content); return it with their SHA-256 once it is durable.
 
+        Files that are on the disk already are linked, and not written again.
         `write_rows` adds rows in the same transaction. `request`: reference of the press, as
         `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
         if their space is needed.
@@ -139,17 +141,20 @@ class CaptureStore:
         report, or no files).
         """
         _refuse_names(capture.id, files)
-        capture = capture.with_files({name: hashlib.sha256(content).hexdigest() for name, content in files.items()})
-        row = schema.row_of(capture, {name: len(content) for name, content in files.items()})
+        capture = capture.with_files({name: _sha256(content) for name, content in files.items()})
+        lengths_bytes = {name: _length_bytes(content) for name, content in files.items()}
+        row = schema.row_of(capture, lengths_bytes)
         row.request = request
         record = RecordDocument("capture", 1, capture_content(row, file_entries(row)))
-        length_bytes = sum(map(len, files.values()))  # rows and record, some kilobytes, fit into the reserve
+        length_bytes = sum(lengths_bytes.values())
+        # Rows and record, some kilobytes, fit into the reserve.
+        new_bytes = sum(lengths_bytes[name] for name, content in files.items() if isinstance(content, bytes))
         files = {**files, CAPTURE_RECORD: record.encoded()}
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
             schema.refuse_if_read_only(self.engine)
-            self.space.make_room(length_bytes)
+            self.space.make_room(new_bytes)
             with _removed_when_full(part, kept):
                 blobs.write_folder(part, files)
                 atomic_io.replace_durably(part, kept)
@@ -293,7 +298,15 @@ def _row(session: Session, id: str) -> capture_rows.CaptureColumns:
     return row
 
 
-def _refuse_names(id: str, files: Mapping[str, bytes]) -> None:
+def _sha256(content: FileContent) -> str:
+    return hashlib.sha256(content).hexdigest() if isinstance(content, bytes) else content.sha256
+
+
+def _length_bytes(content: FileContent) -> int:
+    return len(content) if isinstance(content, bytes) else content.length_bytes
+
+
+def _refuse_names(id: str, files: Mapping[str, FileContent]) -> None:
     for name in (id, *files):
         if not capture_rows.NAME.fullmatch(name):
             raise SettingError(f"{name!r} cannot name something kept", "Use letters, digits, dots and hyphens.")

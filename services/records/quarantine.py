@@ -13,8 +13,8 @@ from services.records.storage_errors import storage_errors
 log = logging.getLogger(__name__)
 
 REQUIRED_FILES = frozenset(
-    {"raw.tiff", "dark.tiff", "picture.png", "quick.jpg", "report.json"}
-)  # complete capture, every release
+    {"raw.tiff", "picture.png", "quick.jpg", "report.json"}
+)  # complete capture, every release; a press that was interrupted may have no dark.tiff
 
 
 class Quarantine:

@@ -19,6 +19,7 @@ from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError, StoreFull, StoreReadOnly
 from services.errors import StoreDamaged
+from services.records.capture_journal import UNDERWAY
 from services.records.capture_store import CaptureStore
 from services.records.reserve_file import NAME, ReserveFile
 from services.records.storage_errors import sqlite_name, storage_errors
@@ -78,9 +79,14 @@ def _copy(source: Path, target: Path) -> None:
     if source.name in READ_FROM_DISK:
         target.symlink_to(source.absolute())
     elif source.is_dir() and source.name not in NOT_COPIED:
-        shutil.copytree(source, target)
+        shutil.copytree(source, target, ignore=_no_frames if source.name == UNDERWAY else None)
     elif source.name not in NOT_COPIED:
         shutil.copy(source, target)
+
+
+def _no_frames(folder: str, names: list[str]) -> list[str]:
+    """Return the folders of frames in the journal, which are not resumed and need not be in memory."""
+    return [name for name in names if (Path(folder) / name).is_dir()]
 
 
 def _refusal(error: StoreError) -> StoreError | None:

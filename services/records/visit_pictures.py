@@ -11,6 +11,7 @@ from device.values import Eye
 from services.errors import ConsentDeclined, ConsentMissing, RecordNotFound, VisitFinished
 from services.records import laterality_correction, schema, visit_queries, visit_rows
 from services.records.capture import Capture, CaptureReport
+from services.records.capture_journal import ResumableCapture
 from services.records.capture_target import CaptureTarget, Permit, RowWriter, permit_test_picture
 from services.records.idempotent_requests import IdempotentRequests, key_conflict
 from services.records.protocol import CHOOSE_REMEDY, Protocol
@@ -53,6 +54,19 @@ class VisitPictures:
         return CaptureTarget(
             id, slot, tries, self._protocol.retakes, protocol_slot.field, self._row_writer(key), request, permit,
             self._protocol.frames, self._protocol.colours,
+        )  # fmt: skip
+
+    def resumed_target(self, interrupted: ResumableCapture) -> CaptureTarget:
+        """Return the target of a capture whose frames the run before has taken, also in a visit that is finished.
+
+        RecordNotFound if the programme no longer has its slot.
+        """
+        key, entry = interrupted.key, interrupted.press
+        request = None if key is None else self._requests.reference(key, PRESS_REQUEST)
+        field = None if entry.slot is None else self._protocol.slot(entry.slot).field
+        return CaptureTarget(
+            entry.visit, entry.slot, entry.tries, self._protocol.retakes, field, self._row_writer(key), request,
+            self.permission(entry.visit), interrupted.planned, interrupted.colours,
         )  # fmt: skip
 
     def permission(self, id: str | None) -> Permit:

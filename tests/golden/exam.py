@@ -150,7 +150,7 @@ class Stage:
 
     def add_journal(self) -> None:
         """Append the content of the journal of interrupted captures to the trace."""
-        notes = sorted((self.rig.store.folder / "underway").iterdir())
+        notes = sorted((self.rig.store.folder / "underway").glob("*.json"))
         entries = [digested_json.decoded(path.read_bytes()) for path in notes]  # the digest depends on the id
         self.trace.add(journal=entries)
 

@@ -33,6 +33,8 @@ STORE, QUARANTINE, EXAM, REQUESTS, STATES, LOOP, LIVE, PIPELINE = (
     "services/instrument/capture_pipeline.py",
 )
 SIGNING, RECOVERY = "services/records/record_signing.py", "services/records/recovery.py"
+JOURNAL, WRITER = "services/records/capture_journal.py", "services/records/frame_writer.py"
+T_INTERRUPTED, T_WRITER = "tests/journey/test_interrupted_press.py", "tests/unit/test_frame_writer.py"
 T_LOG, T_RECOVERY = "tests/unit/test_dose_ledger_log.py", "tests/unit/test_recovery.py"
 T_LIGHT = "tests/journey/test_light_requests.py"
 T_GUARD, T_BOOK, T_DOSES = (
@@ -157,7 +159,7 @@ MUTANTS: tuple[Mutant, ...] = (
         REQUESTS, "self._idempotency_keys.remember(press.key, press)",
         "pass", exam("test_the_same_key_is_the_same_picture_while_it_is_made_and_afterwards"),
     ),
-    Mutant(LOOP, "        press.target.permit()  # again", "        #", "tests/journey/test_consent.py"),
+    Mutant(LOOP, "        target.permit()  # again", "        #", "tests/journey/test_consent.py"),
     Mutant(
         LOOP, "            on_failure()\n",
         "            pass\n", exam("test_a_lamp_that_cannot_be_darkened_ends_the_process"),
@@ -177,11 +179,8 @@ MUTANTS: tuple[Mutant, ...] = (
         PIPELINE, "yield unreconstructed(shot.frame, error)",
         "raise", exam("test_a_capture_without_reconstruction_is_stored"),
     ),
-    Mutant(LOOP, "            self._end_journal_entry(id)\n", "", scenario("camera_stalled")),
-    Mutant(
-        LOOP, "        self._parts.capture_journal.begin(press.journal_entry(id), press.key)\n",
-        "", scenario("press"),
-    ),
+    Mutant(LOOP, "self._parts.capture_journal.fail(id)", "pass", scenario("camera_stalled")),
+    Mutant(JOURNAL, '{press.id}.json", digested', '{press.id}.text", digested', scenario("press")),
     Mutant(
         REQUESTS, "self._change(replace(self._snapshot, live_until_s=0.0))  # aiming is over",
         "pass  # aiming is over", scenario("press_while_aiming"),
@@ -192,12 +191,24 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(REQUESTS, "            self._live_request = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
-        PIPELINE, "    head.check()\n    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)",
-        "    begin_s, shot = clock.now_s(), ExposureSettings(head.spec.camera.exposure_s)", scenario("head_lost"),
+        PIPELINE, "    head.check()\n    run = _Exposing(", "    run = _Exposing(", scenario("head_lost"),
     ),
     Mutant(
         PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes",
         "head.light.on(Illumination(head.spec.light.colour), eyes", scenario("press_while_aiming"),
+    ),
+    # Interrupted presses
+    Mutant(
+        LOOP, "            press.target.permit()  # the consent may", "            pass  # the consent may",
+        f"{T_INTERRUPTED}::test_frames_of_a_patient_who_has_declined_since_are_deleted",
+    ),
+    Mutant(
+        WRITER, "(file.sha256, file.length_bytes) != ", "file.length_bytes != file.length_bytes and ",
+        f"{T_WRITER}::test_one_changed_bit_is_not_taken_for_a_frame",
+    ),
+    Mutant(
+        EXAM, "            requests.remember(one.press)\n", "            pass\n",
+        f"{T_INTERRUPTED}::test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key",
     ),
 )  # fmt: skip
 

@@ -41,7 +41,8 @@ from services.instrument.head_arbiter import AppContext, HeadArbiter
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
-from services.records.protocol import Protocol
+from services.records.protocol import Protocol, load_protocol
+from services.records.visit_repository import VisitRepository
 from tests.simulated import small_head_toml
 
 ROOT = Path(__file__).parents[2]
@@ -201,7 +202,11 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
             stack = replace(calibration, psfs=own)
         opened = head(Head(scene.spec, camera(SimCamera(scene)), light, stack, present_eye=scene.present_eye))
         event_bus = event_bus or EventBus()
-        exam = ExamService(opened, records, event_bus, clock, plans, died.set, Watchdog(watchdog))
+        pictures = VisitRepository(records.engine, protocol or load_protocol(), clock).pictures
+        exam = ExamService(
+            opened, records, event_bus, clock, plans, died.set, Watchdog(watchdog),
+            resumed_target=pictures.resumed_target,
+        )  # fmt: skip
         undo.callback(exam.close)
         undo.callback(clock.gate.set)
         assert not wait or exam.ready.wait(60)

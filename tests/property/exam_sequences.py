@@ -56,6 +56,7 @@ from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import ExamState
 from services.instrument.frame_feedback import NO_AIM
 from services.instrument.progress import Progress
+from services.instrument.resumption import resumed_presses
 from services.instrument.watchdog import Watchdog
 from services.records.capture import Capture
 from services.records.capture_journal import CaptureJournal
@@ -73,7 +74,7 @@ FAULTS = (
 )  # fmt: skip
 TRIGGERS = ("time", "idle", "state", "stage", "verdict", "kept", "failed")
 ACTIONS = ("press", "repeat", "cancel", "take lease", "release lease", "fault", "repair", "disk", "consent", "aim",
-           "useless frames", "unexpected", "close")  # fmt: skip
+           "useless frames", "unexpected", "kill", "close")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ SEQUENCE = st.lists(
 
 
 class Unexpected(RuntimeError):
-    """Exception of the camera that the exam does not know."""
+    """Exception of the camera, or at any moment, that the exam does not know: it ends the process."""
 
 
 @dataclass
@@ -114,14 +115,15 @@ class Conditions:
     has_consent: bool = True
     is_disk_full: bool = False
     is_camera_broken: bool = False
+    is_killed: bool = False
     is_frame_useless: bool = False
 
 
 class BreakableCamera:
-    """Camera that raises an unknown exception while its condition is set."""
+    """Camera that raises an unknown exception while its condition is set; `on_frame` is called with each frame."""
 
-    def __init__(self, camera: Camera, conditions: Conditions) -> None:
-        self._camera, self._conditions, self.shape = camera, conditions, camera.shape
+    def __init__(self, camera: Camera, conditions: Conditions, on_frame: Callable[[Frame], None]) -> None:
+        self._camera, self._conditions, self.shape, self._on_frame = camera, conditions, camera.shape, on_frame
 
     def prepare(self, shot: ExposureSettings) -> None:
         self._camera.prepare(shot)
@@ -130,6 +132,7 @@ class BreakableCamera:
         frame = self._camera.expose(shot, into)
         if self._conditions.is_camera_broken:
             raise Unexpected("the camera driver failed")
+        self._on_frame(frame)
         return frame
 
     def close(self) -> None:
@@ -137,12 +140,16 @@ class BreakableCamera:
 
 
 class ScriptedClock(VirtualClock):
-    """Virtual clock that calls `act` at each moment that it is set for, in the thread that sleeps."""
+    """Virtual clock that calls `act` at each moment that it is set for, in the thread that sleeps.
+
+    `die` is called at the end of each sleep, and raises the exception that ends the process, if it is to end.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.alarm_s: float | None = None
         self.act: Callable[[], None] = lambda: None
+        self.die: Callable[[], None] = lambda: None
 
     def sleep(self, duration_s: float) -> None:
         end_s = self.elapsed_s + max(0.0, duration_s)
@@ -150,6 +157,7 @@ class ScriptedClock(VirtualClock):
             super().sleep(self.alarm_s - self.elapsed_s)
             self.act()
         super().sleep(end_s - self.elapsed_s)
+        self.die()
 
 
 class WatchedWorld(World):
@@ -258,12 +266,15 @@ class Run:
         self.violations: list[str] = []
         self.conditions = bench.conditions
         self.futures: list[Future[Capture]] = []
+        self.resumed: list[Future[Capture]] = []  # of the run before, whose frames are on the disk
+        self.lit: list[Future[Capture]] = []  # of which a lit frame was taken
         self.done: Counter[str] = Counter()
         self.died = False
         self.clock, self.event_bus = ScriptedClock(), HookedBus()
         self.world = copy(bench.world)
         self.world.clock, self.world.faults, self.world.on_light = self.clock, set(), self._check_light
         self.lease, self.requests = ControlLease(self.clock), VirtualRequests(self.clock)
+        self.clock.die = self._end_if_killed
         self.clock.act, self.event_bus.hook, self.requests.idle = self._act_now, self._act_at_event, self._act_idle
         self._is_acting = self._is_permitted = False
         self.parts = self._parts()
@@ -275,15 +286,20 @@ class Run:
         calibration = replace(bench.calibration, sensor=sensor)  # the monitor checks own captures
         spec = self.world.spec
         light = GuardedLight(SimLight(self.world), clock, 30.0, hazard_of(spec), MemoryLedger(clock))
-        camera = BreakableCamera(SimCamera(self.world), self.conditions)
+        camera = BreakableCamera(SimCamera(self.world), self.conditions, self._count_frame)
         head = Head(spec, camera, light, calibration, present_eye=self.world.present_eye)
         progress = Progress(clock, 2 * spec.camera.exposure_s, lambda: BUDGET_S)
         monitor = CalibrationMonitor(
             head, bench.store, self.event_bus, clock, lambda: self.requests.snapshot.is_interrupted, watchdog
         )
+        journal = CaptureJournal(bench.store)
+        resumed = resumed_presses(
+            journal, lambda one: CaptureTarget(one.press.visit, one.press.slot, permit=self._permit_resumed)
+        )
+        self.resumed = [one.press.future for one in resumed]
         return ExamParts(
             head, bench.store, clock, watchdog, lambda: BUDGET_S, self.requests,
-            ExamEvents(self.event_bus, watchdog, progress, self.requests), CaptureJournal(bench.store), monitor,
+            ExamEvents(self.event_bus, watchdog, progress, self.requests), journal, monitor, resumed,
         )  # fmt: skip
 
     def play(self) -> None:
@@ -298,11 +314,19 @@ class Run:
         try:
             run_exam(self.parts, plan, lambda: None, self._die)
         except Unexpected:
-            self._require(self.conditions.is_camera_broken, "an exception without a cause")
+            self._require(self.conditions.is_camera_broken or self.conditions.is_killed, "an exception without a cause")
         self._check_end()
 
     def _die(self) -> None:
         self.died = True
+
+    def _end_if_killed(self) -> None:
+        if self.conditions.is_killed:
+            raise Unexpected("the process ends")
+
+    def _count_frame(self, frame: Frame) -> None:
+        if frame.illumination is not None and self.requests.snapshot.state in EXPOSING:
+            self.lit.append(self.futures[-1])
 
     def _require(self, holds: bool, rule: str) -> None:
         if not holds:
@@ -329,6 +353,9 @@ class Run:
             self._require(self.world.illumination is None, "the lamp is on between two actions")
         pending = sum(not future.done() for future in self.futures)
         self._require(pending == self.requests.snapshot.state.captures, f"{pending} presses are not answered")
+        self._require(
+            all(future.done() for future in self.resumed), "an interrupted press waits although there is time"
+        )
 
     def _check_end(self) -> None:
         now, store = self.requests.snapshot, self.bench.store
@@ -339,13 +366,17 @@ class Run:
             self._require(self.died or now.is_closing, "the lamp stays on and the process too")
             self.parts.head.light.off()
         self._require(self.world.illumination is None, "the lamp is on at the end")
-        for future in self.futures:
+        for future in (*self.futures, *self.resumed):
             self._require(future.done(), "a press is never answered")
             error = future.exception(0) if future.done() else None
             self._require(error is None or isinstance(error, DiffuscopeError), f"a press fails with {error!r}")
             if future.done() and error is None:
                 self._check_stored(future.result(0), store)
         self.done["stored"] += sum(future.done() and future.exception(0) is None for future in self.futures)
+        self.done["resumed"] += sum(future.done() and future.exception(0) is None for future in self.resumed)
+        cut_off = sum(is_cut_off(future) for future in (*self.lit, *self.resumed))
+        on_disk = len(list(store.folder.glob("underway/*/raw.tiff.json")))
+        self._require(on_disk == cut_off, f"{on_disk} presses have frames on the disk, and {cut_off} were cut off")
 
     def _check_stored(self, capture: Capture, store: CaptureStore) -> None:
         self._require(store.get(capture.id) == capture, "an acknowledged capture is not stored as it was answered")
@@ -354,6 +385,7 @@ class Run:
         self._require(capture.simulated, "a capture is not marked as simulated")
         journal = store.folder / "underway" / f"{capture.id}.json"
         self._require(not journal.exists(), "a stored capture is still in the journal")
+        self._require(not journal.with_suffix("").exists(), "frames of a stored capture are still in the journal")
 
     # Actions
 
@@ -425,6 +457,12 @@ class Run:
                 self.conditions.is_frame_useless = True
             case "unexpected":
                 self.conditions.is_camera_broken = True
+            case "kill":
+                self.conditions.is_killed = True
+
+    def _permit_resumed(self) -> None:
+        if not self.conditions.has_consent:
+            raise ConsentDeclined("the patient did not agree to pictures")
 
     def _permit(self) -> None:
         if not self.conditions.has_consent:
@@ -451,6 +489,12 @@ class Run:
         self.done["accepted"] += 1
         self.futures.append(future)
         self._require(before.state.accepts_press and not before.is_closing, "a press is accepted that must be refused")
+
+
+def is_cut_off(future: Future[Capture]) -> bool:
+    """Return whether a press ended with the exam: its frames stay on the disk."""
+    error = future.exception(0) if future.done() else None
+    return error is not None and (isinstance(error, Busy) or "stopped unexpectedly" in str(error))
 
 
 @dataclass

@@ -4,11 +4,19 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from device.values import Frame, Illumination
+from services.imaging.raw_metadata import RawMetadata
+from services.instrument.frame_sink import FrameSink
 from services.records.capture import Capture, CaptureReport
-from services.records.capture_journal import CaptureJournal, InterruptedCapture
+from services.records.capture_journal import MAX_ATTEMPTS, CaptureJournal, InterruptedCapture
 from services.records.capture_store import CaptureStore
+
+NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
+KEY = "0123456789abcdef"
+LIT = ("green", "green")
 
 
 @pytest.fixture
@@ -48,3 +56,87 @@ def test_a_test_picture_is_reported_in_one_run_and_a_picture_of_a_visit_until_it
     reported.mark_reported()
     assert reported.interrupted == (test_picture, of_visit)
     assert CaptureJournal(store).interrupted == (of_visit,)
+
+
+PRESS = InterruptedCapture("20260301T120000-OD-ab", "OD", "v", "R-centre", 1)
+
+
+def press_with_frames(store: CaptureStore, press: InterruptedCapture = PRESS, lights: tuple[str, ...] = LIT) -> None:
+    """Journal a press as it is during its exposure, with one frame in each of these lights on the disk."""
+    writer = CaptureJournal(store).begin(press, KEY, 3, ("red",))
+    sink = FrameSink(writer, RawMetadata(press.id, "OD", NOON, calibration_id="00ff", head="head"), "green")
+    for number, light in enumerate(lights):
+        glow = None if light == "dark" else Illumination("red" if light == "red" else "green")
+        sink(Frame(np.full((8, 9), number, np.uint16), 0.1, number, glow, True), 1e-5, 0.1)
+    writer.finish()
+
+
+def test_an_interrupted_press_with_a_lit_frame_is_resumable_with_its_key_and_plan(store: CaptureStore) -> None:
+    press_with_frames(store)
+    found = CaptureJournal(store)
+    assert found.interrupted == ()
+    (one,) = found.resumable
+    assert (one.press, one.key, one.planned, one.colours) == (PRESS, KEY, 3, ("red",))
+    assert [frame.file.path.name for frame in one.frames] == ["raw.tiff", "raw-1.tiff"]
+    found.end(PRESS.id)
+    assert found.resumable == ()
+    assert list((store.folder / "underway").iterdir()) == []
+
+
+@pytest.mark.parametrize("lights", [(), ("dark",), ("red", "dark")])
+def test_without_a_lit_frame_a_press_is_interrupted_and_its_frames_are_deleted(
+    store: CaptureStore, lights: tuple[str, ...]
+) -> None:
+    press_with_frames(store, lights=lights)
+    found = CaptureJournal(store)
+    assert (found.interrupted, found.resumable) == ((PRESS,), ())
+    assert [path.name for path in (store.folder / "underway").iterdir()] == [f"{PRESS.id}.json"]
+
+
+def test_frames_of_a_stored_capture_and_frames_without_an_entry_are_deleted_at_the_opening(store: CaptureStore) -> None:
+    press_with_frames(store)
+    press_with_frames(store, InterruptedCapture("20260301T120000-OD-cd", "OD"))
+    store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {"raw.tiff": b"1"})
+    (store.folder / "underway" / "20260301T120000-OD-cd.json").unlink()
+    for _ in range(2):
+        found = CaptureJournal(store)
+        assert (found.interrupted, found.resumable) == ((), ())
+        assert list((store.folder / "underway").iterdir()) == []
+
+
+def test_a_failed_resumption_is_an_interrupted_capture_and_two_lost_attempts_end_it(store: CaptureStore) -> None:
+    press_with_frames(store)
+    failed = CaptureJournal(store)
+    failed.fail(PRESS.id)
+    assert (failed.interrupted, failed.resumable) == ((PRESS,), ())
+    assert CaptureJournal(store).interrupted == (PRESS,)
+    CaptureJournal(store).end(PRESS.id)
+    press_with_frames(store)
+    for _ in range(MAX_ATTEMPTS):
+        journal = CaptureJournal(store)
+        assert [one.press for one in journal.resumable] == [PRESS]
+        journal.count_attempt(PRESS.id)  # and the process is killed
+    assert (CaptureJournal(store).interrupted, CaptureJournal(store).resumable) == ((PRESS,), ())
+
+
+@pytest.mark.parametrize("entry", [b"{half", b'{"id": "a", "eye": "OD", "visit": null, "slot": null, "tries": 0}'])
+def test_frames_of_an_entry_that_does_not_name_its_target_are_not_resumed(store: CaptureStore, entry: bytes) -> None:
+    press_with_frames(store)
+    (store.folder / "underway" / f"{PRESS.id}.json").write_bytes(entry)
+    found = CaptureJournal(store)
+    assert found.resumable == ()
+    assert [(one.id, one.eye, one.visit) for one in found.interrupted] == [(PRESS.id, "OD", None)]
+    assert not (store.folder / "underway" / PRESS.id).exists()
+
+
+def test_files_of_the_writer_are_linked_into_the_capture_and_outlast_the_journal(store: CaptureStore) -> None:
+    press_with_frames(store)
+    journal = CaptureJournal(store)
+    (one,) = journal.resumable
+    files = {frame.file.path.name: frame.file for frame in one.frames}
+    before = {name: file.path.read_bytes() for name, file in files.items()}
+    inode = files["raw.tiff"].path.stat().st_ino
+    kept = store.save(Capture(PRESS.id, "OD", NOON, True, "00ff", CaptureReport(), {}), {**files, "report.json": b"{}"})
+    journal.end(PRESS.id)
+    assert {name: store.read(kept.id, name) for name in before} == before
+    assert (store.folder / "captures" / kept.id / "raw.tiff").stat().st_ino == inode, "it was written twice"

@@ -14,6 +14,7 @@ from services.instrument.time_budget import MAX_IN_PROGRESS
 README = Path(exam_state.__file__).with_name("README.md")
 FIRST_README = Path(exam_state.__file__).parents[2] / "README.md"
 EXPOSURE_ENDS = (ExamEvent.EXPOSED, ExamEvent.EXPOSURE_FAILED)
+CAPTURE_BEGINS = (ExamEvent.PRESS, ExamEvent.RESUMED)
 CAPTURE_ENDS = (ExamEvent.STORED, ExamEvent.FAILED, ExamEvent.EXPOSURE_FAILED)
 
 
@@ -42,7 +43,7 @@ def test_a_transition_changes_the_number_of_captures_by_the_event(
     before: ExamState, event: ExamEvent, after: ExamState
 ) -> None:
     if event is not ExamEvent.END:
-        begun, done = event is ExamEvent.PRESS, event in CAPTURE_ENDS
+        begun, done = event in CAPTURE_BEGINS, event in CAPTURE_ENDS
         assert after.captures == before.captures + begun - done
         assert after.captures <= MAX_IN_PROGRESS
 

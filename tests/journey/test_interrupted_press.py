@@ -1,0 +1,212 @@
+"""A press that ends with the process: its frames become a shorter burst under the same id and key at the next start."""
+
+import json
+import signal
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from device.errors import DiffuscopeError, StoreFull
+from device.ports import Camera
+from device.values import ExposureSettings, Frame, Illumination
+from services.errors import ConsentDeclined
+from services.instrument.capture_pipeline import INTERRUPTED
+from services.instrument.resumption import CALIBRATION_DARK, NO_DARK, SHORTER, WHOLE
+from services.records.capture_target import CaptureTarget
+from services.records.protocol import load_protocol
+from services.records.visit_repository import VisitRepository
+from tests.journey.conftest import Rig, until
+from tests.journey.test_cli_server import Server
+from tests.simulated import small_head_toml
+
+KEY = "c" * 16
+
+
+class EndsAt:
+    """Camera that raises an exception the exam does not know, which ends its process, in the exposure number `last`."""
+
+    def __init__(self, camera: Camera, last: int) -> None:
+        self._camera, self._left, self.shape = camera, last, camera.shape
+
+    def prepare(self, shot: ExposureSettings) -> None:
+        self._camera.prepare(shot)
+
+    def expose(self, shot: ExposureSettings, into: Any = None) -> Frame:
+        self._left -= 1
+        if self._left <= 0:
+            raise ZeroDivisionError("unexpected")
+        return self._camera.expose(shot, into)
+
+    def close(self) -> None:
+        self._camera.close()
+
+
+def written(store: Path) -> dict[str, bytes]:
+    """Return the frames of the press in progress that count: those with a note."""
+    notes = sorted(store.glob("underway/*/*.tiff.json"))
+    return {note.stem: note.with_name(note.stem).read_bytes() for note in notes}
+
+
+def begin_visit(rig: Rig) -> str:
+    visit: str = rig.request("POST", "/api/visits", json={"key": "0" * 16}).json()["id"]
+    answer_consent(rig, visit, "agreed", "1" * 16)
+    return visit
+
+
+def answer_consent(rig: Rig, visit: str, value: str, key: str) -> None:
+    rig.request("PATCH", f"/api/visits/{visit}", json={"key": key, "field": "consent", "value": value})
+
+
+@dataclass
+class Interrupted:
+    """What a press left that ended with its process: visit, target, frames on the disk, and light counted."""
+
+    visit: str | None
+    target: CaptureTarget
+    frames: dict[str, bytes]
+    spent_j_per_cm2: float
+
+
+Interrupt = Callable[..., Interrupted]
+
+
+@pytest.fixture
+def interrupt(build: Callable[..., Rig], tmp_path: Path) -> Interrupt:
+    """Press, and end the exam in the exposure number `last`; `consent` is the answer that is given afterwards."""
+
+    def press(last: int, of_visit: bool = True, consent: str = "agreed") -> Interrupted:
+        with ExitStack() as undo:
+            rig = build(tmp_path, undo, camera=lambda camera: EndsAt(camera, last))
+            visit = begin_visit(rig) if of_visit else None
+            pictures = VisitRepository(rig.store.engine, load_protocol(), rig.clock).pictures
+            target = pictures.capture_target("OD", KEY, visit, "R-centre" if of_visit else None)
+            with pytest.raises(DiffuscopeError, match="unexpectedly"):
+                rig.exam.press("OD", KEY, target).result(60)
+            assert rig.died.wait(10)
+            assert rig.world.illumination is None
+            assert rig.store.captures() == []
+            folder = rig.store.folder
+            until(lambda: len(written(folder)) == last - 1)
+            if visit is not None:
+                answer_consent(rig, visit, consent, "2" * 16)
+            return Interrupted(visit, target, written(folder), rig.exam.head.light.ledger.spent_j_per_cm2("OD"))
+
+    return press
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # on purpose
+
+
+@pytest.mark.parametrize(("last", "lit", "red"), [(2, 1, False), (4, 3, False), (6, 4, True)])
+def test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key(
+    build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path, last: int, lit: int, red: bool
+) -> None:
+    before = interrupt(last)
+    (id,) = [path.name for path in (tmp_path / "store" / "underway").iterdir() if path.is_dir()]
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        repeated = rig.exam.press("OD", KEY, before.target)
+        capture = repeated.result(60)
+        until(lambda: rig.exam.state == "aim")
+        assert capture.id == id
+        assert rig.store.captures() == [capture]
+        assert rig.world.frames == 0, "nothing is exposed again"
+        made, light = capture.report.reconstruction, capture.report.light
+        assert [frame.index for frame in made.frames] == list(range(lit))
+        assert SHORTER.format(taken=lit, planned=4) in made.warnings
+        assert {NO_DARK, CALIBRATION_DARK} & set(made.warnings)
+        assert made.method != "none"
+        assert {one.name: one.reason for one in made.channels}["red"] == (None if red else INTERRUPTED)
+        assert light.dose_j_per_cm2 == pytest.approx(one_press_j_per_cm2(rig, lit, red), rel=0.02)
+        assert rig.exam.head.light.ledger.spent_j_per_cm2("OD") == pytest.approx(before.spent_j_per_cm2)
+        for name, content in before.frames.items():
+            assert rig.store.read(id, name) == content
+        assert "dark.tiff" not in capture.files
+        assert list((rig.store.folder / "underway").iterdir()) == []
+        visit = rig.request("GET", f"/api/visits/{before.visit}").json()
+        assert visit["slots"]["R-centre"]["captures"] == [id]
+
+
+def one_press_j_per_cm2(rig: Rig, lit: int, red: bool) -> float:
+    hazard, exposure_s = rig.exam.head.light.hazard, rig.exam.head.spec.camera.exposure_s
+    colour_j_per_cm2 = hazard.dose_j_per_cm2(Illumination("red", hazard.highest_level("red")), exposure_s)
+    return hazard.dose_j_per_cm2(Illumination("green"), lit * exposure_s) + red * colour_j_per_cm2
+
+
+def test_without_a_lit_frame_the_press_is_an_interrupted_capture(
+    build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path
+) -> None:
+    before = interrupt(1, of_visit=False)
+    assert before.frames == {}
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        assert [one.eye for one in rig.exam.capture_journal.interrupted] == ["OD"]
+        assert rig.exam.press("OD", KEY, before.target).result(60).report.reconstruction.method != "none"
+        assert rig.world.frames > 0
+
+
+def test_frames_of_a_patient_who_has_declined_since_are_deleted(
+    build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path
+) -> None:
+    before = interrupt(4, consent="declined")
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo)
+        with pytest.raises(ConsentDeclined):
+            rig.exam.press("OD", KEY, before.target).result(60)
+        assert rig.store.captures() == []
+        assert rig.exam.capture_journal.interrupted == ()
+        assert list((rig.store.folder / "underway").iterdir()) == []
+
+
+def test_frames_that_cannot_be_stored_leave_an_interrupted_capture(
+    build: Callable[..., Rig], interrupt: Interrupt, tmp_path: Path
+) -> None:
+    before = interrupt(3)
+    with ExitStack() as undo:
+        rig = build(tmp_path, undo, store={"free_bytes": lambda _: 0})
+        with pytest.raises(StoreFull):
+            rig.exam.press("OD", KEY, before.target).result(60)
+        assert [one.slot for one in rig.exam.capture_journal.interrupted] == ["R-centre"]
+        assert [path.suffix for path in (rig.store.folder / "underway").iterdir()] == [".json"]
+        assert rig.world.illumination is None
+
+
+@pytest.mark.parametrize(("moment", "lit", "warning"), [("raw-1.tiff", 2, SHORTER), ("dark.tiff", 4, WHOLE)])
+def test_sigkill_between_frames_and_during_the_reconstruction(
+    environment: dict[str, str], tmp_path: Path, moment: str, lit: int, warning: str
+) -> None:
+    """The first press is killed as soon as the frame `moment` is on the disk; the request is repeated after a start."""
+    head, data = tmp_path / "slow.toml", tmp_path / "data"
+    head.write_text(small_head_toml("Small slow head", exposure_s=0.4))
+    server, press = Server(head, data, environment), {"eye": "OD", "key": KEY}
+    with server.running() as process:
+        ready(server)
+        with ThreadPoolExecutor(1) as aside:
+            pressed = aside.submit(server.ask, "POST", "/api/captures", press)
+            until(lambda: bool(list(data.glob(f"underway/*/{moment}.json"))), 60)
+            process.send_signal(signal.SIGKILL)
+            assert pressed.exception(60) is not None
+        process.wait()
+    frames, (id,) = written(data), [one.name for one in (data / "underway").iterdir() if one.is_dir()]
+    assert not (data / "captures" / id).exists(), "the kill came too late, so the test shows nothing"
+    with server.running():
+        assert server.ask("POST", "/api/captures", press)["id"] == id
+        assert server.listed() == [id]
+        report = json.loads(server.ask("GET", f"/api/captures/{id}/report.json"))
+        lit_frames = [name for name in frames if name == "raw.tiff" or name[4:5].isdigit()]
+        assert len(report["frames"]) == len(lit_frames) >= lit
+        assert warning.format(taken=len(lit_frames), planned=4) in report["warnings"]
+        assert report["dose_j_per_cm2"] > 0
+        for name, content in frames.items():
+            assert server.ask("GET", f"/api/captures/{id}/{name}") == content
+        assert server.ask("POST", "/api/captures", {"eye": "OS"})["id"] != id
+    assert [path.name for path in (data / "underway").iterdir()] == []
+
+
+def ready(server: Server) -> None:
+    until(lambda: server.ask("GET", "/api/status")["state"] == "aim", 300)
