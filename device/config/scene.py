@@ -131,6 +131,18 @@ class SensorFlaws(Table):
     bayer: bool = False  # a colour sensor under one colour of light
 
 
+class DiffuserSpec(Table):
+    """Element at the iris: the random surface of [optics], or lenses that focus on the sensor (OPTICS.md 2.8).
+
+    `microlenses` is a square array, `lenslets` are placed at random, equal in focal length. `pitch_um` is the side of a
+    lens, or of the square that a lenslet has on average; `focal_um` None: the distance from the element to the sensor.
+    """
+
+    kind: Literal["diffuser", "microlenses", "lenslets"] = "diffuser"
+    pitch_um: float = Field(default=400.0, ge=100, le=2000)
+    focal_um: float | None = Field(default=None, ge=1000, le=100000)
+
+
 class CalibrationSpec(Table):
     """Conditions of the simulated PSF measurement: refraction of the eye, source size, diffuser distance (or None)."""
 
@@ -177,7 +189,7 @@ EffectTables = Annotated[
 
 
 class SimSpec(Table):
-    """Scene: object, eye, light, sensor and calibration of a simulated head.
+    """Scene: object, eye, light, sensor, element at the iris, and calibration of a simulated head.
 
     `peak_e` is the charge of the brightest pixel in one exposure in green at full drive, electrons; "budget" takes the
     light of a human eye from the light budget of the head's LEDs, their measured light if the head file has it
@@ -191,6 +203,7 @@ class SimSpec(Table):
     eye: EyeSpec = EyeSpec()
     light: LightFlaws = LightFlaws()
     sensor: SensorFlaws = SensorFlaws()
+    diffuser: DiffuserSpec = DiffuserSpec()
     calibration: CalibrationSpec = CalibrationSpec()
     effects: EffectTables = Field(default_factory=dict)
 

@@ -14,7 +14,8 @@ from scipy import fft
 from scipy.special import j1
 
 from device.config.head_file import OpticsSpec
-from device.optics.diffuser import Beam, Refraction, caustic
+from device.config.scene import DiffuserSpec
+from device.optics.diffuser import RANDOM_SURFACE, Beam, Refraction, caustic
 from device.sim.optical_setup import OpticalSetup, Place
 from device.values import Image
 
@@ -78,15 +79,18 @@ def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
     scene = setup.scene
     pitch_um = scene.spec.camera.pitch_um
     with setup.timed(*(["bandwidth"] if setup.lines > 1 else [])):
-        return cached_caustic(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
+        return cached_caustic(
+            setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam, scene.sim.diffuser
+        )
 
 
 @lru_cache(maxsize=4)
 def cached_caustic(
-    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None
-) -> Image:
+    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None,
+    element: DiffuserSpec = RANDOM_SURFACE,
+) -> Image:  # fmt: skip
     """Return the PSF of `caustic` as a read-only array, from a cache of the last four sets of arguments."""
-    point = caustic(optics, pitch_um, seed, refraction, lines, beam)
+    point = caustic(optics, pitch_um, seed, refraction, lines, beam, element)
     point.flags.writeable = False
     return point
 
