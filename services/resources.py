@@ -7,15 +7,13 @@ top-level folder `web` or `hardware`.
 import os
 from pathlib import Path
 
-BESIDE = Path(__file__).parents[1]
-INSTALLED = BESIDE / "diffuscope"
-ROOT = INSTALLED if INSTALLED.is_dir() else BESIDE
+from device.config import shipped_heads
 
-WEB = ROOT / "web"
-HEADS = ROOT / "hardware" / "heads"
-LIGHT_PATH = ROOT / "hardware" / "optics.toml"
-CHANGELOG = ROOT / "CHANGELOG.md"
-SCENES = BESIDE / "device" / "sim" / "scenes"
+HEADS = shipped_heads.HEADS
+LIGHT_PATH = shipped_heads.LIGHT_PATH
+WEB = shipped_heads.ROOT / "web"
+CHANGELOG = shipped_heads.ROOT / "CHANGELOG.md"
+SCENES = Path(__file__).parents[1] / "device" / "sim" / "scenes"
 
 
 def fft_plans() -> Path:

@@ -69,7 +69,8 @@ def coarse(spec: InstrumentSpec, k: int) -> InstrumentSpec:
         "line_s": k * sim.sensor.line_s,
     }  # fmt: skip
     head = spec.model_copy(update={"camera": camera.model_copy(update=summed)})
-    return with_keys(head, peak_e=k**2 * sim.peak_e, sensor=flaws)
+    peak_e = sim.peak_e if sim.peak_e == "budget" else k**2 * sim.peak_e  # a budget follows the pixels by itself
+    return with_keys(head, peak_e=peak_e, sensor=flaws)
 
 
 def with_keys(spec: InstrumentSpec, **keys: Any) -> InstrumentSpec:

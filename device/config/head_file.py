@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from device.config.radiometry import RadiometrySpec
 from device.config.scene import SimSpec
 from device.config.sensors import sensor_profile
+from device.config.shipped_heads import head_path
 from device.config.toml_file import Table, load_toml
 from device.errors import SpecError
 from device.values import Colour, Geometry
@@ -171,9 +172,12 @@ class LightSpec(Table):
     """LED ring: colours for the picture and for aiming, and `max_on_s`, the longest time the guard leaves it on.
 
     `chain` is a matrix of APA102 LEDs, `sinks` a ring of high-power LEDs with TLC5971 drivers; a real head has one.
+    `head` names a shipped head, or a TOML file beside this one, whose [light] supplies the keys that this table omits;
+    the value is then the file's name without `.toml`.
     """
 
     backend: Literal["sim", "replay", "none", "apa102", "tlc5971"]
+    head: str | None = None
     chain: ChainSpec | None = None
     sinks: SinkSpec | None = None
     pupil_mm: float | None = Field(default=None, gt=0, le=10)  # selects the chain's widest ring that fits into it
@@ -181,6 +185,19 @@ class LightSpec(Table):
     preview_colour: Literal["red", "green", "amber"] = "red"
     max_on_s: float = Field(default=1.0, gt=0, le=30)
     radiometry: RadiometrySpec | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_light_of_head(cls, values: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        """Add the keys of the named head's [light] that the table omits; ValueError for an unknown or dark head.
+
+        Nothing is read for a table that has every key, as of a specification that was loaded before.
+        """
+        name = values.get("head")
+        if name is None or set(cls.model_fields) <= set(values):
+            return values
+        light = _light_of(head_path(str(name), Path() if info.context is None else Path(info.context["folder"])))
+        return {**light.model_dump(), **values, "head": Path(str(name)).name.removesuffix(".toml")}
 
 
 class BusSpec(Table):
@@ -259,6 +276,23 @@ class InstrumentSpec(Table):
     calibration: CalibrationTable | None = None
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
+
+
+class _LightTable(Table):
+    """The table [light] of a head file as written, without its other tables."""
+
+    model_config = ConfigDict(extra="ignore")
+    light: dict[str, object]
+
+
+def _light_of(path: Path) -> LightSpec:
+    """Return the [light] of a head file; SpecError if it has no LEDs or is itself that of another head."""
+    if "head" in load_toml(path, _LightTable).light:
+        raise SpecError(f"{path} takes its light from another head; name that one")
+    light = load_head(path).light
+    if light.backend in ("none", "replay"):
+        raise SpecError(f"{path} has no LEDs, so its light is not known; name a head with a lamp")
+    return light
 
 
 def load_head(path: Path) -> InstrumentSpec:

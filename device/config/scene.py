@@ -13,6 +13,7 @@ from device import plugins
 from device.config.toml_file import Table, check_table
 
 WIDEST_GAZE_DEG = 30.0
+MOST_PEAK_E = 1e7
 T = TypeVar("T", bound=Table)
 
 
@@ -130,6 +131,18 @@ class SensorFlaws(Table):
     bayer: bool = False  # a colour sensor under one colour of light
 
 
+class DiffuserSpec(Table):
+    """Element at the iris: the random surface of [optics], or lenses that focus on the sensor (OPTICS.md 2.8).
+
+    `microlenses` is a square array, `lenslets` are placed at random, equal in focal length. `pitch_um` is the side of a
+    lens, or of the square that a lenslet has on average; `focal_um` None: the distance from the element to the sensor.
+    """
+
+    kind: Literal["diffuser", "microlenses", "lenslets"] = "diffuser"
+    pitch_um: float = Field(default=400.0, ge=100, le=2000)
+    focal_um: float | None = Field(default=None, ge=1000, le=100000)
+
+
 class CalibrationSpec(Table):
     """Conditions of the simulated PSF measurement: refraction of the eye, source size, diffuser distance (or None)."""
 
@@ -159,26 +172,50 @@ def _require_tables(effects: object) -> object:
     return effects
 
 
+def _check_peak(peak_e: object) -> object:
+    """Return a peak unchanged; ValueError unless it is "budget" or a number above 0 and up to MOST_PEAK_E."""
+    number = isinstance(peak_e, int | float) and not isinstance(peak_e, bool) and 0 < peak_e <= MOST_PEAK_E
+    if peak_e != "budget" and not number:
+        raise ValueError(
+            f'{peak_e!r} is neither a number of electrons above 0 and up to {MOST_PEAK_E:g} nor "budget"; give the '
+            'electrons of the brightest pixel, or "budget" for a human eye in the light of the head\'s LEDs'
+        )
+    return peak_e
+
+
 EffectTables = Annotated[
     dict[Annotated[str, AfterValidator(_require_installed)], dict[str, object]], BeforeValidator(_require_tables)
 ]
 
 
 class SimSpec(Table):
-    """Scene: object, eye, light, sensor and calibration of a simulated head.
+    """Scene: object, eye, light, sensor, element at the iris, and calibration of a simulated head.
 
-    `peak_e` is the charge of the brightest pixel in one exposure in green at full drive, electrons. `effects` has a
-    table for each effect of a plug-in that the scene uses, [sim.effects.NAME]; the plug-in checks its keys.
+    `peak_e` is the charge of the brightest pixel in one exposure in green at full drive, electrons; "budget" takes the
+    light of a human eye from the light budget of the head's LEDs, their measured light if the head file has it
+    (OPTICS.md 4.7). `effects` has a table for each effect of a plug-in that the scene uses, [sim.effects.NAME]; the
+    plug-in checks its keys.
     """
 
     seed: int = 1
-    peak_e: float = Field(default=15000.0, gt=0, le=1e7)
+    peak_e: Annotated[float | Literal["budget"], BeforeValidator(_check_peak)] = 15000.0
     object: ObjectSpec = ObjectSpec()
     eye: EyeSpec = EyeSpec()
     light: LightFlaws = LightFlaws()
     sensor: SensorFlaws = SensorFlaws()
+    diffuser: DiffuserSpec = DiffuserSpec()
     calibration: CalibrationSpec = CalibrationSpec()
     effects: EffectTables = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check_budget(self) -> "SimSpec":
+        """Raise ValueError for the light of a budget without a human eye: screens, prints and model eyes have none."""
+        if self.peak_e == "budget" and self.eye.shown_by != "human eye":
+            raise ValueError(
+                f'peak_e = "budget" is the light of a human eye, not of a {self.eye.shown_by}; set shown_by = '
+                '"human eye" in [sim.eye], or give peak_e as a number of electrons'
+            )
+        return self
 
     def __hash__(self) -> int:
         """Return the hash of all values as JSON: the tables of effects are mappings, which have none of their own."""

@@ -1,4 +1,4 @@
-"""Diffuser model: a smooth random surface at the iris, and the wave-optics PSF (caustic) of a retinal point behind it.
+"""Element at the iris: a smooth random surface or lenslets, and the wave-optics PSF of a retinal point behind it.
 
     opd_sigma_um   roughness of the surface, from the scattering angle in its data sheet
     surface        one realisation of the surface
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from device.config.head_file import OpticsSpec
+from device.config.scene import DiffuserSpec
 from device.errors import SpecError
+from device.optics import lenslets
 from device.optics.propagation import Field, propagate, require_sampling
 from device.values import Image
 
@@ -59,6 +61,7 @@ class Refraction(NamedTuple):
 
 
 EMMETROPIA = Refraction()
+RANDOM_SURFACE = DiffuserSpec()
 
 
 @dataclass(frozen=True)
@@ -96,19 +99,28 @@ def opd_sigma_um(optics: OpticsSpec) -> float:
     return slope_sigma(optics) * optics.correlation_um / math.sqrt(2)
 
 
-def steepest_rad(optics: OpticsSpec, refraction: Refraction = EMMETROPIA) -> float:
-    """Return the steepest ray behind the diffuser, rad: five sigma of its slope plus the eye's slope at the iris."""
+def steepest_rad(
+    optics: OpticsSpec, refraction: Refraction = EMMETROPIA, element: DiffuserSpec = RANDOM_SURFACE
+) -> float:
+    """Return the steepest ray behind the element, rad, plus the eye's slope at the iris.
+
+    Of a random surface five sigma of its slope, of lenslets the ray of the farthest corner of a lens.
+    """
     m, j0, j45 = refraction
     eye = optics.angular_magnification**2 * (abs(m) + math.hypot(j0, j45)) * optics.iris_um / 2 * 1e-6
+    if element.kind != "diffuser":
+        return lenslets.steepest_rad(element, optics.diffuser_to_sensor_um) + eye
     return MAX_SLOPE_SIGMAS * slope_sigma(optics) + eye
 
 
-def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA) -> Grid:
+def grid_for(
+    optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMETROPIA, element: DiffuserSpec = RANDOM_SURFACE
+) -> Grid:
     """Return a grid, as small as possible, whose samples are a whole fraction of a pixel and resolve the caustic.
 
     SpecError if that needs more than 4096 samples a side, or if the correlation length exceeds a quarter of the grid.
     """
-    angle = steepest_rad(optics, refraction)
+    angle = steepest_rad(optics, refraction, element)
     coarsest_um = min(SAMPLING_FRACTION * optics.wavelength_um / (2 * angle), optics.correlation_um / 4)
     step = math.ceil(pitch_um / coarsest_um)
     extent_um = WINDOW_MARGIN * (optics.iris_um + 2 * optics.diffuser_to_sensor_um * angle)
@@ -123,6 +135,13 @@ def grid_for(optics: OpticsSpec, pitch_um: float, refraction: Refraction = EMMET
     if optics.correlation_um > grid.pixels * pitch_um / 4:
         raise SpecError(f"a surface that is correlated over {optics.correlation_um:g} um is no diffuser in this iris")
     return grid
+
+
+def element_path_um(optics: OpticsSpec, grid: Grid, seed: int, element: DiffuserSpec) -> Image:
+    """Return the optical path difference of the element at the iris, um, float32 (samples, samples)."""
+    if element.kind == "diffuser":
+        return surface(optics, grid, seed)
+    return lenslets.path_um(element, optics.diffuser_to_sensor_um, optics.iris_um, grid.x_um, seed)
 
 
 def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
@@ -149,7 +168,7 @@ def surface(optics: OpticsSpec, grid: Grid, seed: int) -> Image:
 
 def caustic(
     optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
-    beam: Beam | None = None,
+    beam: Beam | None = None, element: DiffuserSpec = RANDOM_SURFACE,
 ) -> Image:  # fmt: skip
     """Return the intensity on the sensor from one retinal point on the axis by wave optics: float32 (n, n), sum 1.
 
@@ -158,12 +177,12 @@ def caustic(
     that of a relaxed eye, because another window would hold another surface. SpecError if no grid samples the light
     sufficiently, or if the grid cannot carry so strong a refraction. OPTICS.md 2.2.
     """
-    return caustic_on(grid_for(optics, pitch_um), optics, seed, refraction, lines, beam)
+    return caustic_on(grid_for(optics, pitch_um, element=element), optics, seed, refraction, lines, beam, element)
 
 
 def caustic_on(
     grid: Grid, optics: OpticsSpec, seed: int, refraction: Refraction = EMMETROPIA, lines: int = 3,
-    beam: Beam | None = None,
+    beam: Beam | None = None, element: DiffuserSpec = RANDOM_SURFACE,
 ) -> Image:  # fmt: skip
     """Return the result of `caustic` on a given grid, (pixels, pixels); SpecError for a grid too coarse or small."""
     require_sampling(
@@ -172,9 +191,9 @@ def caustic_on(
         wavelength_um=optics.wavelength_um,
         distance_um=optics.diffuser_to_sensor_um,
         aperture_um=optics.iris_um,
-        angle_rad=steepest_rad(optics, refraction),
+        angle_rad=steepest_rad(optics, refraction, element),
     )
-    path_um = surface(optics, grid, seed) + eye_wavefront_um(optics, grid, refraction)
+    path_um = element_path_um(optics, grid, seed, element) + eye_wavefront_um(optics, grid, refraction)
     amplitude = iris(optics, grid)
     passed = 1.0
     if beam is not None:

@@ -10,6 +10,7 @@ A part that no effect has changed costs no computing time.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import sqrt
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
 from device.optics.illumination import PEAK_UM
 from device.sim.fundus import Fundus
+from device.sim.head_light import HeadLight, head_light
 from device.sim.sensor import SensorModel
 from device.values import Colour, Eye, Geometry, Image
 
@@ -29,6 +31,7 @@ TRIM: dict[Colour, float] = {"red": 1.5, "green": 1.0, "blue": 0.9, "amber": 1.2
 TABLE_E, TABLE_PITCH_UM = 20000.0, 5.04  # reference light of the tabulated etas: peak electrons and pixel pitch
 LIT_SHARE = 0.37  # of the peak: the mean of the lit pixels of a retina behind this diffuser
 SENSOR_SHARE = 0.15  # of the peak: the mean of the paper's whole sensor
+DISC_SHARE = 0.30  # of the peak: the mean of the disc d + 2 s (OPTICS.md 4.7)
 
 Place = tuple[float, float]  # on the retina, in the eye's view: degrees to the right of the axis, and down
 
@@ -74,10 +77,22 @@ class Scene:
         """Angle from the axis to the edge of the illuminated field, degrees."""
         return self.optics.field_deg / 2
 
-    @property
+    @cached_property
+    def budget(self) -> HeadLight | None:
+        """Light by the budget of the head's LEDs, for `peak_e = "budget"`; None where the scene gives a number."""
+        return head_light(self.spec, self.colour) if self.sim.peak_e == "budget" else None
+
+    @cached_property
     def peak_e(self) -> float:
-        """Electrons of the brightest pixel in one exposure of a picture in this colour, before stray light."""
-        return TRIM[self.colour] * self.sim.peak_e
+        """Electrons of the brightest pixel in one exposure of a picture in this colour, before stray light.
+
+        By a budget an estimate from the mean of the lit disc; the frame itself has the mean of the budget.
+        """
+        budget, peak_e = self.budget, self.sim.peak_e
+        if budget is not None:
+            return budget.mean_e / DISC_SHARE
+        assert peak_e != "budget"
+        return TRIM[self.colour] * peak_e
 
     @property
     def lit_e(self) -> float:

@@ -14,7 +14,8 @@ from scipy import fft
 from scipy.special import j1
 
 from device.config.head_file import OpticsSpec
-from device.optics.diffuser import Beam, Refraction, caustic
+from device.config.scene import DiffuserSpec
+from device.optics.diffuser import RANDOM_SURFACE, Beam, Refraction, caustic
 from device.sim.optical_setup import OpticalSetup, Place
 from device.values import Image
 
@@ -34,14 +35,14 @@ class Zone(NamedTuple):
 def electrons_per_s(setup: OpticalSetup) -> Image:
     """Return the expected electrons per second at full drive, float32 (rows, cols) of the sensor.
 
-    Before veils and pixel response the peak reaches the scene's `peak_e` in one exposure. With veils or ambient light,
+    Before veils and pixel response the peak reaches the scene's `peak_e` in one exposure; by a budget the mean of the
+    lit disc is the budget's, sensor or not. With veils or ambient light,
     sets `lit_e_per_s` of `setup.added_light`, the mean of the lit pixels to which they refer. Ambient light itself is
     not included.
     """
     scene = setup.scene
     electrons = _image_on_sensor(setup)
-    peak = float(electrons.max())
-    electrons *= np.float32(scene.peak_e / scene.spec.camera.exposure_s / max(peak, 1e-30))
+    electrons *= np.float32(_gain_e(setup, electrons) / scene.spec.camera.exposure_s)
     added = setup.added_light
     if added.veils or added.ambient:
         lit = electrons > LIT_THRESHOLD * float(electrons.max())
@@ -50,6 +51,14 @@ def electrons_per_s(setup: OpticalSetup) -> Image:
         with setup.timed(name):
             electrons += veil * np.float32(added.lit_e_per_s)
     return electrons if setup.response is None else electrons * setup.response
+
+
+def _gain_e(setup: OpticalSetup, image: Image) -> float:
+    """Return the electrons of one exposure per unit of `image`, by the scene's peak or by its budget."""
+    scene, budget = setup.scene, setup.scene.budget
+    if budget is None:
+        return scene.peak_e / max(float(image.max()), 1e-30)
+    return budget.mean_e * budget.disc_px / max(float(setup.object.sum(dtype=np.float64)), 1e-30)
 
 
 def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
@@ -70,15 +79,18 @@ def psf(setup: OpticalSetup, place: Place = (0.0, 0.0)) -> Image:
     scene = setup.scene
     pitch_um = scene.spec.camera.pitch_um
     with setup.timed(*(["bandwidth"] if setup.lines > 1 else [])):
-        return cached_caustic(setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam)
+        return cached_caustic(
+            setup.optics, pitch_um, scene.seed, Refraction(m, j0, j45), setup.lines, beam, scene.sim.diffuser
+        )
 
 
 @lru_cache(maxsize=4)
 def cached_caustic(
-    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None
-) -> Image:
+    optics: OpticsSpec, pitch_um: float, seed: int, refraction: Refraction, lines: int, beam: Beam | None,
+    element: DiffuserSpec = RANDOM_SURFACE,
+) -> Image:  # fmt: skip
     """Return the PSF of `caustic` as a read-only array, from a cache of the last four sets of arguments."""
-    point = caustic(optics, pitch_um, seed, refraction, lines, beam)
+    point = caustic(optics, pitch_um, seed, refraction, lines, beam, element)
     point.flags.writeable = False
     return point
 

@@ -91,7 +91,8 @@ def _pedestal(image: Image, world: World) -> np.float32:
     0 if the caustic reaches every pixel.
     """
     optics = world.scene.optics
-    reach_um = optics.iris_um / 2 + optics.diffuser_to_sensor_um * steepest_rad(optics)
+    steepest = steepest_rad(optics, element=world.scene.sim.diffuser)
+    reach_um = optics.iris_um / 2 + optics.diffuser_to_sensor_um * steepest
     rows, cols = (np.arange(size, dtype=np.float32) - size // 2 for size in image.shape)
     outside = np.hypot(rows[:, None], cols[None, :]) * np.float32(world.geometry.pitch_um) > reach_um
     return np.float32(image[outside].mean(dtype=np.float64)) if outside.any() else np.float32(0)

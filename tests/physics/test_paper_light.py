@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from device.config.head_file import load_head
-from services.lab.paper.bench import SCENES, Bench
-from services.lab.paper.light import HEAD, SCENE, human_light, shipped_heads
+from services.lab.paper.bench import Bench
+from services.lab.paper.light import WEAK, human_light, shipped_heads
 from services.lab.paper.report import EXPERIMENTS
 from services.lab.paper.rules import SCENES as RULED
 from services.lab.paper.rules import compare_rules
@@ -31,23 +30,21 @@ def test_readme_has_the_light_of_a_human_eye_with_each_shipped_head(name: str) -
     assert light.exposure_s == 0.1, "README says so"
     printed = (round(light.mean_e), round(light.peak_e, -1))
     assert figures("hardware/README.md", rf"\| `{name}\.toml` \| (\d+) \| (\d+) \|") == printed
-    if name == HEAD:
+    if name == WEAK:
         first_page = r"`imx296\.toml` collects a mean of (\d+) electrons a pixel and (\d+) in the brightest"
         assert figures("README.md", first_page) == printed
-
-
-def test_the_scene_of_a_human_eye_has_the_light_of_its_head() -> None:
-    scene, head = load_head(SCENES / f"{SCENE}.toml"), load_head(SCENES.parents[2] / "hardware/heads" / f"{HEAD}.toml")
-    assert scene.sim is not None
-    assert scene.sim.peak_e == pytest.approx(human_light(HEAD).peak_e, rel=0.1)
-    for key in ("rows", "cols", "pitch_um", "bit_depth", "full_well_e", "read_noise_e", "exposure_s"):
-        assert getattr(scene.camera, key) == getattr(head.camera, key), key
 
 
 def test_every_assertion_about_the_light_holds() -> None:
     outcome = EXPERIMENTS["L"].run(Bench(merged=2))
     assert [claim.what for claim in outcome.claims if not claim.holds] == []
-    assert [shown.file for shown in outcome.shown if shown.file] == ["human-eye.png"]
+    assert [shown.file for shown in outcome.shown if shown.file] == ["human-eye.png", "heads-eye.png"]
+
+
+def test_every_assertion_about_lenslets_holds() -> None:
+    outcome = EXPERIMENTS["D"].run(Bench(merged=2))
+    assert [claim.what for claim in outcome.claims if not claim.holds] == []
+    assert [row[0] for row in outcome.sheets[0].rows] == ["diffuser", "square array", "aperiodic lenslets"]
 
 
 def test_readme_has_the_gain_of_gradient_under_both_rules_for_mu() -> None:

@@ -84,7 +84,8 @@ class ShotNoise:
     def size(self, scene: Scene) -> Size:
         """Return the size eta = 1, because eta is measured in units of the noise, mostly shot noise."""
         share = 1 - (scene.spec.camera.read_noise_e / scene.noise_e) ** 2
-        return Size(1.0, f"{share:.2%} of the variance, {scene.peak_e:.0f} electrons at the peak")
+        origin = "" if scene.budget is None else f"; {scene.budget.why}"
+        return Size(1.0, f"{share:.2%} of the variance, {scene.peak_e:.0f} electrons at the peak{origin}")
 
     def apply(self, setup: OpticalSetup) -> None:
         """Switch the sensor model's shot noise on."""

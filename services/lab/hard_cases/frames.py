@@ -13,6 +13,7 @@ from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
+from device.sim.optical_setup import Scene
 from device.sim.render import crop_or_pad
 from device.sim.scene_files import SimulatedExposure
 from device.sim.simulated_calibration import simulated_calibration
@@ -81,9 +82,8 @@ class Eye:
     @property
     def peak_e(self) -> float:
         """Return the electrons in the brightest pixel of the clean frame."""
-        sim = self.spec.sim
-        assert sim is not None
-        return sim.peak_e
+        spec = self.spec
+        return Scene(spec, spec.light.colour).peak_e
 
     def frame(self, changes: HeadChanges | None = None, shade: Shade | None = None) -> HardFrame:
         """Expose a frame with `changes` to keys of the head or scene; `shade` is the transmission over the field.

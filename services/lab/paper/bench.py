@@ -236,14 +236,15 @@ def with_changes(spec: InstrumentSpec, changes: HeadChanges) -> InstrumentSpec:
 
 
 def with_merged_pixels(spec: InstrumentSpec, n: int) -> InstrumentSpec:
-    """Return the head with n x n pixels combined: light and full well times n^2, read noise times n."""
+    """Return the head with n x n pixels combined: light and full well times n^2, read noise times n.
+
+    The light of a budget follows the pixels by itself.
+    """
     camera = spec.camera
     assert spec.sim is not None
-    return with_changes(
-        spec,
-        {
-            "camera.rows": camera.rows // n, "camera.cols": camera.cols // n, "camera.pitch_um": camera.pitch_um * n,
-            "camera.full_well_e": camera.full_well_e * n**2, "camera.read_noise_e": camera.read_noise_e * n,
-            "sim.peak_e": spec.sim.peak_e * n**2,
-        },
-    )  # fmt: skip
+    merged: HeadChanges = {
+        "camera.rows": camera.rows // n, "camera.cols": camera.cols // n, "camera.pitch_um": camera.pitch_um * n,
+        "camera.full_well_e": camera.full_well_e * n**2, "camera.read_noise_e": camera.read_noise_e * n,
+        "sim.peak_e": spec.sim.peak_e if spec.sim.peak_e == "budget" else spec.sim.peak_e * n**2,
+    }  # fmt: skip
+    return with_changes(spec, merged)

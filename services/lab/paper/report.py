@@ -16,6 +16,7 @@ from services.lab.paper import (  # fmt: skip
     first_order,
     hard,
     hard_grid,
+    lenslets,
     light,
     printed,
     rules,
@@ -30,11 +31,12 @@ from services.lab.paper.style import CLAIMED, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
 ORDER = (
-    "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M", "L",
+    "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M",
+    "L", "D",
 )  # fmt: skip
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
 CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
-_ALL = (first_order, traced, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light)
+_ALL = (first_order, traced, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light, lenslets)
 EXPERIMENTS: dict[str, Experiment] = {
     key: experiment for key in ORDER for part in _ALL for experiment in part.EXPERIMENTS if experiment.key == key
 }
