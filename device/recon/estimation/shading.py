@@ -41,7 +41,7 @@ class Shading:
             row[:] = mode[top:bottom, left:right].ravel()
             on_blocks.append(self._torus_of_blocks(mode))
             seen.append(blocks(model.blur(mode)[model.grid.slices], self._block).ravel())
-        self._spectra: NDArray[np.complex64] = scipy_fft.rfft2(np.stack(on_blocks))
+        self._spectra = np.asarray(scipy_fft.rfft2(np.stack(on_blocks)), np.complex64)
         self._ridge = np.full(count + known, RIDGE)
         self._ridge[count:] = STRAY_RIDGE
         self._beyond_blocks = np.stack(seen) - self._blurred_on_blocks()
