@@ -307,8 +307,8 @@ def run_exam(
     finally:
         with suppress(LightFault):  # then the guardian process and the restart of this process turn the lamp off
             parts.head.light.off()
-        parts.capture_journal.close()
         _fail_waiting(parts, loop)
+        parts.capture_journal.close()
         if parts.requests.snapshot.is_closing:
             parts.events.ended(None, failure)
         else:

@@ -161,8 +161,7 @@ class CaptureJournal:
     def close(self) -> None:
         """Wait until the frames of captures that are still in progress are on the disk, for the next opening."""
         for writer in self._writers.values():
-            writer.finish()
-            writer.close()
+            writer.close(complete=True)
 
     def _resumable(self, press: InterruptedCapture) -> ResumableCapture | None:
         """Return an interrupted capture with its frames.

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from device import atomic_io
-from device.errors import FrameError
+from device.errors import DiffuscopeError, FrameError
 from device.values import Frame
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
@@ -91,9 +91,9 @@ class FrameWriter:
         files = {number: future.result() for number, future in self._written.items()}
         return {number: file for number, file in files.items() if file is not None}
 
-    def close(self) -> None:
-        """Cancel what is not begun and wait for the end of the frame that is being written."""
-        self._executor.shutdown(cancel_futures=True)
+    def close(self, *, complete: bool = False) -> None:
+        """Wait until every frame is written, with `complete`; else only for the one that is being written."""
+        self._executor.shutdown(cancel_futures=not complete)
 
     def _write(self, taken: TakenFrame) -> WrittenFile | None:
         """Write a frame and then its note, durably; None after an error of the disk, which is logged once."""
@@ -108,7 +108,7 @@ class FrameWriter:
             write_new_blob(path, content)
             write_new_blob(note, digested_json.encoded(_note_of(file, taken)))
             atomic_io.fsync_folder(self._folder)
-        except OSError as error:
+        except (OSError, DiffuscopeError) as error:
             self._has_failed = True
             log.warning("the frames stay in memory until the capture is stored: %s", error)
             with suppress(OSError):  # without its note the frame does not count

@@ -313,7 +313,7 @@ def written_again(folder: Path, place: Path) -> dict[str, bool]:
         before = digested_json.decoded(note.read_bytes())
         note.unlink()
         CaptureJournal(store).begin(lost, "0" * 16)
-        journal = digested_json.decoded(note.read_bytes()) == before
+        journal = before.items() <= digested_json.decoded(note.read_bytes()).items()  # this release adds entries
     return {
         "calibration": contents(again.files(id)) == contents(archive.files(id)),
         "signed file": (place / "sent").read_bytes() == (folder / "sent.calibration").read_bytes(),
