@@ -9,10 +9,11 @@ from pathlib import Path
 
 from device.config import shipped_heads
 
+ROOT = shipped_heads.ROOT
 HEADS = shipped_heads.HEADS
 LIGHT_PATH = shipped_heads.LIGHT_PATH
-WEB = shipped_heads.ROOT / "web"
-CHANGELOG = shipped_heads.ROOT / "CHANGELOG.md"
+WEB = ROOT / "web"
+CHANGELOG = ROOT / "CHANGELOG.md"
 SCENES = Path(__file__).parents[1] / "device" / "sim" / "scenes"
 
 
