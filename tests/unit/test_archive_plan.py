@@ -44,14 +44,14 @@ def test_a_plan_lists_each_frame_with_its_digests_and_survives_a_file(scene: Sce
 
 
 def test_a_name_depends_on_capture_calibration_versions_and_settings() -> None:
-    first = result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
-    assert first == result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
+    first = result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 1})
+    assert first == result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 1})
     others = {
-        result_name(("b", ""), "c", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", "d"), "c", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", ""), "e", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", ""), "c", {"code": "2"}, {"rounds": 1}),
-        result_name(("a", ""), "c", {"code": "1"}, {"rounds": 2}),
+        result_name([("raw", "b", "")], "c", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", ""), ("dark", "d", "")], "c", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "e", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "c", {"code": "2"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 2}),
     }
     assert len(others | {first}) == 6
 
