@@ -17,7 +17,7 @@ from device.calibration.archive import Provenance
 from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.sim.render import crop_or_pad
-from device.values import Calibration, Colour, Psf
+from device.values import Calibration, Colour, Eye, Psf
 from services.imaging.picture_files import read_png
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
@@ -41,9 +41,9 @@ def taken(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Capture]
     with ExitStack() as undo:
         rig = rig_builder((world, calibration), root / "plans")(root, undo, tinted=TINTS, wait=False)
         assert rig.exam.ready.wait(READY_S)
-        single = CaptureTarget(frames=1, colours=())
-        presses = [rig.exam.press("OD"), rig.exam.press("OS"), rig.exam.press("OD", None, single)]
-        captures = [press.result(PRESS_S) for press in presses]
+        burst, single = CaptureTarget(), CaptureTarget(frames=1, colours=())
+        targets: list[tuple[Eye, CaptureTarget]] = [("OD", burst), ("OS", burst), ("OD", single)]
+        captures = [rig.exam.press(eye, None, target).result(PRESS_S) for eye, target in targets]
     keep_calibration(root / "store", replace(calibration, psfs=psfs), captures[0])
     return root / "store", captures
 

@@ -74,9 +74,7 @@ def report(
 @app.command()
 def adopt(
     folder: Annotated[Path, typer.Argument(help="Folder of `diffuscope archive run`.")],
-    data: Annotated[
-        Path, typer.Option("--data", "--store", help="Where captures are kept; stop the instrument first.")
-    ],
+    data: Annotated[Path, typer.Option(help="Where captures are kept; stop the instrument first.")],
 ) -> None:
     """Store the results as later versions of the captures; those as taken stay. Exit status 1 if some are refused."""
     from services.lab.archive.adopt import adopt_results  # deferred: imports SQLAlchemy, of the extra `instrument`
