@@ -100,11 +100,14 @@ def _row(session: Session, id: str) -> CaptureRow:
     """Return the row of a capture; RecordNotFound if unknown or no valid id."""
     row = session.get(CaptureRow, id) if NAME.fullmatch(id) else None
     if row is None:
-        raise RecordNotFound(
-            f"this store has no capture named {id!r}",
-            "Adopt it in the store that holds it. The pictures of an erased patient cannot be adopted.",
-        )
+        raise unknown_capture(id)
     return row
+
+
+def unknown_capture(id: str) -> RecordNotFound:
+    """Return the error of a later picture whose capture the store does not hold."""
+    remedy = "Give the store that holds it. The pictures of an erased patient cannot be adopted."
+    return RecordNotFound(f"this store has no capture named {id!r}", remedy)
 
 
 def _refuse_foreign(new: NewVersion, row: CaptureRow, device: str | None) -> None:

@@ -63,7 +63,7 @@ def archive(environment: dict[str, str]) -> Archive:
 
     def run(*words: object) -> subprocess.CompletedProcess[str]:
         command = [COMMAND, "archive", *map(str, words)]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
     return run
 

@@ -20,7 +20,7 @@ from services.lab.archive.solve import read_linear
 from services.records import schema
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
-from services.records.capture_versions import NewVersion
+from services.records.capture_versions import NewVersion, unknown_capture
 from services.records.device_identity import read_device
 from services.records.snapshots import refuse_in_use
 from services.records.storage_errors import storage_errors
@@ -99,10 +99,7 @@ def _is_adopted(planned: PlannedCapture, store: CaptureStore) -> bool:
                 f"{planned.id} was taken by the device {planned.origin}, and this store is that of {own.uuid}",
                 "Adopt it in the store of that device.",
             ) from error
-        raise RecordNotFound(
-            f"this store has no capture named {planned.id!r}",
-            "Give the store that holds it. The pictures of an erased patient cannot be adopted.",
-        ) from error
+        raise unknown_capture(planned.id) from error
     return any(one.result == planned.result for one in versions)
 
 
