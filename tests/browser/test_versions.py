@@ -12,12 +12,12 @@ from services.records.capture_versions import NewVersion
 from tests.browser.looks import look_for_faults
 from tests.browser.real import Real
 from tests.browser.test_accessibility import strike
-from tests.browser.walk import Open, aiming, take_picture, visit_of, wait_until_drawn
+from tests.browser.walk import Open, wait_until_drawn
 
 pytestmark = pytest.mark.browser
 
 
-def adopt_version(real: Real, id: str) -> NewVersion:
+def adopt_version(real: Real, id: str) -> None:
     """Adopt an even grey picture of the same size as a version of a capture."""
     store = real.rig.store
     kept = store.get(id)
@@ -26,20 +26,18 @@ def adopt_version(real: Real, id: str) -> NewVersion:
     frames = {name: digest for name, digest in kept.files.items() if name.endswith(".tiff")}
     new = NewVersion(id, "a" * 32, frames, "", "variation", "1.2", grey, b"{}")
     store.versions.adopt(new, real.clock.wall())
-    return new
 
 
 def test_the_picture_as_taken_is_shown_until_a_version_is_chosen(open_page: Open, real: Real) -> None:
-    page = aiming(open_page, real)
-    take_picture(page)
+    visit = real.begin_visit(consent="agreed")["id"]
+    first, second = (real.press(visit)["id"] for _ in range(2))
+    adopt_version(real, first)
+    page = open_page(f"{real.url}/#/visit/{visit}/picture/R-centre/{second}")
+    wait_until_drawn(page, "colour 0 0")
     group = page.get_by_role("group", name="Which picture")
     expect(group).to_have_count(0)
-    visit = visit_of(page)
-    slot = real.visit(visit)["slots"]["R-centre"]
-    adopt_version(real, slot["capture"])
-    page.goto(f"{real.url}/#/visit/{visit}")
-    page.reload()
-    page.goto(f"{real.url}/#/visit/{visit}/picture/R-centre/{slot['capture']}")
+    page.goto(f"{real.url}/#/visit/{visit}/picture/R-centre/{first}")
+    expect(group).to_have_count(1)
     wait_until_drawn(page, "colour 0 0")
     taken, version = group.get_by_role("button", name="Picture as taken"), group.get_by_role("button", name="Version 1")
     expect(taken).to_have_attribute("aria-pressed", "true")
