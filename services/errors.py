@@ -22,6 +22,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── BackupKeyWrong                passphrase or key does not fit the backup
 │   ├── BackupDamaged                 backup incomplete or changed
 │   ├── RestoreRefused                the store holds records already
+│   ├── VersionRefused                later picture of other frames
 │   ├── UsbDriveFull                  no space on the USB drive
 │   ├── UsbDriveUnavailable           USB drive removed or not writable
 │   ├── RecordRemoved                 file removed to make room
@@ -179,6 +180,13 @@ class RestoreRefused(StoreError):
 
     code = "backup.used"
     default_remedy = "Restore on a new device, or into a new folder with --data."
+
+
+class VersionRefused(StoreError):
+    """A later picture was not made from the frames of this capture."""
+
+    code = "version.refused"
+    default_remedy = "Plan and run the archive again, with this store as its source."
 
 
 class UsbDriveFull(StoreError):

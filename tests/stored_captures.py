@@ -8,16 +8,19 @@ from numpy.typing import NDArray
 from device.clock import VirtualClock
 from services.imaging.picture_files import raw_tiff
 from services.imaging.raw_metadata import RawMetadata
-from services.records.capture import Capture, CaptureReport
+from services.records.capture import Capture, CaptureReport, RecordOrigin
 from services.records.capture_store import CaptureStore
 
 
-def write_store(folder: Path, raw: NDArray[np.uint16], calibration_id: str, names: tuple[str, ...]) -> None:
+def write_store(
+    folder: Path, raw: NDArray[np.uint16], calibration_id: str, names: tuple[str, ...],
+    device: RecordOrigin | None = None,
+) -> None:  # fmt: skip
     """Add captures to a store, each with a little more light than the one before, and with a dark frame."""
     with CaptureStore(folder, reserve_bytes=0) as store:
         for k, name in enumerate(names):
             taken_at = VirtualClock().wall()
-            capture = Capture(name, "OD", taken_at, True, calibration_id, CaptureReport(), {})
+            capture = Capture(name, "OD", taken_at, True, calibration_id, CaptureReport(device=device), {})
             metadata = RawMetadata(
                 id=name, eye="OD", taken_at=taken_at, exposure_s=0.1, illumination=None, simulated=True,
                 calibration_id=calibration_id, head="tiny",

@@ -27,6 +27,7 @@ from services.records.json_values import JsonObject
 
 REMEMBERED = 32  # idempotency keys: a request that the network repeats makes one capture
 QUICK_PX = 640
+FRAME_QUALITY = "frame quality"  # begins the reason of a frame that its own verdict keeps out of the picture
 
 
 @dataclass(frozen=True)

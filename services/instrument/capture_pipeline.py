@@ -41,7 +41,7 @@ from device.values import (
     Report,
 )
 from services.imaging import picture_files
-from services.instrument.capture import ExposedCapture, capture_files, capture_report
+from services.instrument.capture import FRAME_QUALITY, ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
 from services.records.blobs import FileContent
 from services.records.capture import NO_METHOD, Capture, RecordOrigin
@@ -224,7 +224,7 @@ class CapturePipeline:
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
         unusable = {
-            place: f"frame quality: {verdicts[k].code}"
+            place: f"{FRAME_QUALITY}: {verdicts[k].code}"
             for place, k in enumerate(order)
             if verdicts[k].code != verdicts[best].code
         }

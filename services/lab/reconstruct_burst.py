@@ -60,11 +60,11 @@ def load_burst(raws: Sequence[Source], options: ReconstructOptions) -> list[Load
 
 def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
     """Return the picture of the loaded raws of a burst; FrameError if none can be used, or for colour raws."""
-    unusable = _unusable(loaded)
+    unusable = unusable_raws(loaded)
     if len(unusable) == len(loaded):
         raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take the burst again.")
     usable = [one for k, one in enumerate(loaded) if k not in unusable]
-    common, clock = _common(usable), SystemClock()
+    common, clock = common_raw(usable), SystemClock()
     psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
     calibration = load_calibrations(options, common, psfs)[0]
     index = 0
@@ -72,7 +72,7 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
         index, _ = most_likely_psf(calibration, common.raw.pixels, planner)
     joiner = BurstJoiner(calibration, common.solved_shape, planner, clock, index)
     begin_s = clock.now_s()
-    joined = joiner([_without_bad(one.raw) for one in loaded], unusable)
+    joined = joiner([without_bad(one.raw) for one in loaded], unusable)
     join_s = clock.now_s() - begin_s
     solver = plan_reconstructor(options, joined.calibration, common.solved_shape, planner, index)
     deadline = None if options.budget_s is None else Deadline.after(clock, max(options.budget_s - join_s, 1e-6))
@@ -81,12 +81,12 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
     report = replace(
         file_report(made.report, solver, options),
         seconds={"join": join_s} | made.report.seconds, frames=joined.frames,
-        warnings=(*made.report.warnings, *_rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
+        warnings=(*made.report.warnings, *rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
     )  # fmt: skip
     return FileReconstruction(made.picture, report, made.simulated or calibration.simulated)
 
 
-def _unusable(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
+def unusable_raws(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
     """Return the reason of each raw that holds no usable signal, by its place in the burst."""
     reasons = {}
     for k, one in enumerate(loaded):
@@ -97,7 +97,7 @@ def _unusable(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
     return reasons
 
 
-def _common(usable: Sequence[LoadedRaw]) -> LoadedRaw:
+def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
     """Return the first usable raw with the levels of all; the bits of a file follow from its brightest pixel.
 
     FrameError for raws of different shapes, colour patterns or levels, SettingError for colour raws.
@@ -127,14 +127,14 @@ def _storage(raw: LoadedRaw) -> tuple[object, ...]:
     return raw.raw.shift, raw.raw.pixels.dtype, raw.black_dn
 
 
-def _without_bad(raw: Raw) -> Pixels:
+def without_bad(raw: Raw) -> Pixels:
     """Return the counts, with NaN for bad pixels if there are any."""
     if not raw.bad.any():
         return raw.pixels
     return np.where(raw.bad, np.float32(np.nan), raw.pixels.astype(np.float32))
 
 
-def _rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
+def rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
     """Return a note for each raw that is not used."""
     return tuple(
         f"{one.name} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used

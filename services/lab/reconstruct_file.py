@@ -25,7 +25,7 @@ from device.recon.installed_methods import find_method
 from device.recon.method_settings import Settings, check_settings
 from device.recon.methods import METHODS, Method
 from device.recon.model.fft_plans import Planner
-from device.recon.model.field_of_view import field_radius_px
+from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Recipe, Reconstructor, default_schedule, plane
@@ -160,6 +160,13 @@ class FileReconstructor:
             calibration = replace(calibration, geometry=geometry)
         return flat_field_correct(picture, field_mask(calibration, shape), evenness_px(calibration, shape))
 
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the lit field in the last picture; all of them for a mosaic, or before any picture."""
+        if self._last is None or self._last.is_mosaic:
+            return slice(None), slice(None)
+        return field_box(self._last.calibrations[0], self._last.shape)
+
     def _psfs_for(self, loaded: LoadedRaw) -> LoadedPsfs | None:
         """Return the PSFs for a raw, read at the first raw of its shape; None for an archived calibration."""
         key = (loaded.shape, loaded.channels, loaded.bayer)
@@ -192,7 +199,7 @@ class _Plan:
         is_mosaic: bool,
     ) -> None:  # fmt: skip
         self.calibrations, self.is_mosaic = calibrations, is_mosaic
-        self._options, self._shape, self._planner, self._clock = options, shape, planner, SystemClock()
+        self._options, self.shape, self._planner, self._clock = options, shape, planner, SystemClock()
         self._solvers: dict[int, tuple[Reconstructor, ...]] = {}
         if options.sweep is not None and len(calibrations[0].psfs) < 2:
             raise SettingError("a sweep compares several PSFs", "Give --psf more than once, or leave --sweep out.")
@@ -227,9 +234,9 @@ class _Plan:
         options = self._options
         periodic = options.method is not None and find_method(options.method).periodic
         if len(self.calibrations) > 1 and options.bin is None and not periodic:
-            finest = min(default_schedule(one, self._shape, index)[1].bin for one in self.calibrations)
+            finest = min(default_schedule(one, self.shape, index)[1].bin for one in self.calibrations)
             options = replace(options, bin=finest)
-        return tuple(plan_reconstructor(options, one, self._shape, self._planner, index) for one in self.calibrations)
+        return tuple(plan_reconstructor(options, one, self.shape, self._planner, index) for one in self.calibrations)
 
     def _most_likely_psf(self, loaded: LoadedRaw) -> int:
         """Return the index of the most likely PSF of a stack, by the brightest channel; draw the sweep plot."""
@@ -293,14 +300,21 @@ def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[s
 
 
 def plan_reconstructor(
-    options: ReconstructOptions, calibration: Calibration, shape: Shape, planner: Planner, index: int
-) -> Reconstructor:
-    """Return the reconstructor of the options, planned for a calibration and a frame shape; `index` is the PSF's."""
-    consistency = PsfConsistency(calibration, shape, index)
+    options: ReconstructOptions, calibration: Calibration, shape: Shape, planner: Planner, index: int, *,
+    quick: bool = False, main: bool = True,
+) -> Reconstructor:  # fmt: skip
+    """Return the reconstructor of the options, planned for a calibration and a frame shape; `index` is the PSF's.
+
+    `quick`: with a quick look before the picture, as with a time budget. `main`: its report is shown, so it estimates
+    the refraction and tests the PSF.
+    """
+    consistency = PsfConsistency(calibration, shape, index) if main else None
     method = None if options.method is None else find_method(options.method)
     recipes = _recipes(options, method, calibration, shape, index)
+    if quick and len(recipes) == 1:
+        recipes = (default_schedule(calibration, shape, index)[0], *recipes)
     return Reconstructor(
-        calibration, shape, planner, SystemClock(), recipes, index, consistency=consistency,
+        calibration, shape, planner, SystemClock(), recipes, index, refract=main, consistency=consistency,
         timed=options.budget_s is not None, methods=METHODS if method is None else {**METHODS, method.name: method},
         audience=Audience.FILES, field_fixed=options.field_fixed,
     )  # fmt: skip

@@ -29,7 +29,7 @@ from device.config.image_files import (
 from device.errors import FrameError, PsfError, SettingError, SpecError
 from device.recon.method_settings import Settings
 from device.recon.model.preprocessing import MOST_BAD
-from device.values import Calibration, Geometry, Image, Psf, Sensor, SimulatedCounts
+from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 Shape = tuple[int, int]
@@ -43,7 +43,8 @@ class ReconstructOptions:
     Images are paths or arrays. `output` None writes nothing. `even`: flat-field correction of the picture.
     `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and `settings` (of the method, see
     device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`: the raw is a mosaic.
-    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge.
+    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge. `light`: colour of the
+    raw, for which the PSFs of an archived calibration are chosen (None: all are used).
     """
 
     raw: Source
@@ -65,6 +66,7 @@ class ReconstructOptions:
     settings: Settings = field(default_factory=dict)
     bayer: Bayer | None = None
     field_fixed: bool = False
+    light: Colour | None = None
 
 
 @dataclass(frozen=True)
@@ -360,6 +362,8 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     archive = Archive(Path(folder if colon else place))
     kept = archive.load(id if colon else None)
     found, raw = kept.calibration, loaded.raw
+    if options.light is not None:
+        found = found.for_colour(options.light)
     require_same_shape(found.psfs, loaded.solved_shape)
     known = "white_dn" not in kept.provenance.unknown
     white_dn = min(found.sensor.white_dn, raw.white_dn) if known else raw.white_dn

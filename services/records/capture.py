@@ -10,6 +10,7 @@ from services.records.json_values import JsonObject
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
 COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
+OtherColour = Literal["red", "blue"]  # of light, besides the green one of the picture
 BUDGET_S = 5.0  # standard time budget, also of captures of earlier releases, whose report has none
 
 
@@ -94,14 +95,47 @@ class RecordOrigin:
 
 
 @dataclass(frozen=True)
+class CaptureVersion:
+    """A later picture of a capture, made from its raw frames by `diffuscope archive run` and adopted by the store.
+
+    `number` is 1 for the first one; its files are `picture-<number>.png`, `report-<number>.json` and, in colour,
+    `colour-<number>.png`. `result`: name of the result, a digest of frames, calibration, software and settings. `at`:
+    time of the adoption (ISO 8601); `method`: of the reconstruction; `software`: version of the program. `others`: as
+    in PictureVerdict.
+    """
+
+    number: int
+    result: str
+    at: str | None = None
+    method: str | None = None
+    software: str | None = None
+    others: JsonObject = field(default_factory=dict)
+
+    @property
+    def picture(self) -> str:
+        """Name of the file of the picture."""
+        return f"picture-{self.number}.png"
+
+    @property
+    def colour(self) -> str:
+        """Name of the file of the picture in colour, which not every version has."""
+        return f"colour-{self.number}.png"
+
+    @property
+    def report(self) -> str:
+        """Name of the file of the report."""
+        return f"report-{self.number}.json"
+
+
+@dataclass(frozen=True)
 class CaptureReport:
     """Report of a capture: its reconstruction, light, visit and slot, verdict, laterality and time budget.
 
     `reconstruction.seconds`: durations by stage, with the exposure. `visit` and `slot`: ids, None for a test picture.
     `moved`: corrections of the eye, oldest first; `confirmed`: None unless the recorded eye was confirmed. `device`:
-    origin, None in captures of earlier releases. `others`: entries of the stored JSON that this release does not read
-    or that have another type; they are written again unchanged. A field that is missing in the report of an earlier
-    release has its default.
+    origin, None in captures of earlier releases. `versions`: later pictures, oldest first. `others`: entries of the
+    stored JSON that this release does not read or that have another type; they are written again unchanged. A field
+    that is missing in the report of an earlier release has its default.
     """
 
     reconstruction: Report = field(default_factory=lambda: Report(NO_METHOD, frames=()))
@@ -114,6 +148,7 @@ class CaptureReport:
     moved: tuple[EyeCorrection, ...] = ()
     confirmed: EyeConfirmation | None = None
     device: RecordOrigin | None = None
+    versions: tuple[CaptureVersion, ...] = ()
     others: JsonObject = field(default_factory=dict)
 
     @property
@@ -133,6 +168,11 @@ class CaptureReport:
     def with_confirmation(self, confirmation: EyeConfirmation) -> Self:
         """Return a copy of the report with this confirmation of the recorded eye."""
         return replace(self, confirmed=confirmation, others=_without(self.others, "confirmed"))
+
+    def with_version(self, version: CaptureVersion) -> Self:
+        """Return a copy of the report with one more version of the picture."""
+        versions = (*self.versions, version)
+        return replace(self, versions=versions, others=_without(self.others, "versions"))
 
 
 def _without(entries: JsonObject, *names: str) -> JsonObject:

@@ -14,6 +14,7 @@ from services.records.capture import (
     BUDGET_S,
     NO_METHOD,
     CaptureReport,
+    CaptureVersion,
     EyeConfirmation,
     EyeCorrection,
     LateralityEstimate,
@@ -67,6 +68,8 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
         entries["confirmed"] = _confirmation_as_json(report.confirmed)
     if report.device is not None:
         entries["device"] = origin_as_json(report.device)
+    if report.versions:
+        entries["versions"] = [_version_as_json(one) for one in report.versions]
     return entries
 
 
@@ -74,6 +77,13 @@ def origin_as_json(origin: RecordOrigin) -> dict[str, JsonValue]:
     """Return the origin of a record as a JSON object: the block `device` of reports, exports and uploads."""
     known: dict[str, JsonValue] = {name: getattr(origin, name) for name in ORIGIN}
     return known | dict(origin.others)
+
+
+def _version_as_json(one: CaptureVersion) -> dict[str, JsonValue]:
+    known: dict[str, JsonValue] = {
+        "number": one.number, "result": one.result, "at": one.at, "method": one.method, "software": one.software,
+    }  # fmt: skip
+    return known | dict(one.others)
 
 
 def _frame_as_json(one: FrameUse) -> JsonValue:
@@ -132,6 +142,7 @@ def read_report(content: object) -> CaptureReport:
         moved=() if moved is None else _moves(moved),
         confirmed=_confirmation(confirmed) if isinstance(confirmed, Mapping) else None,
         device=_origin(device) if isinstance(device, Mapping) else None,
+        versions=_lenient(entries, "versions", _versions, ()),
     )
     return replace(report, others=_unwritten(entries, _known_entries(report)))
 
@@ -234,6 +245,19 @@ def _origin(entries: JsonObject) -> RecordOrigin:
     uuid, serial, software, head, id, calibrated_at, clock = (_lenient(entries, name, text, None) for name in ORIGIN)
     origin = RecordOrigin(uuid, serial, software, head, id, calibrated_at, clock)
     return replace(origin, others=_unwritten(entries, origin_as_json(origin)))
+
+
+def _versions(content: object) -> tuple[CaptureVersion, ...]:
+    if not isinstance(content, list):
+        raise ValueError("versions that are no list")
+    return tuple(_version(_object(one)) for one in content)
+
+
+def _version(entries: JsonObject) -> CaptureVersion:
+    number, result = _whole(entries.get("number")), text(entries.get("result"))
+    at, method, software = (_lenient(entries, name, text, None) for name in ("at", "method", "software"))
+    version = CaptureVersion(number, result, at, method, software)
+    return replace(version, others=_unwritten(entries, _version_as_json(version)))
 
 
 def _unwritten(entries: JsonObject, written: JsonObject) -> JsonObject:

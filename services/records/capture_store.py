@@ -42,6 +42,7 @@ from services.records import blobs, capture_rows, row_validation, schema
 from services.records.blobs import FileContent
 from services.records.capture import Capture
 from services.records.capture_target import RowWriter
+from services.records.capture_versions import CaptureVersions
 from services.records.quarantine import Quarantine
 from services.records.record_document import RecordDocument
 from services.records.record_files import CAPTURE_RECORD, RecordFiles
@@ -67,10 +68,10 @@ class CaptureStore:
 
     `newly_quarantined` holds the names in `torn/` of the folders moved there at this opening, `recovery` what was
     restored from the files of the records. With `refusal` the folder is a copy in memory (read_only_store.py): nothing
-    is recovered or quarantined, and every change raises this error. `quarantine`, `space` and `write_ahead_log` are the
-    parts of the store for those matters. Several threads may read while one writes; a lock file serialises writers
-    across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at opening: StoreError,
-    StoreFull, StoreDamaged.
+    is recovered or quarantined, and every change raises this error. `quarantine`, `versions`, `space` and
+    `write_ahead_log` are the parts of the store for those matters. Several threads may read while one writes; a lock
+    file serialises writers across threads and processes. Opening and closing checkpoint the write-ahead log. Errors at
+    opening: StoreError, StoreFull, StoreDamaged.
     """
 
     newly_quarantined: tuple[str, ...]
@@ -97,6 +98,7 @@ class CaptureStore:
             self.write_ahead_log = WriteAheadLog(database, self.engine)
             self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
             self.removed = RemovedCaptures(self._captures, folder / "removed", self._lock)
+            self.versions = CaptureVersions(self._captures, self._lock, self.engine)
             self.space = StoreSpace(folder, self.engine, (self.removed, self.quarantine), reserve_bytes, free_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)

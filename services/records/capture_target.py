@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 from sqlalchemy.orm import Session
 
-from services.records.capture import Capture
+from services.records.capture import Capture, OtherColour
 
-OtherColour = Literal["red", "blue"]
 OTHER_COLOURS: tuple[OtherColour, ...] = get_args(OtherColour)
 RowWriter = Callable[[Session, Capture], None]
 Permit = Callable[[], None]

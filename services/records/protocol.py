@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 from device.config.toml_file import Table, load_toml
 from device.values import EYES, Eye
 from services.errors import RecordNotFound
-from services.records.capture_target import COLOURS, FRAMES, OtherColour
+from services.records.capture import OtherColour
+from services.records.capture_target import COLOURS, FRAMES
 
 DEFAULT_PROTOCOL = Path(__file__).parent / "protocol.toml"
 CHOOSE_REMEDY = "Choose one of the pictures on the page."

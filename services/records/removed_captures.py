@@ -23,7 +23,9 @@ from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
 
-LARGE_FILE = re.compile(r"(raw(-([0-9]+|[a-z]+))?|dark)[.]tiff|(picture|colour)[.]png")  # nearly all bytes of a capture
+LARGE_FILE = re.compile(
+    r"(raw(-([0-9]+|[a-z]+))?|dark)[.]tiff|(picture|colour)(-[0-9]+)?[.]png"
+)  # nearly all bytes of a capture
 MARK = "removed.json"
 Reason = Literal["exported", "sent"]
 

@@ -63,7 +63,7 @@ def archive(environment: dict[str, str]) -> Archive:
 
     def run(*words: object) -> subprocess.CompletedProcess[str]:
         command = [COMMAND, "archive", *map(str, words)]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
     return run
 
@@ -78,5 +78,5 @@ def plan(recording: Path, archive: Archive, tmp_path: Path) -> Path:
 
 def result_digests(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of every picture and report below a folder of results, by path; durations are not in them."""
-    names = sorted([*folder.glob("results/*/*/picture.tiff"), *folder.glob("results/*/*/report.json")])
+    names = sorted(path for path in folder.glob("results/*/*/*") if path.name != "run.json")
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in names}

@@ -38,7 +38,7 @@ def test_a_table_of_a_hundred_thousand_rows_is_reported_in_time(tmp_path: Path) 
     assert len(page) < 5e6
     assert "head-0" in page
     assert "no signal" in page
-    assert page.count("<h2>") == 9
+    assert page.count("<h2>") == 10
 
 
 def test_the_age_of_a_calibration_is_in_days_or_unknown() -> None:

@@ -58,6 +58,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2", "archive plan {0}/none -o {0}/plan.toml",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2 --budget-s 1", "archive plan",
     "archive run", "archive run {0}/plan.toml -o {0}/results --workers 0", "archive report",  # with or without Dask
+    "archive adopt", "archive adopt {0}/none --data {0}/none",
     "frontier --json {0}/f.json --plot {0}/f.svg", "frontier --json {0}/f.json --plot {0}/f.svg --repeats 0",
     "frontier --data {0}/scene --scene {0}/head.toml --json {0}/f.json --plot {0}/f.svg",
     "data {0}/scene", "data {0}/scene --check --psf {0}/none.tiff", "data {0}", "data {0}/none", "data",

@@ -5,6 +5,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from io import BytesIO
 from threading import Event
 from typing import Any
@@ -15,6 +16,7 @@ from PIL import Image
 
 from device.errors import DiffuscopeError
 from services.http.problem_responses import HTTP_STATUS, problem_response
+from services.records.capture_versions import NewVersion
 from tests.journey.asking import live_picture
 
 CHOSEN = {  # expected HTTP status of each error class
@@ -410,3 +412,27 @@ def test_event_stream_ends_when_the_event_bus_closes(rig: Any, read_events: Any)
     never = Event()
     events = read_events(rig.app, lambda _: never.is_set(), begin=rig.event_bus.close)
     assert [kind for _, kind, _ in events] == ["beat"]
+
+
+def test_versions_of_a_capture_are_listed_with_working_links(old_rig: Any) -> None:
+    kept = old_rig.exam.press("OD").result(30)
+    at, frames = f"/api/captures/{kept.id}", {name: one for name, one in kept.files.items() if name.endswith(".tiff")}
+    taken = old_rig.request("GET", at).json()
+    assert "versions" not in taken
+    new = NewVersion(kept.id, "a" * 32, frames, "", "variation", "1.2", b"new", b'{"method": "variation"}')
+    for one in (new, replace(new, result="b" * 32, colour=b"new in colour")):
+        old_rig.store.versions.adopt(one, old_rig.clock.wall())
+    capture = old_rig.request("GET", at).json()
+    assert capture["links"] == taken["links"]
+    first, second = capture["versions"]
+    assert first == {
+        "number": 1, "result": "a" * 32, "at": old_rig.clock.wall().isoformat(), "method": "variation",
+        "software": "1.2", "picture": f"{at}/picture-1.png", "report": f"{at}/report-1.json",
+    }  # fmt: skip
+    picture, colour, report = (
+        old_rig.request("GET", second[name]) for name in ("picture", "colour", "report")
+    )  # fmt: skip
+    assert (picture.content, picture.headers["content-type"]) == (b"new", "image/png")
+    assert (colour.content, report.json()) == (b"new in colour", {"method": "variation"})
+    assert old_rig.request("GET", taken["links"]["picture"]).content == old_rig.store.read(kept.id, "picture.png")
+    refused(old_rig.request("GET", f"{at}/picture-3.png"), 404, "store.unknown")

@@ -8,9 +8,12 @@ import tifffile
 from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.errors import SettingError
+from device.values import FrameUse, Report
 from services.lab.archive.content import NAME_DIGITS, different_versions, result_name, software
 from services.lab.archive.plan import Plan, PlanSettings, read_plan, write_plan
 from services.lab.archive.planning import make_plan
+from services.records.capture import Capture, CaptureReport, RecordOrigin
+from services.records.capture_store import CaptureStore
 from tests.datasets import Scene, simulate_tiny
 from tests.scenes import calibration, speckle
 from tests.stored_captures import write_store
@@ -44,14 +47,14 @@ def test_a_plan_lists_each_frame_with_its_digests_and_survives_a_file(scene: Sce
 
 
 def test_a_name_depends_on_capture_calibration_versions_and_settings() -> None:
-    first = result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
-    assert first == result_name(("a", ""), "c", {"code": "1"}, {"rounds": 1})
+    first = result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 1})
+    assert first == result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 1})
     others = {
-        result_name(("b", ""), "c", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", "d"), "c", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", ""), "e", {"code": "1"}, {"rounds": 1}),
-        result_name(("a", ""), "c", {"code": "2"}, {"rounds": 1}),
-        result_name(("a", ""), "c", {"code": "1"}, {"rounds": 2}),
+        result_name([("raw", "b", "")], "c", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", ""), ("dark", "d", "")], "c", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "e", {"code": "1"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "c", {"code": "2"}, {"rounds": 1}),
+        result_name([("raw", "a", "")], "c", {"code": "1"}, {"rounds": 2}),
     }
     assert len(others | {first}) == 6
 
@@ -147,3 +150,58 @@ def test_a_damaged_plan_is_refused(text: str, message: str, tmp_path: Path) -> N
     path.write_text(text)
     with pytest.raises(SettingError, match=message):
         read_plan(path)
+
+
+def test_frames_of_one_name_are_one_capture_in_every_kind_of_folder(scene: Scene, tmp_path: Path) -> None:
+    flat, pairs, scenes = recording(tmp_path / "flat", scene, 2), tmp_path / "pairs", tmp_path / "scenes"
+    recording(pairs / "raw", scene, 2).joinpath("psf.tiff").rename(pairs / "psf.tiff")
+    (scenes / "a").mkdir(parents=True)
+    for name in ("raw.tiff", "psf.tiff"):
+        (scenes / "a" / name).write_bytes((scene.folder / name).read_bytes())
+    for place, stem in ((flat, "eye0"), (pairs / "raw", "eye0"), (scenes / "a", "raw")):
+        for k, name in enumerate(("1", "2", "4", "red", "blue")):
+            tifffile.imwrite(place / f"{stem}-{name}.tiff", scene.raw + 10 + k)
+    for place in (flat, pairs, scenes / "a"):
+        tifffile.imwrite(place / "psf-red.tiff", scene.psf)
+    for source, first, ids in (
+        (flat, "eye0", ["eye0", "eye0-4", "eye1"]), (pairs, "eye0", ["eye0", "eye0-4", "eye1"]), (scenes, "a", ["a"])
+    ):  # fmt: skip
+        plan = plan_of(source)
+        assert [one.id for one in plan.captures] == ids
+        frames = plan.captures[ids.index(first)].frames
+        assert [Path(one.path).stem.rpartition("-")[2] for one in frames] == ["1", "2", "red", "blue"]
+        assert [one.colour for one in frames] == ["", "", "red", "blue"]
+        assert [one.role for one in plan.calibrations[0].files] == ["psf", "psf-red"]
+
+
+def test_a_stored_burst_is_planned_whole_with_what_the_instrument_left_out(scene: Scene, tmp_path: Path) -> None:
+    made = calibration(speckle(scene.raw.shape))
+    kept = Archive(tmp_path / "calibrations" / "tiny-head")
+    id = kept.add_and_activate(made, Provenance("D1", VirtualClock().wall(), "test", "0"))
+    uses = tuple(FrameUse(k, k != 1, None, 0.0, "frame quality: shot.moved" if k == 1 else None) for k in range(3))
+    report = CaptureReport(Report("variation", frames=uses), device=RecordOrigin(uuid="here"))
+    files = {f"{name}.tiff": name.encode() for name in ("raw", "raw-1", "raw-2", "raw-red", "dark")}
+    with CaptureStore(tmp_path, reserve_bytes=0) as store:
+        for name in ("a", "b"):
+            capture = Capture(name, "OD", VirtualClock().wall(), True, id, report, {})
+            store.save(capture, files | {"raw.tiff": name.encode(), "report.json": b"{}"})
+    (first, second) = plan_of(tmp_path).captures
+    assert [(Path(one.path).name, one.colour, one.unusable) for one in first.frames] == [
+        ("raw-1.tiff", "", "frame quality: shot.moved"), ("raw-2.tiff", "", ""), ("raw-red.tiff", "red", "")
+    ]  # fmt: skip
+    assert first.origin == "here"
+    assert first.result != second.result
+    (tmp_path / "captures" / "b" / "raw-2.tiff").unlink()
+    plan = plan_of(tmp_path)
+    assert (len(plan.captures), plan.left_out[0].reason) == (1, "its raw frame raw-2.tiff was removed")
+
+
+def test_the_name_of_a_result_depends_on_every_frame(scene: Scene, tmp_path: Path) -> None:
+    folder = recording(tmp_path / "a", scene, 1)
+    names = [plan_of(folder).captures[0].result]
+    for k, name in enumerate(("eye0-1", "eye0-red")):
+        tifffile.imwrite(folder / f"{name}.tiff", scene.raw + 20 + k)
+        names.append(plan_of(folder).captures[0].result)
+    tifffile.imwrite(folder / "eye0-1.tiff", scene.raw + 30)
+    names.append(plan_of(folder).captures[0].result)
+    assert len(set(names)) == 4

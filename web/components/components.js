@@ -7,7 +7,7 @@ import { icon, target } from "./icons.js";
 import { get, lostShots, slotPlan } from "../core/state.js";
 import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
-import { has, t } from "../i18n/translate.js";
+import { calendarDay, has, t } from "../i18n/translate.js";
 
 /** Return the translated eye and field of a slot: {eye, part}. */
 export const slotLabel = (state, slot) => {
@@ -146,6 +146,9 @@ export function choice({ label, field, value, options, choose, many = false }) {
     </div>
   `;
 }
+
+/** Name of a version of a picture: its number, and the day on which the store adopted it. */
+export const versionName = ({ number, at }) => t("version.n", { n: number, day: at ? calendarDay(at) : "" });
 
 /** Reasons of the programme why a picture could not be taken, as buttons. */
 export function reasons({ protocol, route }, actions) {

@@ -1,9 +1,9 @@
 // Picture area: live preview and taken picture in the same place, without layout shift, and the prompt line below.
 
 import { icon } from "./icons.js";
-import { finalPicture } from "../core/api.js";
+import { finalPicture, pictureLinks } from "../core/api.js";
 import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
-import { slotLabel, topAlert, alertBar } from "./components.js";
+import { slotLabel, topAlert, alertBar, versionName } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
@@ -38,11 +38,11 @@ export function pictureArea(state, actions) {
           aria-label=${pictureName(state, shot)}
           .head=${state.status}
           .subject=${shot?.key ?? null}
-          .redfree=${state.redfree && !shot?.capture?.links.colour}
+          .redfree=${state.redfree && !(shot?.capture && pictureLinks(shot.capture, state.version).colour)}
           .brightness=${state.brightness}
           .contrast=${state.contrast}
           .loupe=${state.loupe}
-          .src=${sourceOf(shot, state.redfree)}
+          .src=${sourceOf(shot, state)}
           @drawn=${actions.pictureDrawn}
           @fault=${actions.pictureFault}
           @zoomed=${actions.zoomed}
@@ -54,8 +54,8 @@ export function pictureArea(state, actions) {
   `;
 }
 
-function sourceOf(shot, redfree) {
-  if (shot?.capture) return finalPicture(shot.capture, redfree);
+function sourceOf(shot, { redfree, version }) {
+  if (shot?.capture) return finalPicture(shot.capture, redfree, version);
   return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
 }
 
@@ -98,7 +98,7 @@ function promptOf(state) {
 function markPrompt(state) {
   const shot = currentShot(state);
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
-  if (state.picture === "final") return ["done", "check", t("mark.final")];
+  if (state.picture === "final") return ["done", "check", t(state.version ? "version.note" : "mark.final")];
   if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
   return shot.stage.name === "expose" && !shot.verdict ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
 }
@@ -107,5 +107,7 @@ function pictureName(state, shot) {
   if (!shot || state.picture === "none") return t("pic.none");
   const time = shot.capture ? clockTime(shot.capture.taken_at) : "";
   const { eye, part } = slotLabel(state, shot.slot);
-  return t("pic.name", { mark: t(`mark.${state.picture}`), eye: eye || t(`eye.${eyeOf(state, shot.slot)}`), part, time });
+  const shown = shot.capture?.versions?.find(({ number }) => number === state.version);
+  const mark = shown ? versionName(shown) : t(`mark.${state.picture}`);
+  return t("pic.name", { mark, eye: eye || t(`eye.${eyeOf(state, shot.slot)}`), part, time });
 }

@@ -1,5 +1,6 @@
 // Details dialog of a picture: reconstruction data, files to download, and the change to the other eye.
 
+import { versionName } from "./components.js";
 import { icon } from "./icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
@@ -25,7 +26,7 @@ export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylind
   return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
 }
 
-export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links }, slot, eye }) {
+export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
   const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
   const used = frames.filter((one) => one.used).length;
@@ -57,6 +58,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
             ${t("result.othereye", { other: t(`eye.${eye === "OD" ? "OS" : "OD"}.word`) })}
           </button>`}
       ${["colour", "picture", "raw", "report"].filter((key) => links[key]).map((key) => html`<a class="button" href=${links[key]} download>${t(`detail.${key}`)}</a>`)}
+      ${versions.map((one) => html`<a class="button" href=${one.colour ?? one.picture} download>${versionName(one)} (PNG)</a>`)}
     </p>
     <button class="primary" type="button" @click=${close}>${t("menu.close")}</button>
   </dialog>`;

@@ -116,6 +116,7 @@ const pictureActions = {
   zoomed: ({ detail }) => set({ zoom: detail }),
   zoomIn: () => $("#picture").zoomIn(),
   zoomOut: () => $("#picture").zoomOut(),
+  setVersion: (version) => set({ version }),
   setRedfree: (redfree) => set({ redfree }),
   contrastBy: (step) => set({ contrast: clamp(get().contrast + step, -TOOL_STEPS, TOOL_STEPS) }),
   brightnessBy: (step) => set({ brightness: clamp(get().brightness + step, -TOOL_STEPS, TOOL_STEPS) }),

@@ -109,14 +109,19 @@ function parseAim(header) {
   }
 }
 
-/** Fetch a picture and decode it. */
-/**
- * Return the source for <eye-pic> of a capture: its picture in colour, or red-free the one in green light. A capture
- * without a picture in colour has only the latter, and the viewer's own red-free tool.
- */
-export const finalPicture = ({ links: { picture, colour } }, redfree) =>
-  colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
+/** Return the URLs of the pictures of a capture: of the version with this number, or as taken for 0. */
+export const pictureLinks = ({ links, versions = [] }, version) => versions.find(({ number }) => number === version) ?? links;
 
+/**
+ * Return the source for <eye-pic> of a capture or one of its versions: the picture in colour, or red-free the one in
+ * green light. Without a picture in colour there is only the latter, and the viewer's own red-free tool.
+ */
+export function finalPicture(capture, redfree, version = 0) {
+  const { picture, colour } = pictureLinks(capture, version);
+  return colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
+}
+
+/** Fetch a picture and decode it. */
 export async function getBitmap(url, signal) {
   const response = await fetch(url, { signal });
   if (!response.ok) throw new Error(`picture ${response.status}`);

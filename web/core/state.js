@@ -22,6 +22,7 @@ function loadSetting(key, otherwise) {
 export const PICTURE_DEFAULTS = Object.freeze({
   picture: "none",
   grey: false,
+  version: 0, // number of the version that is shown; 0: the picture as taken
   redfree: false,
   brightness: 0,
   contrast: 0,

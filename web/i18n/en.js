@@ -200,6 +200,10 @@ export const ENGLISH = {
   "detail.raw": "Raw frame",
   "detail.report": "Report",
 
+  "version.label": "Which picture",
+  "version.taken": "Picture as taken",
+  "version.n": "Version {n}, {day}",
+  "version.note": "Computed again from the same raw frames. The picture as taken stays in use.",
   "tool.plain": "As taken",
   "tool.colour": "Colour",
   "tool.redfree": "Red-free",

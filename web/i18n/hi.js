@@ -157,6 +157,10 @@ export const WORDS = {
   "result.details": "विवरण",
   "result.details.warn": "विवरण: चेतावनी के साथ",
 
+  "version.label": "कौन सी तस्वीर",
+  "version.taken": "तस्वीर जैसी ली गई",
+  "version.n": "संस्करण {n}, {day}",
+  "version.note": "उन्हीं कच्चे फ़्रेमों से फिर बनाई गई। जैसी ली गई तस्वीर ही मानी जाती है।",
   "tool.plain": "जैसी ली",
   "tool.colour": "रंगीन",
   "tool.redfree": "लाल रहित",

@@ -166,6 +166,10 @@ export const WORDS = {
   "result.details": "விவரங்கள்",
   "result.details.warn": "விவரங்கள்: எச்சரிக்கையுடன்",
 
+  "version.label": "எந்தப் படம்",
+  "version.taken": "எடுத்தபடியான படம்",
+  "version.n": "பதிப்பு {n}, {day}",
+  "version.note": "அதே மூலப் படங்களிலிருந்து மீண்டும் உருவாக்கப்பட்டது. எடுத்தபடியான படமே கணக்கில் உள்ளது.",
   "tool.plain": "எடுத்தபடி",
   "tool.colour": "வண்ணம்",
   "tool.redfree": "சிவப்பின்றி",

@@ -157,6 +157,10 @@ export const WORDS = {
   "result.details": "వివరాలు",
   "result.details.warn": "వివరాలు: హెచ్చరికతో",
 
+  "version.label": "ఏ చిత్రం",
+  "version.taken": "తీసినట్టు చిత్రం",
+  "version.n": "సంస్కరణ {n}, {day}",
+  "version.note": "అవే ముడి ఫ్రేముల నుండి మళ్లీ తయారు చేసింది. తీసిన చిత్రమే లెక్కలో ఉంటుంది.",
   "tool.plain": "తీసినట్టు",
   "tool.colour": "రంగులో",
   "tool.redfree": "ఎరుపు లేకుండా",

@@ -2,8 +2,9 @@
 // button. Three verdict texts: Good, Take again, Could not.
 
 import { icon } from "../components/icons.js";
+import { pictureLinks } from "../core/api.js";
 import { currentShot } from "../core/state.js";
-import { chips, alertButton, reasons, slotLabel, tiles } from "../components/components.js";
+import { chips, choice, alertButton, reasons, slotLabel, tiles, versionName } from "../components/components.js";
 import { ALERTS, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { nextSlot } from "../core/visit.js";
@@ -98,7 +99,7 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 
 // ---- tools
 
-function tools({ redfree, brightness, contrast, loupe, zoom }, actions, { capture }) {
+function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions, { capture }) {
   const step = (tool, label, by) => html`
     <div class="step" role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -113,17 +114,24 @@ function tools({ redfree, brightness, contrast, loupe, zoom }, actions, { captur
       <div class="pair">
         ${[false, true].map(
           (on) => html`<button type="button" aria-pressed=${on === redfree} @click=${() => actions.setRedfree(on)}>
-            ${t(on ? "tool.redfree" : capture?.links.colour ? "tool.colour" : "tool.plain")}
+            ${t(on ? "tool.redfree" : capture && pictureLinks(capture, version).colour ? "tool.colour" : "tool.plain")}
           </button>`,
         )}
       </div>
-      ${step("tool.brightness", signed("tool.brightness", brightness), actions.brightnessBy)}
+      ${versions(version, actions, capture)} ${step("tool.brightness", signed("tool.brightness", brightness), actions.brightnessBy)}
       <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => actions.setLoupe(!loupe)}>${t("tool.loupe")}</button>
       ${step("tool.contrast", signed("tool.contrast", contrast), actions.contrastBy)}
       ${step("tool.zoom", t("tool.zoom", { z: number(zoom) }), zoomBy)}
       <button class="reset" type="button" @click=${actions.reset}>${t("tool.reset")}</button>
     </div>
   `;
+}
+
+// The picture as taken and its later versions; nothing for a capture without versions.
+function versions(value, actions, capture) {
+  if (!capture?.versions) return nothing;
+  const options = [[0, t("version.taken")], ...capture.versions.map((one) => [one.number, versionName(one)])];
+  return choice({ label: t("version.label"), field: "version", value, options, choose: actions.setVersion });
 }
 
 // ---- buttons: the verdict selects the primary one

@@ -1,5 +1,6 @@
 """Bodies of the endpoints of captures."""
 
+from collections.abc import Mapping
 from typing import Self, TypeVar
 
 from pydantic import BaseModel, Field, JsonValue, model_validator
@@ -20,6 +21,7 @@ from services.records.capture import (
     COLOUR,
     Capture,
     CaptureReport,
+    CaptureVersion,
     EyeConfirmation,
     EyeCorrection,
     LateralityEstimate,
@@ -168,10 +170,27 @@ class ReportAnswer(StoredPart):
     confirmed: OmittedIfNone[EyeConfirmationAnswer] = None
 
 
+class VersionAnswer(ResponseBody):
+    """A later picture of a capture, made from its raw frames: number from 1, name of the result, and URLs of its files.
+
+    `at`: time of the adoption (ISO 8601). `colour`: the picture in colour, if any.
+    """
+
+    number: int
+    result: str
+    at: str | None
+    method: str | None
+    software: str | None
+    picture: str
+    colour: OmittedIfNone[str] = None
+    report: str
+
+
 class CaptureAnswer(ResponseBody):
     """A stored capture: its eye, time, report and verdict, visit and slot, and its files with their SHA-256.
 
-    `visit` and `slot` are null for a test picture (`test`).
+    `visit` and `slot` are null for a test picture (`test`). `versions`: later pictures, oldest first; only where there
+    are some. `links` are always the files as taken.
     """
 
     id: str
@@ -186,6 +205,7 @@ class CaptureAnswer(ResponseBody):
     verdict: VerdictAnswer | None
     files: dict[str, str]
     links: CaptureLinks
+    versions: OmittedIfNone[list[VersionAnswer]] = None
 
 
 class CaptureList(ResponseBody):
@@ -205,6 +225,16 @@ def capture_answer(capture: Capture) -> CaptureAnswer:
         id=capture.id, eye=capture.eye, taken_at=capture.taken_at, simulated=capture.simulated,
         calibration_id=capture.calibration_id, report=report_answer(report), visit=report.visit, slot=report.slot,
         test=report.is_test, verdict=verdict_answer(report.verdict), files=capture.files, links=links,
+        versions=[_version(one, capture.files, at) for one in report.versions] or None,
+    )  # fmt: skip
+
+
+def _version(one: CaptureVersion, files: Mapping[str, str], at: str) -> VersionAnswer:
+    """Return a version of a capture whose files are below the URL `at`."""
+    return VersionAnswer(
+        number=one.number, result=one.result, at=one.at, method=one.method, software=one.software,
+        picture=f"{at}/{one.picture}", colour=f"{at}/{one.colour}" if one.colour in files else None,
+        report=f"{at}/{one.report}",
     )  # fmt: skip
 
 

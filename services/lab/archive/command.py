@@ -1,4 +1,4 @@
-"""Command `diffuscope archive plan|run|report`: reprocess every stored raw frame, on one machine or a cluster."""
+"""Command `diffuscope archive plan|run|report|adopt`: reprocess every stored raw frame, on one machine or a cluster."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,7 +9,7 @@ from device.clock import SystemClock
 from services.lab.archive.plan import PlanSettings, read_plan, write_plan
 from services.lab.reconstruct_file import require_writable
 
-app = typer.Typer(help="Reprocess an archive of raw frames: plan, run, report.", no_args_is_help=True)
+app = typer.Typer(help="Reprocess an archive of raw frames: plan, run, report, adopt.", no_args_is_help=True)
 
 
 def _progress(line: str) -> None:
@@ -69,3 +69,23 @@ def report(
 
     require_writable(output)
     typer.echo(f"{output}: {write_report(folder, output, _progress)}")
+
+
+@app.command()
+def adopt(
+    folder: Annotated[Path, typer.Argument(help="Folder of `diffuscope archive run`.")],
+    data: Annotated[Path, typer.Option(help="Where captures are kept; stop the instrument first.")],
+) -> None:
+    """Store the results as later versions of the captures; those as taken stay. Exit status 1 if some are refused."""
+    from services.lab.archive.adopt import adopt_results  # deferred: imports SQLAlchemy, of the extra `instrument`
+
+    done = adopt_results(folder, data, SystemClock(), _progress)
+    for one in done.refused[:20]:
+        _progress(f"refused: {one.id}: {one.reason}. {one.remedy}")
+    if len(done.refused) > 20:
+        _progress(f"and {len(done.refused) - 20} more")
+    typer.echo(
+        f"{data}: {done.adopted} adopted, {done.known} adopted before, {len(done.refused)} refused, "
+        f"{done.missing} without a result"
+    )
+    raise typer.Exit(1 if done.refused else 0)

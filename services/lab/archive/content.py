@@ -3,7 +3,7 @@
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -52,12 +52,18 @@ def digest_of(value: object) -> str:
 
 
 def result_name(
-    frames: tuple[str, ...], calibration: str, versions: Mapping[str, str], settings: Mapping[str, object]
+    frames: Sequence[Sequence[str]], calibration: str, versions: Mapping[str, str], settings: Mapping[str, object]
 ) -> str:
     """Return the name of a result, NAME_DIGITS hexadecimal digits.
 
-    `frames`: SHA-256 of the raw frame and of its dark frame (empty: none); `calibration`: digest of its files;
-    `versions` as of `software`; `settings` of the reconstruction. Equal input gives the equal name on every machine.
+    `frames`: role, SHA-256 and reason against its use (empty: none) of every frame, with the dark frame;
+    `calibration`: digest of its files; `versions` as of `software`; `settings` of the reconstruction. Equal input gives
+    the equal name on every machine.
     """
-    content = {"frames": list(frames), "calibration": calibration, "software": dict(versions), "settings": settings}
+    content = {
+        "frames": [list(one) for one in frames],
+        "calibration": calibration,
+        "software": dict(versions),
+        "settings": settings,
+    }
     return digest_of(content)[:NAME_DIGITS]

@@ -15,9 +15,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from device import atomic_io
 from device.errors import SettingError
 from services.lab.reconstruct_file import write_or_raise
+from services.records.capture import OtherColour
 
 FORMAT = 1
-Role = Literal["psf", "dark", "flat", "archive"]
+Role = Literal["psf", "psf-red", "psf-blue", "dark", "flat", "archive"]
+COLOUR_ROLES: dict[OtherColour, Role] = {"red": "psf-red", "blue": "psf-blue"}
 
 
 class _Part(BaseModel):
@@ -63,11 +65,24 @@ class PlannedCalibration(_Part):
     made_at: str = ""
 
 
+class PlannedFrame(_Part):
+    """One more raw frame of a capture: of the burst, or in another `colour` of light (empty: of the burst).
+
+    `unusable`: reason why it must not enter the picture, as the instrument recorded it; empty if it may.
+    """
+
+    path: str
+    sha256: str
+    colour: OtherColour | Literal[""] = ""
+    unusable: str = ""
+
+
 class PlannedCapture(_Part):
     """One capture: raw frame, own dark frame, calibration (digest), and the name of its result.
 
-    `truth` and `before` are pictures of the same rows and columns to compare with, `report` is the earlier report in
-    the store; each is a path, or empty.
+    `raw` is the first frame of the burst, `frames` are the others in their order, then those in other colours.
+    `origin`: UUID of the device that took it, empty if unknown. `truth` and `before` are pictures of the same rows and
+    columns to compare with, `report` is the earlier report in the store; each is a path, or empty.
     """
 
     id: str
@@ -76,12 +91,14 @@ class PlannedCapture(_Part):
     raw_sha256: str
     calibration: str
     result: str
+    frames: tuple[PlannedFrame, ...] = ()
     dark: str = ""
     dark_sha256: str = ""
     truth: str = ""
     before: str = ""
     report: str = ""
     device: str = ""
+    origin: str = ""
     eye: str = ""
     taken_at: str = ""
 

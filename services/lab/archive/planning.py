@@ -7,8 +7,23 @@ from device.calibration.archive import MANIFEST, parse_calibration
 from device.clock import Clock
 from device.errors import FrameError, SettingError
 from services.lab.archive.content import digest_of, file_digest, result_name, software
-from services.lab.archive.plan import InputFile, LeftOut, Plan, PlannedCalibration, PlannedCapture, PlanSettings
-from services.lab.archive.sources import FoundCalibration, FoundCapture, archived_calibrations, find_captures, is_store
+from services.lab.archive.plan import (
+    InputFile,
+    LeftOut,
+    Plan,
+    PlannedCalibration,
+    PlannedCapture,
+    PlannedFrame,
+    PlanSettings,
+)
+from services.lab.archive.sources import (
+    FoundCalibration,
+    FoundCapture,
+    FoundFrame,
+    archived_calibrations,
+    find_captures,
+    is_store,
+)
 from services.lab.reconstruct_file import refuse_invalid
 from services.lab.reconstruct_inputs import ReconstructOptions
 
@@ -73,15 +88,18 @@ class _Planning:
         calibration = self._calibration(found.calibration)
         raw_digest = found.raw_sha256 or file_digest(found.raw)
         dark_digest = "" if found.dark is None else found.dark_sha256 or file_digest(found.dark)
-        name = result_name((raw_digest, dark_digest), calibration.digest, software(), self._settings)
+        frames = tuple(_planned_frame(one) for one in found.frames)
+        content = [("raw", raw_digest, ""), *((one.colour or "burst", one.sha256, one.unusable) for one in frames)]
+        content += [("dark", dark_digest, "")] if found.dark is not None else []
+        name = result_name(content, calibration.digest, software(), self._settings)
         if (same := self.captures.get(name)) is not None:
             self._leave_out(found, source, f"it has the same content as {same.id}")
             return
         self.captures[name] = PlannedCapture(
             id=found.id, source=str(source), raw=str(found.raw), raw_sha256=raw_digest, result=name,
-            calibration=calibration.digest, dark=_text(found.dark), dark_sha256=dark_digest, truth=_text(found.truth),
-            before=_text(found.before), report=_text(found.report), device=found.device, eye=found.eye,
-            taken_at=found.taken_at,
+            calibration=calibration.digest, frames=frames, dark=_text(found.dark), dark_sha256=dark_digest,
+            truth=_text(found.truth), before=_text(found.before), report=_text(found.report),
+            device=found.device, origin=found.origin, eye=found.eye, taken_at=found.taken_at,
         )  # fmt: skip
 
     def _calibration(self, found: FoundCalibration) -> PlannedCalibration:
@@ -93,6 +111,11 @@ class _Planning:
 
     def _leave_out(self, found: FoundCapture, source: Path, reason: str) -> None:
         self.left_out.append(LeftOut(id=found.id, source=str(source), raw=str(found.raw), reason=reason))
+
+
+def _planned_frame(one: FoundFrame) -> PlannedFrame:
+    sha256 = one.sha256 or file_digest(one.path)
+    return PlannedFrame(path=str(one.path), sha256=sha256, colour=one.colour, unusable=one.unusable)
 
 
 def _planned(found: FoundCalibration) -> PlannedCalibration:

@@ -119,7 +119,8 @@ def html(folder: Path, columns: Columns, found: list[Change]) -> str:
         _section("What was done", _summary(folder, columns)), _section("Quality before and after", _quality(found)),
         _section("Largest improvements", _pictures(folder, columns, _best(found))),
         _section("Largest losses", _losses(folder, columns, found)),
-        _section("Messages and quarantine", _causes(columns)), _section("PSF consistency", _drift(columns)),
+        _section("Frames and colours", _frames(columns)), _section("Messages and quarantine", _causes(columns)),
+        _section("PSF consistency", _drift(columns)),
         _section("Retakes", _retakes(columns)), _section("Refraction", _refraction(columns)),
         _section("Cost", _cost(columns)),
     ]  # fmt: skip
@@ -231,6 +232,21 @@ def _thumbnail(path: Path | None, simulated: bool, words: str) -> str:
     except DiffuscopeError as error:
         return f"<span>{escape(error.message)}</span>"
     return _image("image/jpeg", jpeg, words)
+
+
+def _frames(columns: Columns) -> str:
+    """Return how many captures used how many of their frames, and which colours of light their pictures have."""
+    pairs = zip(columns.values("frames_used"), columns.values("frames"), strict=True)
+    used = Counter(f"{some} of {all}" for some, all in pairs if all is not None)
+    kinds = {"channels": "measured", "predicted_channels": "predicted", "missing_channels": "missing"}
+    colours = Counter(
+        f"{colour} ({word})"
+        for name, word in kinds.items()
+        for many in columns.values(name)
+        for colour in (many if isinstance(many, list) else ())
+    )
+    words = _table(("frames used", "captures"), _counted(used)) if used else "<p>No capture has a result.</p>"
+    return words + (_table(("colour of light", "captures"), _counted(colours)) if colours else "")
 
 
 def _causes(columns: Columns) -> str:

@@ -3,6 +3,8 @@
 plan.toml                       the plan that is computed here
 results/<ab>/<name>/            one result, renamed into place when it is complete; <ab> are the first two digits
     picture.tiff                linear float32, rows x cols (x 3) of the raw frame
+    colour.tiff                 picture in red, green and blue of a capture in several colours of light, cropped to its
+                                field, rows x cols x 3; absent without one
     report.json                 provenance, report and scores: equal for equal input, settings and versions
     run.json                    durations, worker and time, which differ from run to run
 quarantine/<name>.json          a capture that failed, with the reason; tried again by the next run if it may help
@@ -23,6 +25,7 @@ from device.errors import SettingError
 from services.lab.archive.plan import Plan, encoded, read_plan
 from services.lab.reconstruct_file import write_or_raise
 
+COLOUR_PICTURE = "colour.tiff"
 PICTURE, REPORT, RUN, PLAN, TABLE = "picture.tiff", "report.json", "run.json", "plan.toml", "captures.parquet"
 
 
@@ -39,10 +42,40 @@ class Quarantined:
 
 @dataclass(frozen=True)
 class Stored:
-    """The two JSON documents of a stored result."""
+    """The two JSON documents of a stored result, and what adoption and report read of them."""
 
     report: Mapping[str, object]
     run: Mapping[str, object]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether a frame was simulated."""
+        return self.report.get("simulated") is not False
+
+    @property
+    def method(self) -> str:
+        """Method of the reconstruction."""
+        return str(self._reconstruction.get("method"))
+
+    @property
+    def predicted(self) -> tuple[str, ...]:
+        """Colours of the picture in colour that were not measured."""
+        channels = self._reconstruction.get("channels")
+        found = channels if isinstance(channels, list) else []
+        return tuple(str(one["name"]) for one in found if isinstance(one, dict) and one.get("predicted") is True)
+
+    @property
+    def field_px(self) -> tuple[int, int, int, int]:
+        """First row, last row + 1, first column, last column + 1 of the lit field."""
+        match self.report.get("field_px"):
+            case [int(top), int(bottom), int(left), int(right)]:
+                return top, bottom, left, right
+        raise SettingError("a result does not state its field", "Run the plan again with this release.")
+
+    @property
+    def _reconstruction(self) -> Mapping[str, object]:
+        report = self.report.get("report")
+        return report if isinstance(report, dict) else {}
 
 
 class ResultFolder:
@@ -119,6 +152,11 @@ class ResultFolder:
         for path in sorted(self._quarantine.glob("[!.]*.json")):
             entries = _document(path)
             yield Quarantined(**entries)
+
+
+def encoded_document(value: object) -> bytes:
+    """Return a JSON document of a result: sorted keys, so that equal values give equal bytes."""
+    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
 
 
 def _document(path: Path) -> Any:

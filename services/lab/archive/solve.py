@@ -3,11 +3,10 @@
 Nothing here needs Dask: a bare process computes the same bytes.
 """
 
-import json
 import shutil
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,14 +18,23 @@ from device.clock import Clock, SystemClock
 from device.config.image_files import only_frame, read_image_file
 from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError
 from device.recon.model.fft_plans import Planner
-from device.values import Image
+from device.values import Colour, Image
 from services.imaging.picture_files import read_raw_tiff
+from services.imaging.raw_metadata import RawMetadata
 from services.lab.archive.content import different_versions, file_digest, software
-from services.lab.archive.plan import PlannedCalibration, PlannedCapture, PlanSettings, Role
-from services.lab.archive.result import PICTURE, REPORT, RUN, Quarantined, ResultFolder
+from services.lab.archive.plan import COLOUR_ROLES, PlannedCalibration, PlannedCapture, PlanSettings, Role
+from services.lab.archive.result import (
+    COLOUR_PICTURE,
+    PICTURE,
+    REPORT,
+    RUN,
+    Quarantined,
+    ResultFolder,
+    encoded_document,
+)
 from services.lab.montage_files import read_picture
 from services.lab.pair_scores import PairScorer
-from services.lab.reconstruct_file import FileReconstruction, FileReconstructor
+from services.lab.reconstruct_capture import CaptureFrames, CaptureReconstruction, CaptureReconstructor
 from services.lab.reconstruct_inputs import ReconstructOptions
 
 KEPT_SOLVERS = 2  # captures come sorted by calibration; a solver takes up to about 300 MB at full sensor size
@@ -69,14 +77,18 @@ class CalibrationFiles:
     def options(self, calibration: PlannedCalibration, settings: PlanSettings) -> ReconstructOptions:
         """Return the options of a reconstruction with the local copies of a calibration."""
         place = self._root / calibration.digest
-        local = {role: tuple(place / n for r, n in local_names(calibration) if r == role) for role in ("psf", "dark",
-                 "flat")}  # fmt: skip
         return ReconstructOptions(
-            raw=Path(), psfs=local["psf"], output=None, method=settings.method, budget_s=settings.budget_s,
-            dark=next(iter(local["dark"]), None), flat=next(iter(local["flat"]), None), head=None, field_deg=None,
+            raw=Path(), psfs=self.paths(calibration, "psf"), output=None, method=settings.method,
+            budget_s=settings.budget_s, dark=next(iter(self.paths(calibration, "dark")), None),
+            flat=next(iter(self.paths(calibration, "flat")), None), head=None, field_deg=None,
             even=False, plans=None, rounds=settings.rounds,
             calibration=f"{place}:{calibration.id}" if calibration.id else None,
         )  # fmt: skip
+
+    def paths(self, calibration: PlannedCalibration, role: Role) -> tuple[Path, ...]:
+        """Return the local copies of the files of a calibration with this role."""
+        place = self._root / calibration.digest
+        return tuple(place / name for found, name in local_names(calibration) if found == role)
 
 
 def local_names(calibration: PlannedCalibration) -> list[tuple[Role, str]]:
@@ -94,7 +106,7 @@ class Solvers:
     def __init__(self, calibrations: CalibrationFiles, clock: Clock | None = None) -> None:
         self._calibrations, self._clock = calibrations, clock or SystemClock()
         self._planner = Planner(None, effort=EFFORT)
-        self._kept: OrderedDict[str, FileReconstructor] = OrderedDict()
+        self._kept: OrderedDict[str, CaptureReconstructor] = OrderedDict()
 
     def solve(self, task: Task, results: ResultFolder, worker: str) -> Outcome:
         """Reconstruct a capture and store its result; a result that is there already stays.
@@ -112,35 +124,48 @@ class Solvers:
         if isinstance(made, Quarantined):
             return Outcome(name, self._clock.now_s() - begin_s, made)
         total_s = self._clock.now_s() - begin_s
-        run = {"seconds": made.made.report.seconds, "total_s": total_s, "worker": worker,
+        run = {"seconds": made.solved.made.report.seconds, "total_s": total_s, "worker": worker,
                "finished_at": self._clock.wall().isoformat(timespec="seconds")}  # fmt: skip
-        picture = _tiff(made.made.picture)
-        report = _report(task, made)
-        results.add(name, {PICTURE: picture, REPORT: _json(report), RUN: _json(run)})
+        files = {
+            PICTURE: _tiff(made.solved.made.picture),
+            REPORT: encoded_document(_report(task, made)),
+            RUN: encoded_document(run),
+        }
+        if made.solved.colour is not None:
+            files[COLOUR_PICTURE] = _tiff(made.solved.colour)
+        results.add(name, files)
         return Outcome(name, self._clock.now_s() - begin_s)
 
     def _made(self, task: Task, spool: Path) -> "_Made | Quarantined":
         """Return the reconstruction of a capture, from copies of its files that have the planned digests."""
         capture, name = task.capture, task.capture.result
         try:
-            raw = _copied(capture.raw, capture.raw_sha256, spool / "raw")
-            dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
+            frames = _copied_frames(capture, spool)
         except OSError as error:
             return Quarantined(name, "source", f"{error.filename}: {error.strerror}", "Give the source again.", True)
         except FrameError as error:
             return Quarantined(name, "changed", error.message, error.remedy)
+        stated = _stated(frames.lit[0])
+        light = None if stated is None or stated.illumination is None else stated.illumination.colour
         try:
-            made = self._solver(task)(raw, dark)
-            return _Made(made, _facts(raw), _scores(made.picture, capture))
+            solved = self._solver(task)(replace(frames, light=light))
+            scores = _scores(solved.made.picture, capture)
         except REFUSED as error:
-            reason = error.message.replace(str(raw), Path(capture.raw).name)
-            return Quarantined(name, error.code, reason, error.remedy)
+            return Quarantined(name, error.code, error.message.replace(f"{spool}/raw/", ""), error.remedy)
+        report = solved.made.report
+        warnings = tuple(one.replace(f"{spool}/raw/", "") for one in report.warnings)  # the copies are temporary
+        made = replace(solved.made, report=replace(report, warnings=warnings))
+        return _Made(replace(solved, made=made), _facts(stated), scores)
 
-    def _solver(self, task: Task) -> FileReconstructor:
+    def _solver(self, task: Task) -> CaptureReconstructor:
         key = task.calibration.digest
         if key not in self._kept:
             options = self._calibrations.options(task.calibration, task.settings)
-            self._kept[key] = FileReconstructor(options, self._planner)
+            colour_psfs: dict[Colour, tuple[Path, ...]] = {}
+            for colour, role in COLOUR_ROLES.items():
+                if paths := self._calibrations.paths(task.calibration, role):
+                    colour_psfs[colour] = paths
+            self._kept[key] = CaptureReconstructor(options, self._planner, colour_psfs)
             while len(self._kept) > KEPT_SOLVERS:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
@@ -149,14 +174,29 @@ class Solvers:
 
 @dataclass(frozen=True)
 class _Made:
-    made: FileReconstruction
+    solved: CaptureReconstruction
     facts: dict[str, object]
     scores: dict[str, float]
 
 
+def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
+    """Return copies of all frames of a capture, whose contents have the planned digests; errors as in `_copied`."""
+    lit = [_copied(capture.raw, capture.raw_sha256, spool / "raw")]
+    colours, unusable = dict[Colour, Path](), dict[int, str]()
+    for one in capture.frames:
+        copy = _copied(one.path, one.sha256, spool / "raw")
+        if one.colour:
+            colours[one.colour] = copy
+        else:
+            unusable |= {len(lit): one.unusable} if one.unusable else {}
+            lit.append(copy)
+    dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
+    return CaptureFrames(tuple(lit), colours, dark, unusable=unusable)
+
+
 def _copied(path: str, digest: str, folder: Path) -> Path:
     """Return a copy of a file, whose content has the digest; FrameError for another content, OSError for none."""
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     copy = folder / Path(path).name
     shutil.copyfile(path, copy)
     if file_digest(copy) != digest:
@@ -164,13 +204,18 @@ def _copied(path: str, digest: str, folder: Path) -> Path:
     return copy
 
 
-def _facts(raw: Path) -> dict[str, object]:
-    """Return what a raw frame of the instrument states about itself; empty for another file."""
+def _stated(raw: Path) -> RawMetadata | None:
+    """Return what a raw frame of the instrument states about itself; None for another file."""
     if raw.suffix.lower() not in (".tif", ".tiff"):
-        return {}
+        return None
     try:
-        _, stated = read_raw_tiff(raw.read_bytes())
+        return read_raw_tiff(raw.read_bytes())[1]
     except FrameError:
+        return None
+
+
+def _facts(stated: RawMetadata | None) -> dict[str, object]:
+    if stated is None:
         return {}
     light = stated.illumination
     facts: dict[str, object] = {"exposure_s": stated.exposure_s, "head": stated.head}
@@ -201,14 +246,20 @@ def read_linear(path: Path) -> Image:
 
 
 def _report(task: Task, made: _Made) -> dict[str, object]:
-    """Return the document of a result: provenance, report without durations, facts of the raw frame, scores."""
-    report = asdict(made.made.report)
+    """Return the document of a result: provenance, report without durations, facts of the raw frame, scores.
+
+    `field_px`: first row, last row + 1, first and last column + 1 of the lit field.
+    """
+    solved = made.solved
+    report = asdict(solved.made.report)
     del report["seconds"]
-    rows, cols = made.made.picture.shape[:2]
+    rows, cols = solved.made.picture.shape[:2]
+    (top, bottom, _), (left, right, _) = (one.indices(n) for one, n in zip(solved.box, (rows, cols), strict=True))
     return {
         "capture": task.capture.model_dump(), "calibration": task.calibration.model_dump(),
         "settings": task.settings.model_dump(), "software": task.software, "report": report, "raw": made.facts,
-        "scores": made.scores, "rows": rows, "cols": cols, "simulated": made.made.simulated,
+        "scores": made.scores, "rows": rows, "cols": cols, "simulated": solved.made.simulated,
+        "field_px": [top, bottom, left, right],
     }  # fmt: skip
 
 
@@ -216,7 +267,3 @@ def _tiff(picture: Image) -> bytes:
     out = BytesIO()
     tifffile.imwrite(out, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
     return out.getvalue()
-
-
-def _json(value: object) -> bytes:
-    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()

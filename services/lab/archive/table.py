@@ -12,7 +12,7 @@ from pyarrow import parquet
 from device import atomic_io
 from services.lab.archive.content import digest_of
 from services.lab.archive.plan import Plan, PlannedCapture
-from services.lab.archive.result import PICTURE, TABLE, Quarantined, ResultFolder, Stored
+from services.lab.archive.result import COLOUR_PICTURE, PICTURE, TABLE, Quarantined, ResultFolder, Stored
 from services.lab.archive.stored_reports import earlier_figures
 
 ROWS_PER_GROUP = 5_000
@@ -28,14 +28,15 @@ BEFORE = {
 }  # fmt: skip
 SCHEMA = pa.schema({
     "id": TEXT, "state": TEXT, "reason": TEXT, "reason_code": TEXT, "source": TEXT, "raw": TEXT, "raw_sha256": TEXT,
-    "result": TEXT, "picture": TEXT, "device": TEXT, "eye": TEXT, "taken_at": TEXT, "calibration": TEXT,
-    "calibration_made_at": TEXT, "calibration_age_days": NUMBER, "simulated": FLAG, "rows": COUNT, "cols": COUNT,
-    "exposure_s": NUMBER, "light_colour": TEXT, "light_level": NUMBER, "method": TEXT, "bin": COUNT, "rounds": COUNT,
-    "stopped": TEXT, "psf_index": COUNT, "psf_scale": NUMBER, "noise_dn": NUMBER, "residual": NUMBER,
-    **{f"quality_{name}": NUMBER for name in QUALITY}, "sphere_dpt": NUMBER, "sphere_sd_dpt": NUMBER, "j0_dpt": NUMBER,
-    "j45_dpt": NUMBER, "messages": TEXTS, "psnr_db": NUMBER, "pcc": NUMBER, "before_psnr_db": NUMBER,
-    "before_pcc": NUMBER, **BEFORE, "solve_s": NUMBER, "total_s": NUMBER, "worker": TEXT, "finished_at": TEXT,
-    "diffuscope": TEXT, "software": TEXT, "settings": TEXT,
+    "result": TEXT, "picture": TEXT, "colour_picture": TEXT, "device": TEXT, "eye": TEXT, "taken_at": TEXT,
+    "calibration": TEXT, "calibration_made_at": TEXT, "calibration_age_days": NUMBER, "simulated": FLAG, "rows": COUNT,
+    "cols": COUNT, "exposure_s": NUMBER, "light_colour": TEXT, "light_level": NUMBER, "frames": COUNT,
+    "frames_used": COUNT, "channels": TEXTS, "predicted_channels": TEXTS, "missing_channels": TEXTS, "method": TEXT,
+    "bin": COUNT, "rounds": COUNT, "stopped": TEXT, "psf_index": COUNT, "psf_scale": NUMBER, "noise_dn": NUMBER,
+    "residual": NUMBER, **{f"quality_{name}": NUMBER for name in QUALITY}, "sphere_dpt": NUMBER,
+    "sphere_sd_dpt": NUMBER, "j0_dpt": NUMBER, "j45_dpt": NUMBER, "messages": TEXTS, "psnr_db": NUMBER, "pcc": NUMBER,
+    "before_psnr_db": NUMBER, "before_pcc": NUMBER, **BEFORE, "solve_s": NUMBER, "total_s": NUMBER, "worker": TEXT,
+    "finished_at": TEXT, "diffuscope": TEXT, "software": TEXT, "settings": TEXT,
 })  # fmt: skip
 Row = dict[str, object]
 
@@ -102,8 +103,12 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     quality, dpt = _object(report.get("quality")), _object(report.get("refraction_dpt"))
     seconds = _object(run.get("seconds"))
     same = ("method", "bin", "rounds", "stopped", "psf_index", "psf_scale", "noise_dn", "residual")
+    place = results.place(name)
+    colour = place / COLOUR_PICTURE
     return {
-        "state": "done", "picture": str((results.place(name) / PICTURE).relative_to(results.root)),
+        "state": "done", "picture": str((place / PICTURE).relative_to(results.root)),
+        "colour_picture": str(colour.relative_to(results.root)) if colour.is_file() else None,
+        **_frame_columns(report),
         "simulated": document.get("simulated"), "rows": document.get("rows"), "cols": document.get("cols"),
         "exposure_s": raw.get("exposure_s"), "light_colour": raw.get("colour"), "light_level": raw.get("light_level"),
         **{key: report.get(key) for key in same}, **{f"quality_{key}": quality.get(key) for key in QUALITY},
@@ -111,6 +116,18 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
         "j45_dpt": dpt.get("j45"), "messages": report.get("warnings"), **scores,
         "solve_s": seconds.get("solve"), "total_s": run.get("total_s"), "worker": run.get("worker"),
         "finished_at": run.get("finished_at"),
+    }  # fmt: skip
+
+
+def _frame_columns(report: Mapping[str, Any]) -> Row:
+    """Return how many frames were taken and used, and the colours that are measured, predicted and missing."""
+    frames, channels = report.get("frames") or (), report.get("channels") or ()
+    taken = [one for one in channels if one["reason"] is None]
+    return {
+        "frames": len(frames), "frames_used": sum(one["used"] for one in frames),
+        "channels": [one["name"] for one in taken if not one["predicted"]],
+        "predicted_channels": [one["name"] for one in taken if one["predicted"]],
+        "missing_channels": [one["name"] for one in channels if one["reason"] is not None],
     }  # fmt: skip
 
 
