@@ -50,7 +50,6 @@ from services.records.device_identity import load_or_create_device, read_device
 from services.records.dose_ledger_tables import DoseLedgerStore
 from services.records.protocol import Protocol
 from services.records.read_only_store import opened_store
-from services.records.visit_pictures import VisitPictures
 from services.records.visit_repository import VisitRepository
 
 log = logging.getLogger(__name__)
@@ -120,8 +119,7 @@ def serve(
         context = AppContext(spec, archive, store, EventBus(), clock, watchdog, stop.failed)
         explorer = AccuracyExplorer(data / "explorer", data / "plans", clock, spec, context.event_bus.publish, measure)
 
-        pictures = VisitRepository(store.engine, protocol, clock).pictures
-        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, pictures)
+        exam = partial(_open_exam, context, dose_tables, data / "plans", explorer, protocol)
         arbiter = HeadArbiter(context, exam, lambda: open_bench(spec, clock))
         undo.callback(arbiter.close)
         authenticator = PinAuthenticator(data / "technician.json", clock)
@@ -162,9 +160,10 @@ def _log_start(version: str, store: CaptureStore) -> None:
 
 
 def _open_exam(
-    context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer, pictures: VisitPictures
+    context: AppContext, doses: DoseLedgerStore, plans: Path, explorer: AccuracyExplorer, protocol: Protocol
 ) -> ExamService:
-    """Open the head with the calibration in force, and return its exam; `pictures` has the targets of its captures."""
+    """Open the head with the calibration in force, and return its exam; `protocol` has the slots of its captures."""
+    pictures = VisitRepository(context.store.engine, protocol, context.clock).pictures
     head = open_head(with_calibration(context.spec, context.archive.root), context.clock, doses)
     return ExamService(
         head, context.store, context.event_bus, context.clock, plans, context.on_failure, context.watchdog,

@@ -168,7 +168,7 @@ class ExamLoop:
         try:
             press.target.permit()  # the consent may have been withdrawn since
         except RequestRefused:
-            self._end_journal_entry(id)
+            _end_journal_entry(journal, id)
             raise
         journal.count_attempt(id)
         self._events.stage(press, id, "expose")
@@ -182,7 +182,7 @@ class ExamLoop:
         shot = self._exposed.popleft()
         with self._resolving(shot.press, shot.id, ExamEvent.FAILED):
             kept = self._process(shot)
-            self._end_journal_entry(shot.id, shot.press.key)
+            _end_journal_entry(self._parts.capture_journal, shot.id, shot.press.key)
             self._events.problem(None)
             self._requests.advance(ExamEvent.STORED)
             self._events.state()
@@ -212,11 +212,6 @@ class ExamLoop:
             raise
         finally:
             self._parts.head.light.off()
-
-    def _end_journal_entry(self, id: str, key: str | None = None) -> None:
-        """Remove a capture from the journal; with `key`, also interrupted captures of that key."""
-        with suppress(StoreError):  # then the next start reports the capture as interrupted
-            self._parts.capture_journal.end(id, key)
 
     def _process(self, shot: ExposedCapture) -> Capture:
         """Reconstruct, assess and store one exposure; return the stored capture."""
@@ -281,6 +276,12 @@ class ExamLoop:
                 with suppress(FrameError):  # its own reconstruction will report the error
                     self._events.quick_look(shot, self._pipeline.quick_look(shot))
                 self._exposed.append(shot)
+
+
+def _end_journal_entry(journal: CaptureJournal, id: str, key: str | None = None) -> None:
+    """Remove a capture from the journal; with `key`, also interrupted captures of that key."""
+    with suppress(StoreError):  # then the next start reports the capture as interrupted, or finds it in the store
+        journal.end(id, key)
 
 
 def run_exam(

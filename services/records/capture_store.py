@@ -134,23 +134,20 @@ class CaptureStore:
     ) -> Capture:
         """Store a capture and its files (name -> content); return it with their SHA-256 once it is durable.
 
-        Files that are on the disk already are linked, and not written again.
         `write_rows` adds rows in the same transaction. `request`: reference of the press, as
         `IdempotentRequests.reference` returns it, stored in the record of the capture. Quarantined captures are deleted
-        if their space is needed.
+        if their space is needed; files that are on the disk already are linked.
         Errors: StoreFull (everything written is removed); StoreError (the id exists; or a write failed: the next
         opening quarantines the folder if it is incomplete and has no row); SettingError (invalid id, file name or
         report, or no files).
         """
         _refuse_names(capture.id, files)
         capture = capture.with_files({name: _sha256(content) for name, content in files.items()})
-        lengths_bytes = {name: _length_bytes(content) for name, content in files.items()}
-        row = schema.row_of(capture, lengths_bytes)
+        row = schema.row_of(capture, {name: _length_bytes(content) for name, content in files.items()})
         row.request = request
         record = RecordDocument("capture", 1, capture_content(row, file_entries(row)))
-        length_bytes = sum(lengths_bytes.values())
-        # Rows and record, some kilobytes, fit into the reserve.
-        new_bytes = sum(lengths_bytes[name] for name, content in files.items() if isinstance(content, bytes))
+        length_bytes = sum(map(_length_bytes, files.values()))  # rows and record, some kilobytes, fit into the reserve
+        new_bytes = sum(len(content) for content in files.values() if isinstance(content, bytes))
         files = {**files, CAPTURE_RECORD: record.encoded()}
         part, kept = self._captures / f".{capture.id}.part", self._captures / capture.id
         with storage_errors(), atomic_io.file_lock(self._lock):
