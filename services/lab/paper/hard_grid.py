@@ -37,9 +37,9 @@ def run_grid(bench: Bench) -> Outcome:
         (one.rule, one.eye, one.case, one.method, one.words) for one in found.violations
     ))  # fmt: skip
     note = (
-        f"{MERGED} x {MERGED} pixels are merged here, and only the default schedule runs; `diffuscope hard -o DIR` runs "
-        "the whole sensor with every method. Each cell goes through the functions of `diffuscope reconstruct`, with raw, "
-        "PSF and head file as a user gives them."
+        f"{MERGED} x {MERGED} pixels are merged here, and only the default schedule runs; `diffuscope hard -o DIR` "
+        "runs the whole sensor with every method. Each cell goes through the functions of `diffuscope reconstruct`, "
+        "with raw, PSF and head file as a user gives them."
     )
     return Outcome(claims, shown, (why, broken) if found.violations else (why,), (note,))
 
