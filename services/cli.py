@@ -489,7 +489,7 @@ def bench_data_set(
 def paper(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for report.html.")],
     only: Annotated[
-        list[str] | None, typer.Option(help="Just this experiment (N, S0 ... S13, M, L); may be repeated.")
+        list[str] | None, typer.Option(help="Just this experiment (N, T, S0 ... S13, M, L, D); may be repeated.")
     ] = None,
     merged: Annotated[int, typer.Option(min=1, max=3, help="Make n x n pixels one: quicker, a little coarser.")] = 1,
 ) -> None:

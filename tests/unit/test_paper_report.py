@@ -108,6 +108,16 @@ def test_report_of_one_experiment_is_written(tmp_path) -> None:
     assert "The paper&#x27;s numbers" in (tmp_path / "new" / "report.html").read_text()
 
 
+def test_several_experiments_run_in_processes_and_stand_in_their_order(tmp_path) -> None:
+    progress = []
+    found = run_experiments(tmp_path, VirtualClock(), progress.append, ["T", "N"])
+    assert [one.experiment.key for one in found] == ["N", "T"]
+    assert sorted(line.split(":")[0] for line in progress) == ["N", "T"]
+    assert found[1].seconds > 0, "by the clock of the process, not the virtual one"
+    page = (tmp_path / "report.html").read_text()
+    assert page.index('<section id="N">') < page.index('<section id="T">')
+
+
 def test_command_prints_the_path_of_the_report(tmp_path) -> None:
     done = CliRunner().invoke(app, ["paper", "-o", str(tmp_path), "--only", "N"])
     assert done.exit_code == 0, done.output

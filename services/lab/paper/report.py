@@ -1,15 +1,17 @@
-"""`diffuscope paper`: runs all experiments in order and writes the HTML report."""
+"""`diffuscope paper`: runs all experiments, several at a time, and writes the HTML report in their order."""
 
 from base64 import b64decode
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from html import escape
+from multiprocessing import get_context
 from pathlib import Path
 from typing import get_args
 
-from device.clock import Clock
+from device.clock import Clock, SystemClock
 from device.errors import SettingError
 from services.lab.paper import (  # fmt: skip
     caustics,
@@ -34,6 +36,8 @@ ORDER = (
     "N", "T", "S0", "S1", "S2", "S2b", "S3", "S4", "S5", "S6", "S7", "S8", "S9", "S10", "S11", "S12", "S13", "M",
     "L", "D",
 )  # fmt: skip
+LONGEST = ("S13", "D", "L")  # begun first, so that no process is left alone with one of them
+WORKERS = 2  # processes of the whole report: most experiments use one core
 MARKS: dict[Status, str] = {"holds": "", "does not hold": "NO", "not reproduced": "NR"}
 CLASSES: dict[Status, str] = {"holds": "yes", "does not hold": "no", "not reproduced": "open"}
 _ALL = (first_order, traced, caustics, screen, printed, trainer, sensors, hard, hard_grid, rules, light, lenslets)
@@ -56,26 +60,49 @@ def run_experiments(
 ) -> list[ExperimentRun]:
     """Run the experiments `keys` (default: all), write `report.html` and PNG files into a folder; return the outcomes.
 
-    `merged` n combines n x n pixels, as stated in the report. `progress` is called with one line per step.
-    SettingError for an unknown key; StoreError for an unwritable folder.
+    `merged` n combines n x n pixels, as stated in the report. One experiment runs in this process, several in WORKERS
+    processes, which measure with the system's clock. `progress` is called with one line per experiment, and for a
+    single one with a line per step. SettingError for an unknown key; StoreError for an unwritable folder.
     """
     for key in keys:
         if key not in EXPERIMENTS:
             raise SettingError(f"no experiment is called {key!r}", f"Choose from {', '.join(EXPERIMENTS)}.")
     write_or_raise(folder, lambda: folder.mkdir(parents=True, exist_ok=True))
-    bench = Bench(merged, progress)
-    ran = []
-    for experiment in EXPERIMENTS.values():
-        if keys and experiment.key not in keys:
-            continue
-        begin_s = clock.now_s()
-        outcome = experiment.labelled(experiment.run(bench))
-        ran.append(ExperimentRun(experiment, outcome, clock.now_s() - begin_s))
-        _write_pictures(folder, outcome)
-        progress(f"{experiment.key}: {summary(outcome.claims)}")
-    page = folder / "report.html"
-    write_or_raise(page, lambda: page.write_text(html(ran, merged), encoding="utf-8"))
-    return ran
+    chosen = [key for key in EXPERIMENTS if not keys or key in keys]
+    found: dict[str, ExperimentRun] = {}
+    several = _run_in_processes(chosen, merged) if len(chosen) > 1 else map(_run, chosen, [merged], [clock], [progress])
+    for ran in several:
+        found[ran.experiment.key] = ran
+        _write_pictures(folder, ran.outcome)
+        progress(f"{ran.experiment.key}: {summary(ran.outcome.claims)}")
+    ordered, page = [found[key] for key in chosen], folder / "report.html"
+    write_or_raise(page, lambda: page.write_text(html(ordered, merged), encoding="utf-8"))
+    return ordered
+
+
+def _run(key: str, merged: int, clock: Clock, progress: Callable[[str], None]) -> ExperimentRun:
+    begin_s = clock.now_s()
+    outcome = EXPERIMENTS[key].labelled(EXPERIMENTS[key].run(Bench(merged, progress)))
+    return ExperimentRun(EXPERIMENTS[key], outcome, clock.now_s() - begin_s)
+
+
+def _run_in_processes(keys: Sequence[str], merged: int) -> Iterator[ExperimentRun]:
+    """Yield the runs of experiments as they end; an error of one ends all."""
+    first = sorted(keys, key=lambda key: key not in LONGEST)
+    with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:  # a fork would copy the threads of the kernels
+        waiting = [pool.submit(_run_alone, key, merged) for key in first]
+        try:
+            for done in as_completed(waiting):
+                outcome, seconds, key = done.result()
+                yield ExperimentRun(EXPERIMENTS[key], outcome, seconds)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _run_alone(key: str, merged: int) -> tuple[Outcome, float, str]:
+    """Run one experiment in a process of the pool; return its outcome, seconds and key."""
+    ran = _run(key, merged, SystemClock(), lambda line: None)
+    return ran.outcome, ran.seconds, key
 
 
 def _write_pictures(folder: Path, outcome: Outcome) -> None:
