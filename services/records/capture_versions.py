@@ -106,8 +106,10 @@ def _row(session: Session, id: str) -> CaptureRow:
 
 def unknown_capture(id: str) -> RecordNotFound:
     """Return the error of a later picture whose capture the store does not hold."""
-    remedy = "Give the store that holds it. The pictures of an erased patient cannot be adopted."
-    return RecordNotFound(f"this store has no capture named {id!r}", remedy)
+    return RecordNotFound(
+        f"this store has no capture named {id!r}",
+        "Give the store that holds it. The pictures of an erased patient cannot be adopted.",
+    )
 
 
 def _refuse_foreign(new: NewVersion, row: CaptureRow, device: str | None) -> None:
