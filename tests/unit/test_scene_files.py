@@ -13,16 +13,14 @@ from device.config.head_file import load_head
 from device.errors import StoreError
 from device.sim.effects import EFFECTS
 from device.sim.scene_files import simulate
+from tests import simulated
 
 SCENES = Path(__file__).parents[2] / "device" / "sim" / "scenes"
 
 
 def coarse(name):
-    """Return a scene with pixels four times as wide."""
-    spec = load_head(SCENES / name)
-    camera = spec.camera
-    smaller = {"rows": camera.rows // 4, "cols": camera.cols // 4, "pitch_um": 4 * camera.pitch_um}
-    return spec.model_copy(update={"camera": camera.model_copy(update=smaller)})
+    """Return a scene with 4 x 4 of its pixels summed."""
+    return simulated.coarse(load_head(SCENES / name), 4)
 
 
 def with_field(spec, field_deg):
