@@ -119,17 +119,21 @@ def _done_columns(stored: Stored, results: ResultFolder, name: str) -> Row:
     }  # fmt: skip
 
 
-def _frame_columns(report: Mapping[str, Any]) -> Row:
+def _frame_columns(report: Mapping[str, object]) -> Row:
     """Return how many frames were taken and used, and the colours that are measured, predicted and missing."""
-    frames, channels = report.get("frames") or (), report.get("channels") or ()
-    taken = [one for one in channels if one["reason"] is None]
+    frames, channels = _objects(report.get("frames")), _objects(report.get("channels"))
+    taken = [one for one in channels if one.get("reason") is None]
     return {
-        "frames": len(frames), "frames_used": sum(one["used"] for one in frames),
-        "channels": [one["name"] for one in taken if not one["predicted"]],
-        "predicted_channels": [one["name"] for one in taken if one["predicted"]],
-        "missing_channels": [one["name"] for one in channels if one["reason"] is not None],
+        "frames": len(frames), "frames_used": sum(one.get("used") is True for one in frames),
+        "channels": [one.get("name") for one in taken if not one.get("predicted")],
+        "predicted_channels": [one.get("name") for one in taken if one.get("predicted")],
+        "missing_channels": [one.get("name") for one in channels if one.get("reason") is not None],
     }  # fmt: skip
 
 
 def _object(value: Any) -> Mapping[str, object]:
     return value if isinstance(value, dict) else {}
+
+
+def _objects(value: Any) -> list[Mapping[str, object]]:
+    return [_object(one) for one in value] if isinstance(value, list | tuple) else []
