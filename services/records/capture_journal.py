@@ -17,8 +17,9 @@ from device.errors import StoreError
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import digested_json, row_validation
+from services.records.capture import OtherColour
 from services.records.capture_store import CaptureStore
-from services.records.capture_target import FRAMES, OTHER_COLOURS, OtherColour
+from services.records.capture_target import FRAMES, OTHER_COLOURS
 from services.records.frame_writer import FrameWriter, StoredFrame, stored_frames
 from services.records.json_values import JsonObject
 from services.records.record_document import whole_number
