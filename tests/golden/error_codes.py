@@ -17,7 +17,7 @@ CODE = re.compile(r"[a-z]+(?:\.[a-z-]+)+")
 FILE = re.compile(
     r".*\.(?:png|jpe?g|tiff?|npy|npz|json|jsonl|toml|sqlite|txt|html|css|js|mjs|py|md|svg|zip|raucb|local)"
 )
-SENTENCE = re.compile(r"[A-Z{](?:[^\n]* ){2,}[^\n]*[.?!]")  # at least three words
+SENTENCE = re.compile(r"[A-Z{][^\n ]* [^\n ]* [^\n]*[.?!]")  # at least three words; linear in the length
 SOURCES = ("device/", "services/")
 
 
