@@ -38,10 +38,11 @@ FILL_SHARE = 0.5  # of the full well, that the brightest pixel is to reach
 WIDER = 1.2  # of the promised field: room for a field that is larger than promised
 RESOLVED = 0.2  # least modulation of resolved bars; 0.15 is Rayleigh's dip of 26 %, as contrast
 LEAST_AGREEMENT = 0.5  # 0.95 in a good picture, 0.78 at 170 electrons per pixel of 5.04 um, 0.06 in noise
+BARS_OVER_FORMULA = 0.6  # resolved period over that of the formula, which is of vessels: 0.46 to 0.6 in simulation
 LIGHT_FACTOR, SCALE_TOLERANCE, FIELD_TOLERANCE, STEP, GREY_TOLERANCE = 2.0, 0.025, 0.05, 1.27, 0.15
 MOST_SATURATED = 0.01
 REASONS = {
-    "resolution": "one step of the chart coarser than the formula (OPTICS.md 4.3), which is of three simulations",
+    "resolution": "one step of the chart; OPTICS.md 4.3 for this light, and bars of full contrast (simulated)",
     "scale": "lens 25.0 or 25.2 mm (0.8 %), print (0.5 %), diffuser to sensor 6.0 +- 0.05 mm (0.8 %)",
     "field": "the holes of the LED cap, printed to 0.1 mm of 2.2 mm",
     "light": "the LEDs' power is known within a factor of two until a power meter has measured it (OPTICS.md 5.2)",
@@ -265,7 +266,8 @@ def _period_um(peak_e: float, promise: Promise) -> float:
     """Return the finest bar period on the chart that this light promises, at least two pixels, um."""
     if peak_e <= 0:
         return float("inf")
-    half_deg = max(half_period_deg(peak_e, promise.pitch_um), 1 / promise.px_per_deg)
+    formula_deg = half_period_deg(peak_e, promise.pitch_um)
+    half_deg = max(BARS_OVER_FORMULA * formula_deg, 1 / promise.px_per_deg)
     return 2000 * retina_chart.EYE_MM * radians(half_deg)
 
 

@@ -108,11 +108,11 @@ def lit_diameter_px(picture: Image, px_per_deg: float) -> float:
     """Return the diameter of the disc with the area that is brighter than half of the lit level, holes filled."""
     level = ndimage.gaussian_filter(picture, 0.3 * px_per_deg)
     bright = level > 0.5 * np.median(level[level > 0.3 * np.quantile(level, 0.98)])
-    areas, count = ndimage.label(bright)
+    areas, count = ndimage.label(ndimage.binary_fill_holes(bright))  # a ring of the chart parts its rim from the rest
     if count == 0:
         return 0.0
-    largest = 1 + int(np.argmax(ndimage.sum_labels(bright, areas, range(1, count + 1))))
-    return float(2 * np.sqrt(ndimage.binary_fill_holes(areas == largest).sum() / np.pi))
+    largest = np.max(ndimage.sum_labels(np.ones_like(picture), areas, range(1, count + 1)))
+    return float(2 * np.sqrt(largest / np.pi))
 
 
 def _mean(picture: Image, fit: ChartFit, right_um: Floats, down_um: Floats) -> float:
