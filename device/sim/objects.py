@@ -3,8 +3,8 @@
     draw_object    the object of a scene, colour by colour, cropped by the field
 
 A drawing is measured in um on its surface. A place h off the axis appears at atan(h / f) (OPTICS.md 1.2: then the
-paper's 15 mm are 33.4 degrees), and degrees map linearly to pixels (values.Geometry). Drawings are white on black, but for the
-retina chart; pixels on an edge have the value of their covered area.
+paper's 15 mm are 33.4 degrees), and degrees map linearly to pixels (values.Geometry). Drawings are white on black,
+but for the retina chart; pixels on an edge have the value of their covered area.
 """
 
 from collections.abc import Callable

@@ -17,7 +17,8 @@ BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring ar
 UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
 BOUGHT = {
     "lens tubes": "metal", "beam splitter": "glass", "LED matrix": "board", "LED film": "glass", "lever": "metal",
-    "polariser film": "glass", "diffuser": "glass", "camera": "board", "eye lens": "glass", "pinhole": "metal", "retina chart": "glass",
+    "polariser film": "glass", "diffuser": "glass", "camera": "board", "eye lens": "glass", "pinhole": "metal",
+    "retina chart": "glass",
 }  # fmt: skip
 AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
     "lens tubes": (0, 0, -60), "tube flange": (0, 0, -38), "plate lid": (-58, 0, 0), "beam splitter": (-34, 0, 0),

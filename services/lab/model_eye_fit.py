@@ -3,6 +3,8 @@
     fit_chart       finds the chart; `ChartFit` maps places on the chart to pixels and says how well they agree
     modulation      contrast of one group of bars, 1 if it is as high as that of paper and ink
     lit_diameter_px diameter of the lit field
+
+The expected picture is drawn from `device/optics/retina_chart.py`, not by the simulator.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""The chart piston: slides into the model eye in place of the pinhole piston, with a printed retina glued to its nose."""
+"""The chart piston: slides into the model eye in place of the pinhole piston, with a printed retina on its nose."""
 
 from build123d import Part
 
@@ -7,7 +7,7 @@ from hardware.parts.printed import pinhole_piston
 from hardware.parts.shapes import rod
 
 UP = (0.0, 0.0, 1.0)
-NOTCH_MM, NOTCH_DEEP_MM = 2.0, 2.0  # in the rim of the flange: which way is up
+NOTCH_MM = 3.0  # half-round, in the rim of the flange: which way is up
 
 
 def nose_z_mm(d: Dimensions) -> float:
@@ -20,4 +20,4 @@ def chart_piston(d: Dimensions) -> Part:
     nose, end = nose_z_mm(d), pinhole_piston.rear_z_mm(d) - d.bought.eye_step_mm
     flange = (end - pinhole_piston.FLANGE_MM, end)
     body = rod(d.bought.eye_lens_mm - d.fit.slide_mm, (end, nose)) + rod(pinhole_piston.WIDE_MM, flange)
-    return body - rod(NOTCH_MM, flange, (0, pinhole_piston.WIDE_MM / 2 - NOTCH_DEEP_MM / 2))
+    return body - rod(NOTCH_MM, flange, (0, pinhole_piston.WIDE_MM / 2))
