@@ -366,7 +366,7 @@ def check_head(
     """Ask whether the calibration in force still fits the head: after a drop, or when pictures look odd.
 
     The last captures tell; without any, dark frames are taken now. With --model-eye the printed retina of
-    hardware/model-eye.md tells resolution, scale, field and light. The exit status is 1 if a finding fails.
+    hardware/model-eye.md gives resolution, scale, field and light. The exit status is 1 if a finding fails.
     """
     if model_eye:
         raise typer.Exit(_check_model_eye(head, archive, (raw, psf, dark), exposure_s, as_json))

@@ -168,7 +168,7 @@ def _drawn(element: Element) -> str:
 
 
 def srgb(tone: float) -> str:
-    """Return the colour of a tone as printers are told it: black for ink, else the sRGB grey of that reflectance."""
+    """Return the colour of a tone for a printer: black for ink, else the sRGB grey of that reflectance."""
     if tone <= INK:
         return "#000000"
     level = round(255 * (1.055 * tone ** (1 / 2.4) - 0.055))

@@ -59,12 +59,12 @@ REMEDIES = {
 
 @dataclass(frozen=True)
 class Promise:
-    """What a head file promises of the chart; `electrons` is the mean per pixel of the lit disc in one exposure."""
+    """What a head file promises of the chart; `lit_e` is the mean charge per pixel of the lit disc in one exposure."""
 
     px_per_deg: float
     field_deg: float
     extent_px: float
-    electrons: float
+    lit_e: float
     pitch_um: float
 
 
@@ -144,8 +144,8 @@ def mean_tone(field_deg: float) -> float:
 
 def usual_exposure_s(spec: InstrumentSpec) -> float:
     """Return the exposure at which the brightest pixel reaches half of the full well, at most that of the head, s."""
-    electrons = promise_of(spec, spec.camera.exposure_s).electrons
-    share = FILL_SHARE * spec.camera.full_well_e / (PEAK_TO_MEAN * electrons)
+    lit_e = promise_of(spec, spec.camera.exposure_s).lit_e
+    share = FILL_SHARE * spec.camera.full_well_e / (PEAK_TO_MEAN * lit_e)
     return float(spec.camera.exposure_s * min(1.0, share))
 
 
@@ -190,8 +190,8 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
             "Put the chart into the model eye, ink towards the lens, with one step ring; light it, and keep its pupil "
             "on the head's axis. If it is there, the PSF may be that of another head.",
         )
-    contrast = {group.period_um: modulation(made.picture, fit, group) for group in retina_chart.BAR_GROUPS}
-    contrast = {int(period): contrast[period] for period in sorted(contrast)}
+    groups = sorted(retina_chart.BAR_GROUPS, key=lambda group: group.period_um)
+    contrast = {int(group.period_um): modulation(made.picture, fit, group) for group in groups}
     rows = (
         _resolution(contrast, peak_e, promise), _scale(fit, promise), _field(wide, fit, promise),
         _light(mean_e, promise), _grey(made.picture, fit),
@@ -242,9 +242,9 @@ def _electrons(spec: InstrumentSpec, frame: ModelEyeFrame, promise: Promise) -> 
     black_dn: float | NDArray[Any] = float(camera.black_dn)
     if frame.dark is not None:
         black_dn = np.asarray(load_raw(frame.dark, checked=False).raw.pixels, np.float64)
-    electrons = camera.gain_e_per_dn * (pixels - black_dn)
-    mean_e = float(electrons[_lit(electrons.shape, promise)].mean())
-    peak_e = float(np.quantile(electrons, 0.9995))
+    charge_e = camera.gain_e_per_dn * (pixels - black_dn)
+    mean_e = float(charge_e[_lit(charge_e.shape, promise)].mean())
+    peak_e = float(np.quantile(charge_e, 0.9995))
     coarsest_um = retina_chart.PERIODS_UM[-1]
     if mean_e <= camera.read_noise_e or _period_um(peak_e, promise) > coarsest_um:
         raise FrameError(
@@ -292,7 +292,7 @@ def _field(wide: Image, fit: ChartFit, promise: Promise) -> Row:
 
 
 def _light(mean_e: float, promise: Promise) -> Row:
-    light = promise.electrons
+    light = promise.lit_e
     return _row("light", mean_e, light, light / LIGHT_FACTOR, light * LIGHT_FACTOR, "e-/pixel")
 
 

@@ -68,8 +68,10 @@ def fit_chart(picture: Image, px_per_deg: float, field_deg: float) -> ChartFit:
         return -_agreement(small, trial, radius_deg)
 
     corners = np.vstack([np.zeros(4), np.eye(4)])
-    options = {"initial_simplex": corners, "xatol": 2e-3, "fatol": 1e-6, "maxfev": 400}
-    best = optimize.minimize(loss, np.zeros(4), method="Nelder-Mead", options=options)
+    best = optimize.minimize(
+        loss, np.zeros(4), method="Nelder-Mead",
+        options={"initial_simplex": corners, "xatol": 2e-3, "fatol": 1e-6, "maxfev": 400},
+    )  # fmt: skip
     row, col, scale, turn = best.x * steps
     middle = [(size - 1) / 2 for size in picture.shape]
     inner = [(size - 1) / 2 for size in small.shape]
@@ -142,10 +144,11 @@ def _expected(shape: Iterable[int], trial: ChartFit, radius_deg: float) -> tuple
     angle = np.hypot(right, down) / np.float32(trial.px_per_deg)
     stretch = 1000 * retina_chart.EYE_MM * np.tan(np.radians(np.minimum(angle, 60)))
     per_px = stretch / np.maximum(angle * np.float32(trial.px_per_deg), 1e-6)
+    right_um, down_um = (np.asarray(off * per_px, np.float32) for off in (right, down))
     soft_um = radians(SOFT_DEG) * 1000 * retina_chart.EYE_MM
     plane = np.ones(angle.shape, np.float32)
     for tone in (retina_chart.INK, retina_chart.GREY):
-        away = retina_chart.signed_distance_um(retina_chart.of_tone(tone), right * per_px, down * per_px)
+        away = retina_chart.signed_distance_um(retina_chart.of_tone(tone), right_um, down_um)
         plane -= np.float32(1 - tone) * np.clip(0.5 - away / np.float32(soft_um), 0, 1)
     return plane, np.asarray(angle <= radius_deg, np.float32)
 
@@ -178,7 +181,7 @@ def _coarse(small: Image, px_per_deg: float, radius_deg: float) -> ChartFit:
         count = float(mask.sum())
         variance = np.maximum(correlated(squared, mask) - correlated(seen, mask) ** 2 / count, 1e-12)
         for turn in TURNS_DEG:
-            plane = _expected(small.shape, ChartFit(middle[0], middle[1], scale, turn, 0.0), radius_deg)[0]
+            plane = _expected(small.shape, ChartFit(middle[0], middle[1], scale, float(turn), 0.0), radius_deg)[0]
             plane = (plane - (plane * mask).sum() / count) * mask
             agreements = correlated(seen, plane) / np.sqrt(variance * max(float((plane**2).sum()), 1e-12))
             row, col = np.unravel_index(np.argmax(agreements), agreements.shape)

@@ -155,7 +155,7 @@ def called(folder: Path, *words: str) -> tuple[int, str]:
 
 
 def test_quarter_of_the_light_is_a_miss_with_remedy(folder: Path) -> None:
-    """The frame is said to have taken four times as long: the head gives a quarter of the promised light."""
+    """With four times the frame's exposure as argument the head gives a quarter of the promised light."""
     status, output = called(folder, "--exposure-s", str(4 * EXPOSURE_S))
     assert status == 1
     assert re.findall(r"^FAIL +(\w+)", output, re.M) == ["light"]
