@@ -352,11 +352,26 @@ def check_head(
     head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
     archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
+    model_eye: Annotated[
+        bool, typer.Option("--model-eye", help="Compare the model eye's chart with what the head file promises.")
+    ] = False,
+    raw: Annotated[Path | None, typer.Option(help="Frame of the chart; else one is taken, with light.")] = None,
+    psf: Annotated[Path | None, typer.Option(help="Measured PSF of that frame.")] = None,
+    dark: Annotated[Path | None, typer.Option(help="Dark frame of the same exposure.")] = None,
+    exposure_s: Annotated[
+        float | None, typer.Option(min=1e-5, max=10, help="Of that frame; else the head's, or what suits a new one.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="With --model-eye: as JSON.")] = False,
 ) -> None:
     """Ask whether the calibration in force still fits the head: after a drop, or when pictures look odd.
 
-    The last captures tell; without any, dark frames are taken now. The exit status is 1 if a finding fails.
+    The last captures tell; without any, dark frames are taken now. With --model-eye the printed retina of
+    hardware/model-eye.md gives resolution, scale, field and light. The exit status is 1 if a finding fails.
     """
+    if model_eye:
+        raise typer.Exit(_check_model_eye(head, archive, (raw, psf, dark), exposure_s, as_json))
+    if raw or psf or dark or exposure_s or as_json:
+        raise typer.BadParameter("--raw, --psf, --dark, --exposure-s and --json go with --model-eye")
     from services.lab.check_head import (  # imports the drivers only for this command
         check_calibration,
         table,
@@ -370,6 +385,38 @@ def check_head(
     typer.echo(f"calibration {found.kept.calibration.id} of {found.kept.provenance.serial}")
     typer.echo(table(found))
     raise typer.Exit(1 if any(one.fails for one in found.findings) else 0)
+
+
+def _check_model_eye(
+    head: Path, archive: Path | None, files: tuple[Path | None, ...], exposure_s: float | None, as_json: bool
+) -> int:
+    """Print the check of the model eye with the frame of `files` (raw, psf, dark) or a new one; return the status."""
+    from services.lab import model_eye
+    from services.lab.check_head import with_archive
+
+    raw, psf, dark = files
+    if (raw is None) != (psf is None) or (dark is not None and raw is None):
+        raise typer.BadParameter("a frame from a file needs both --raw and --psf; --dark goes with them")
+    spec = with_archive(load_head(head), archive)
+    if raw is not None and psf is not None:
+        frame = model_eye.ModelEyeFrame(raw, psf, dark, exposure_s or spec.camera.exposure_s)
+    else:
+        _progress("the lamp shines for a moment: the model eye stands before the head, and no person")
+        frame = model_eye.expose_model_eye(spec, exposure_s, SystemClock())
+    found = model_eye.check_model_eye(head, frame)
+    typer.echo(model_eye.as_json(found) if as_json else model_eye.table(found))
+    return 0 if found.ok else 1
+
+
+@app.command("chart")
+def draw_chart(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Where to draw the chart, as SVG.")],
+) -> None:
+    """Draw the retina chart of the model eye, to print at 100 % and cut out: hardware/model-eye.md."""
+    from device.optics.retina_chart import chart_svg
+
+    write_or_raise(output, lambda: output.write_text(chart_svg(), encoding="utf-8"))
+    typer.echo(f"{output}: print at 100 %; the line below the chart is 20 mm long")
 
 
 @app.command()

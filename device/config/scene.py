@@ -22,13 +22,14 @@ class ObjectSpec(Table):
 
     `retina` is drawn from the scene's seed with these numbers of lesions; `image` is a photograph; `dots` are a lattice
     of discs; `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
-    one disc of `dot_um`. All are moved by `at_deg` (right, down). `size_deg` is the width of a drawn retina or
+    one disc of `dot_um`; `chart` is the printed retina of the model eye (device/optics/retina_chart.py), which the
+    field crops. All are moved by `at_deg` (right, down). `size_deg` is the width of a drawn retina or
     photograph; None: as wide as the field needs. `cut_deg` (right, down) cuts a retina or photograph to a rectangle in
     the middle of the field, as a photograph whose disc is cut at top and bottom; a photograph then keeps its shape and
     has the rectangle's width, else its central square fills the field.
     """
 
-    kind: Literal["retina", "image", "dots", "ruler", "point"] = "retina"
+    kind: Literal["retina", "image", "dots", "ruler", "point", "chart"] = "retina"
     haemorrhages: int = Field(default=0, ge=0, le=1000)
     microaneurysms: int = Field(default=0, ge=0, le=1000)
     exudates: int = Field(default=0, ge=0, le=1000)

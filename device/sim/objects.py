@@ -3,11 +3,12 @@
     draw_object    the object of a scene, colour by colour, cropped by the field
 
 A drawing is measured in um on its surface. A place h off the axis appears at atan(h / f) (OPTICS.md 1.2: then the
-paper's 15 mm are 33.4 degrees), and degrees map linearly to pixels (values.Geometry). Drawings are white on black;
-pixels on an edge have the value of their covered area.
+paper's 15 mm are 33.4 degrees), and degrees map linearly to pixels (values.Geometry). Drawings are white on black,
+but for the retina chart; pixels on an edge have the value of their covered area.
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import atan, ceil, degrees, floor, hypot
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy import ndimage
 from device.config.head_file import OpticsSpec
 from device.config.scene import ObjectSpec, SimSpec
 from device.errors import SpecError
+from device.optics import retina_chart
 from device.sim.fundus import COLOURS, Fundus, field_mask, fundus
 from device.sim.photo import photograph
 from device.values import Eye, Image
@@ -44,6 +46,8 @@ def draw_object(
     if what.kind in ("retina", "image"):
         found = _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
         return found if what.cut_deg is None else _cut(found, what.cut_deg, px_per_deg)
+    if what.kind == "chart":
+        return _chart(scene.eye.focal_length_um, optics.field_deg, shape, px_per_deg, at_deg)
     _refuse_drawing_beyond_field(what, scene.eye.focal_length_um, optics.field_deg, at_deg)
     outside = {"dots": _dots, "ruler": _ruler, "point": _disc}[what.kind](what)
     plane = _coverage(outside, scene.eye.focal_length_um, shape, px_per_deg, at_deg)
@@ -51,6 +55,17 @@ def draw_object(
         plane = 1 - plane
     plane *= _soft_field(shape, px_per_deg * optics.field_deg / 2)
     return Fundus(dict.fromkeys(COLOURS, plane), field_mask(shape, px_per_deg * optics.field_deg / 2))
+
+
+def _chart(focal_length_um: float, field_deg: float, shape: tuple[int, int], px_per_deg: float, at_deg: Pair) -> Fundus:
+    """Return the retina chart of the model eye on white paper, cropped by the field."""
+    plane = np.ones(shape, np.float32)
+    for tone in (retina_chart.INK, retina_chart.GREY):
+        outside = partial(retina_chart.signed_distance_um, retina_chart.of_tone(tone))
+        plane -= np.float32(1 - tone) * _coverage(outside, focal_length_um, shape, px_per_deg, at_deg)
+    radius_px = px_per_deg * field_deg / 2
+    plane *= _soft_field(shape, radius_px)
+    return Fundus(dict.fromkeys(COLOURS, plane), field_mask(shape, radius_px))
 
 
 def angle_deg(height_um: float, focal_length_um: float) -> float:

@@ -12,7 +12,8 @@ from hardware.parts import bought
 from hardware.parts.dimensions import Dimensions
 
 PRINTED = Path(__file__).parent / "printed"
-EYE = {"model eye tube", "pinhole piston", "step ring"}  # what makes the calibration's eye; all others make the head
+EYE = {"model eye tube", "pinhole piston", "step ring"}  # what makes the calibration's eye
+CHART = {"model eye tube", "chart piston", "step ring"}  # what makes the eye that shows a retina; all others: the head
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def printed() -> dict[str, Printed]:
 
 def head(d: Dimensions) -> dict[str, Part]:
     """The head without its lenses, every part where it stands."""
-    own = {name: part.shape(d) for name, part in printed().items() if name not in EYE}
+    own = {name: part.shape(d) for name, part in printed().items() if name not in EYE | CHART}
     return own | {name: shape(d) for name, shape in bought.HEAD.items()}
 
 
@@ -51,3 +52,9 @@ def eye(d: Dimensions) -> dict[str, Part]:
     """The calibration's eye, its point of light in focus."""
     own = {name: part.shape(d) for name, part in printed().items() if name in EYE}
     return own | {name: shape(d) for name, shape in bought.EYE.items()}
+
+
+def chart_eye(d: Dimensions) -> dict[str, Part]:
+    """The same eye with the printed retina instead of the point of light, in focus."""
+    own = {name: part.shape(d) for name, part in printed().items() if name in CHART}
+    return own | {name: shape(d) for name, shape in bought.CHART.items()}

@@ -4,8 +4,9 @@ from collections.abc import Callable
 
 from build123d import Part, Plane, Solid
 
+from device.optics.retina_chart import PAPER_UM
 from hardware.parts.dimensions import FOUR, Dimensions
-from hardware.parts.printed import diffuser_cell, pinhole_piston, polariser_ring, tube_flange
+from hardware.parts.printed import chart_piston, diffuser_cell, pinhole_piston, polariser_ring, tube_flange
 from hardware.parts.printed.splitter_block import along_plate
 from hardware.parts.shapes import box, joined, rod, rod_y, square
 
@@ -94,8 +95,15 @@ def pinhole(d: Dimensions) -> Part:
     return rod(d.bought.pinhole_foil_mm, (nose - d.bought.pinhole_foil_thick_mm, nose))
 
 
+def retina_chart(d: Dimensions) -> Part:
+    """The paper disc on the nose of the chart piston."""
+    nose = chart_piston.nose_z_mm(d)
+    return rod(PAPER_UM / 1000, (nose, nose + d.bought.chart_paper_mm))
+
+
 HEAD: dict[str, Callable[[Dimensions], Part]] = {
     "lens tubes": lens_tube, "beam splitter": beam_splitter, "LED matrix": led_matrix, "LED film": led_film,
     "polariser film": polariser_film, "lever": lever, "diffuser": diffuser, "camera": camera,
 }  # fmt: skip
 EYE: dict[str, Callable[[Dimensions], Part]] = {"eye lens": eye_lens, "pinhole": pinhole}
+CHART: dict[str, Callable[[Dimensions], Part]] = {"eye lens": eye_lens, "retina chart": retina_chart}

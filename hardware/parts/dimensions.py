@@ -49,6 +49,7 @@ class Bought:
     pinhole_foil_thick_mm: float = 0.1
     eye_focal_mm: float = 25.0  # the model eye as the paper computes with it
     eye_pupil_mm: float = 7.7
+    chart_paper_mm: float = 0.1  # measure; matt paper of 80 to 100 g/m2, without the glue
     eye_step_mm: float = 4.0  # the screen moves by that much, either way
 
 

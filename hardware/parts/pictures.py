@@ -18,6 +18,7 @@ UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
 BOUGHT = {
     "lens tubes": "metal", "beam splitter": "glass", "LED matrix": "board", "LED film": "glass", "lever": "metal",
     "polariser film": "glass", "diffuser": "glass", "camera": "board", "eye lens": "glass", "pinhole": "metal",
+    "retina chart": "glass",
 }  # fmt: skip
 AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
     "lens tubes": (0, 0, -60), "tube flange": (0, 0, -38), "plate lid": (-58, 0, 0), "beam splitter": (-34, 0, 0),
@@ -28,6 +29,9 @@ AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
 }  # fmt: skip
 EYE_AWAY: dict[str, Offset] = {
     "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "pinhole": (0, 0, -60), "pinhole piston": (0, 0, -70),
+}  # fmt: skip
+CHART_AWAY: dict[str, Offset] = {
+    "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "retina chart": (0, 0, -56), "chart piston": (0, 0, -70),
 }  # fmt: skip
 OBLIQUE = View((-0.60, 0.52, 0.24))
 
@@ -51,6 +55,11 @@ def exploded(d: Dimensions) -> str:
 def eye(d: Dimensions) -> str:
     """The calibration's eye."""
     return _exploded("The eye for the calibration, taken apart", assembly.eye(d), EYE_AWAY)
+
+
+def chart_eye(d: Dimensions) -> str:
+    """The model eye with its retina chart."""
+    return _exploded("The model eye with its retina chart, taken apart", assembly.chart_eye(d), CHART_AWAY)
 
 
 def _exploded(title: str, parts: dict[str, Part], away: dict[str, Offset]) -> str:
@@ -145,5 +154,5 @@ def _kind(name: str) -> str:
 
 
 PICTURES: dict[str, Callable[[Dimensions], str]] = {
-    "exploded": exploded, "section": section, "eye": eye, "printed": printed,
+    "exploded": exploded, "section": section, "eye": eye, "chart-eye": chart_eye, "printed": printed,
 }  # fmt: skip

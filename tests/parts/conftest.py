@@ -40,3 +40,8 @@ def changed(tmp_path: Path) -> Callable[[str, str], "Dimensions"]:
         return dimensions(file)
 
     return change
+
+
+@pytest.fixture(scope="session")
+def chart_eye(d: "Dimensions") -> dict[str, "Manifold"]:
+    return {name: solid(part) for name, part in assembly.chart_eye(d).items()}

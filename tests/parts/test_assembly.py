@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from device.optics import field_extent
 from device.optics.light_path import relay_of
 from device.optics.matrix import ring
+from device.optics.retina_chart import RINGS
 from hardware.parts import assembly, bought
 from hardware.parts.dimensions import FOUR, Dimensions
 from hardware.parts.printed import diffuser_cell, pinhole_piston, retaining_ring, splitter_block, tube_flange
@@ -48,7 +49,7 @@ def bundle(*discs: tuple[float, float, float, float]) -> Manifold:
     return Manifold.hull_points(np.array(places))
 
 
-@pytest.mark.parametrize("which", ["head", "eye"])
+@pytest.mark.parametrize("which", ["head", "eye", "chart_eye"])
 def test_parts_do_not_overlap(which: str, request: pytest.FixtureRequest) -> None:
     parts: Solids = request.getfixturevalue(which)
     inside = {
@@ -206,6 +207,13 @@ def test_step_rings_set_the_distance_of_the_point_source(d: Dimensions, eye: Sol
     assert nose == pytest.approx(pinhole_piston.nose_z_mm(d, rings), abs=1e-4)
     lens = sum(eye["eye lens"].bounding_box()[2::3]) / 2
     assert lens == pytest.approx(0, abs=1e-4)
+
+
+def test_chart_is_at_the_focus_of_the_lens(d: Dimensions, chart_eye: Solids) -> None:
+    """The front of the paper is 25 mm behind the lens, and nothing of the tube is before it within the widest ring."""
+    assert chart_eye["retina chart"].bounding_box()[5] == pytest.approx(-d.bought.eye_focal_mm, abs=1e-4)
+    light = rod((0, 0, -d.bought.eye_focal_mm + 0.01), (0, 0, 1), 10.0, 2 * RINGS[-1].radius_um / 1000)
+    assert common_mm3(light, chart_eye["model eye tube"]) < NOTHING_MM3
 
 
 def test_pupil_of_the_model_eye_is_that_of_the_paper(d: Dimensions, eye: Solids) -> None:
