@@ -35,7 +35,8 @@ UNSET = (
 CALLS = (  # ordered: later calls use the files of earlier ones
     "", "fly", "--version",
     "methods", "methods --rows 136 --cols 240", "methods --rows 0",
-    "chart -o {0}/chart.svg", "optics", "optics --sensor imx296", "optics --sensor none", "optics --head {0}/head.toml --sensor imx296",
+    "chart -o {0}/chart.svg",
+    "optics", "optics --sensor imx296", "optics --sensor none", "optics --head {0}/head.toml --sensor imx296",
     "simulate {0}/head.toml --explain", "simulate {0}/head.toml -o {0}/scene", "simulate {0}/head.toml",
     "simulate {0}/none.toml -o {0}/scene", "simulate {0}/head.toml --explain --only moonlight",
     "reconstruct {0}/scene/raw.tiff --psf {0}/scene/psf.tiff --head {0}/head.toml --method gradient -o {0}/x.npy",
