@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,11 +37,11 @@ def store(tmp_path: Path) -> Iterator[CaptureStore]:
         yield opened
 
 
-def version(store: CaptureStore, result: str = "a" * 32, **changed: object) -> NewVersion:
+def version(store: CaptureStore, result: str = "a" * 32, **changed: Any) -> NewVersion:
     """Return a new picture of the stored frames."""
     frames = {name: digest for name, digest in store.get(ID).files.items() if name.endswith(".tiff")}
     new = NewVersion(ID, result, frames, "here", "variation", "1.2", b"new picture", b'{"method": "variation"}')
-    return replace(new, **changed)  # type: ignore[arg-type]
+    return replace(new, **changed)
 
 
 def test_a_version_stands_beside_the_picture_as_taken(store: CaptureStore) -> None:
