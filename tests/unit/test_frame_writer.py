@@ -11,9 +11,11 @@ from threading import Event
 import numpy as np
 import pytest
 
-from device.values import Frame, Illumination
+from device.values import Calibration, Frame, Illumination, Psf, Sensor
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.frame_sink import FrameSink
+from services.instrument.resumption import SHORTER, resumed_frames
+from services.records.capture_journal import InterruptedCapture, ResumableCapture
 from services.records.frame_writer import FrameWriter, StoredFrame, stored_frames
 
 NOON = datetime(2026, 3, 1, 12, 0, 0, 123456, tzinfo=UTC)
@@ -127,3 +129,13 @@ def test_close_writes_nothing_more_than_the_frame_that_is_being_written(tmp_path
     count = len(list(tmp_path.iterdir()))
     Event().wait(0.2)
     assert len(list(tmp_path.iterdir())) == count <= 2
+
+
+def test_a_frame_that_is_lost_between_others_is_reported(tmp_path: Path) -> None:
+    """The dark frame is on the disk, but not the second lit one: the burst is shorter all the same."""
+    write(tmp_path, frames()).finish()
+    (tmp_path / "raw-1.tiff").write_bytes(b"")
+    press = InterruptedCapture(SHARED.id, "OD", None, None, 1)
+    stored = ResumableCapture(press, None, 2, ("red",), stored_frames(tmp_path))
+    calibration = Calibration((Psf(np.ones((40, 60), np.float32)),), Sensor())
+    assert SHORTER.format(taken=1, planned=2) in resumed_frames(stored, calibration, 0.0).notes
