@@ -19,12 +19,13 @@ from device.clock import Clock
 from device.errors import FrameError
 from device.recon.assessment.image_quality import NO_SIGNAL
 from device.recon.estimation.registration import Detail, Registrar, Registration, Shift
+from device.recon.model import kernels
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Preprocessor
-from device.recon.model.resampling import moved_back, to_sensor
+from device.recon.model.resampling import add_moved_back, to_sensor
 from device.recon.reconstructor import (
     ROUND_DONE,
     Reconstructor,
@@ -58,8 +59,12 @@ class JoinedFrame:
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A frame above dark in DN and its good pixels on the sensor, its picture on the grid, and its mean in DN."""
+class SeenFrame:
+    """A frame that is ready to be joined: `BurstJoiner.see` makes it, before the other frames are known.
+
+    `light`: DN above dark, and `good`: 1 for good pixels, both (rows, cols) of the sensor; `picture` on the grid of the
+    registration; `mean_dn`: mean light in DN.
+    """
 
     light: Image
     good: Image
@@ -100,25 +105,27 @@ class BurstJoiner:
         return joined
 
     def steps(
-        self, frames: Sequence[Pixels], unusable: Mapping[int, str] | None = None, dark: Pixels | None = None
-    ) -> Iterator[RoundDone | JoinedFrame]:
+        self, frames: Sequence[Pixels], unusable: Mapping[int, str] | None = None, dark: Pixels | None = None,
+        ready: Mapping[int, SeenFrame] | None = None,
+    ) -> Iterator[RoundDone | JoinedFrame]:  # fmt: skip
         """Join frames (rows, cols) in counts; `dark` is their dark frame (None: the calibration's).
 
-        Yields ROUND_DONE after the picture of each frame, then the joined frame. `unusable` holds the reason of each
-        frame that is known to be unusable, by index. A frame that does not show what most of the others show, that has
-        no light or too many missing pixels is left out, with its reason. With one frame left the result is that frame.
-        FrameError if none can be used.
+        Yields ROUND_DONE after the picture of each frame that is not `ready` (by index, with the same dark frame), then
+        the joined frame. `unusable` holds the reason of each frame that is known to be unusable, by index. A frame that
+        does not show what most of the others show, that has no light or too many missing pixels is left out, with its
+        reason. With one frame left the result is that frame. FrameError if none can be used.
         """
-        seen: dict[int, _Seen] = {}
         reasons = dict(unusable or {})
+        seen = {k: one for k, one in (ready or {}).items() if k not in reasons}
         for k, frame in enumerate(frames):
-            if k in reasons:
+            if k in reasons or k in seen:
                 continue
             try:
-                seen[k] = self._see(plane(frame, 0), dark)
+                seen[k] = self.see(frame, dark)
             except FrameError as error:
                 reasons[k] = error.message
             yield ROUND_DONE
+        seen = {k: seen[k] for k in sorted(seen)}
         if not seen:
             raise FrameError(f"no frame of the burst can be used; the first: {reasons[0]}", "Take the burst again.")
         grid = self._stage.grid
@@ -130,15 +137,19 @@ class BurstJoiner:
         uses = [FrameUse(k, k not in reasons, shifts.get(k), 0.0, reasons.get(k)) for k in range(len(frames))]
         yield self._join(seen, field, uses)
 
-    def _see(self, counts: Pixels, dark: Pixels | None) -> _Seen:
-        """Return the parts of a frame; FrameError without light or with too many missing pixels."""
+    def see(self, frame: Pixels, dark: Pixels | None) -> SeenFrame:
+        """Return a frame (rows, cols) in counts, ready to be joined; `dark` as for `steps`.
+
+        FrameError without light or with too many missing pixels.
+        """
+        counts = plane(frame, 0)
         report = self._single(counts, dark, quick=True).report
         if NO_SIGNAL in report.warnings:
             raise FrameError("the frame holds no signal above the black level")
         # A preprocessor of its own: its buffers are the result, and those of all frames are needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
         linear = full(counts, dark, self._single.defects(counts, dark))
-        return _Seen(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn)
+        return SeenFrame(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn)
 
     def _field(self, pictures: Sequence[Image]) -> Image:
         """Return the lit field on the grid of the pictures, 0 to 1; found in their mean if it is not calibrated."""
@@ -146,35 +157,34 @@ class BurstJoiner:
             return self._stage.model.mask
         return lit_field(np.mean(pictures, axis=0, dtype=np.float32), self._stage.grid)
 
-    def _smooth(self, seen: _Seen, field: Image) -> Image:
-        """Return the smooth part of a frame on the sensor in DN: its picture without detail, blurred by the PSF."""
+    def _smooth(self, seen: SeenFrame, field: Image, near: Image) -> tuple[Image, float]:
+        """Return the smooth part of a frame on the sensor, its picture without detail, blurred by the PSF, and its
+        scale in DN; `near` is the blurred field.
+        """
         stage, sigma = self._stage, SMOOTH_PX / self._stage.grid.n
-        near = np.maximum(ndimage.gaussian_filter(field, sigma), 0.05)
         picture = ndimage.gaussian_filter(seen.picture * field, sigma) / near * field
         blurred = to_sensor(stage.model.blur(picture.astype(np.float32)), self._whole)
-        return blurred * np.float32(_fitted_scale(seen.light, blurred, seen.good))
+        along, _, energy, _, _ = kernels.flat_fit_sums(seen.light, blurred, seen.good)  # least squares
+        return blurred, along / energy if energy > 0 else 0.0
 
-    def _join(self, seen: dict[int, _Seen], field: Image, uses: Sequence[FrameUse]) -> JoinedFrame:
+    def _join(self, seen: dict[int, SeenFrame], field: Image, uses: Sequence[FrameUse]) -> JoinedFrame:
         used = [one.index for one in uses if one.used]
         total_dn = sum(seen[k].mean_dn for k in used)
-        weights = {k: seen[k].mean_dn / total_dn for k in used}
+        shares = {k: seen[k].mean_dn / total_dn for k in used}
         reference = seen[used[0]]
-        base = self._smooth(reference, field)
-        residual, weight = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.float32)
+        near = np.maximum(ndimage.gaussian_filter(field, SMOOTH_PX / self._stage.grid.n), 0.05)
+        base, base_scale = self._smooth(reference, field, near)
+        detail = np.empty(self._shape, np.float32)
+        joined, weights = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.float32)
         for k in used:
-            shift = uses[k].shift_px
+            shift, one = uses[k].shift_px, seen[k]
             assert shift is not None
-            one = seen[k]
-            smooth = base if one is reference else self._smooth(one, field)
-            part, good = moved_back((one.light - smooth) * one.good, one.good, shift)
-            good *= np.float32(weights[k])
-            part *= good
-            residual += part * np.float32(reference.mean_dn / one.mean_dn)
-            weight += good
-        with np.errstate(invalid="ignore", divide="ignore"):
-            joined = np.where(weight >= LEAST_WEIGHT, residual / weight + base, np.float32(np.nan))
+            smooth, scale = (base, base_scale) if one is reference else self._smooth(one, field, near)
+            kernels.subtract_scaled(one.light, smooth, scale, one.good, detail)
+            add_moved_back(detail, one.good, shift, shares[k], reference.mean_dn / one.mean_dn, joined, weights)
+        kernels.finish_mean(joined, weights, LEAST_WEIGHT, base, base_scale)
         light = total_dn / reference.mean_dn
-        frames = tuple(replace(one, weight=weights.get(one.index, 0.0)) for one in uses)
+        frames = tuple(replace(one, weight=shares.get(one.index, 0.0)) for one in uses)
         return JoinedFrame(joined, light, joined_calibration(self._calibration, light, len(used)), frames)
 
 
@@ -250,8 +260,3 @@ def _refined(registrar: Registrar, flats: dict[int, Image], shifts: dict[int, Sh
         refined[k] = shifts[k][0] + rest[0], shifts[k][1] + rest[1]
     return refined
 
-
-def _fitted_scale(light: Image, smooth: Image, good: Image) -> float:
-    """Return the factor of `smooth` that fits the frame by least squares over its good pixels."""
-    energy = float(np.vdot(smooth * good, smooth))
-    return float(np.vdot(smooth * good, light)) / energy if energy > 0 else 0.0

@@ -259,6 +259,69 @@ def interpolate_cubic(
 
 
 @_jit
+def subtract_scaled(light: Image, smooth: Image, scale: float, good: Image, out: Image) -> None:
+    """Write (light - scale smooth) good into `out`."""
+    scale32 = np.float32(scale)
+    rows, cols = light.shape
+    for i in range(rows):
+        for j in range(cols):
+            out[i, j] = (light[i, j] - scale32 * smooth[i, j]) * good[i, j]
+
+
+@_jit
+def add_moved(
+    image: Image, good: Image, whole: tuple[int, int], taps: Axes, weight: float, gain: float, total: Image,
+    weights: Image,
+) -> None:  # fmt: skip
+    """Add weight gain image(r + shift) to `total`, and `weight` to `weights`, where the pixels under all taps are good.
+
+    The shift is `whole` pixels, and the part of a pixel that `taps` interpolate: an odd number of weights per axis,
+    rows and columns. `image` and `good`, 0 or 1, are 0 beyond the shifted image; under the taps they repeat the edge.
+    """
+    rows, cols = image.shape
+    down, across = taps
+    reach_down, reach_across = down.size // 2, across.size // 2
+    weight32, gain32 = np.float32(weight), np.float32(gain)
+    line, kept = np.empty(cols + 2 * reach_across, np.float32), np.empty(cols + 2 * reach_across, np.float32)
+    value, share = np.empty(cols, np.float32), np.empty(cols, np.float32)
+    low, high = max(0, -whole[1]), min(cols, cols - whole[1])
+    for i in range(max(0, -whole[0]), min(rows, rows - whole[0])):
+        line[:], kept[:] = 0, 1
+        for t in range(down.size):
+            a = min(max(i + whole[0] + t - reach_down, 0), rows - 1)
+            _add_line(image[a], good[a], down[t], line[reach_across : reach_across + cols], kept[reach_across:])
+        line[:reach_across], line[reach_across + cols :] = line[reach_across], line[reach_across + cols - 1]
+        kept[:reach_across], kept[reach_across + cols :] = kept[reach_across], kept[reach_across + cols - 1]
+        size = high - low
+        value[:size], share[:size] = 0, 1
+        for t in range(across.size):
+            first = low + whole[1] + t
+            _add_line(line[first : first + size], kept[first : first + size], across[t], value[:size], share[:size])
+        for j in range(size):
+            total[i, low + j] += weight32 * gain32 * value[j] * share[j]
+            weights[i, low + j] += weight32 * share[j]
+
+
+@_jit
+def _add_line(source: Image, good: Image, weight: Single, total: Image, kept: Image) -> None:
+    for j in range(total.size):
+        total[j] += weight * source[j]
+        kept[j] = min(kept[j], good[j])
+
+
+@_jit
+def finish_mean(total: Image, weights: Image, least: float, base: Image, scale: float) -> None:
+    """Replace `total` by total / weights + scale base, and by NaN where `weights` is less than `least`."""
+    scale32, least32, missing = np.float32(scale), np.float32(least), np.float32(np.nan)
+    rows, cols = total.shape
+    for i in range(rows):
+        for j in range(cols):
+            weight = weights[i, j]
+            mean = total[i, j] / max(weight, least32) + scale32 * base[i, j]
+            total[i, j] = mean if weight >= least32 else missing
+
+
+@_jit
 def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Image) -> None:
     """Write the mean light of the four neighbours of each pixel to `mean`, and its own light minus that mean to `off`.
 

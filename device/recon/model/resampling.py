@@ -1,7 +1,6 @@
 """Resampling: a binned picture to the pixels of the sensor by cubic interpolation, and an image by a given shift."""
 
 import numpy as np
-from scipy import ndimage
 
 from device.recon.model import kernels
 from device.recon.model.grid import Grid
@@ -88,35 +87,36 @@ def block_mean(picture: Image, block: int) -> Image:
 def moved_back(image: Image, good: Image, shift_px: tuple[float, float]) -> tuple[Image, Image]:
     """Return image(r + shift) and the share of good pixels behind it, 0 or 1, both (rows, cols) float32.
 
-    `image` is 0 where `good` is 0. Band-limited interpolation by a windowed sinc of 2 TAPS + 1 taps per axis, which
-    keeps the noise white up to 0.4 cycles per pixel; a pixel with a missing one under its taps is missing itself.
+    `image` is 0 where `good` is 0. See `add_moved_back`.
     """
-    moved, kept = np.ascontiguousarray(image), np.ascontiguousarray(good)
-    for axis, shift in enumerate(shift_px):
-        whole = round(shift)
-        part = shift - whole
-        if abs(part) > LEAST_PART_PX:
-            moved = ndimage.correlate1d(moved, sinc_taps(part), axis=axis, mode="nearest")
-            if not kept.all():
-                kept = ndimage.minimum_filter1d(kept, 2 * TAPS + 1, axis=axis, mode="nearest")
-        moved, kept = _by_whole_pixels(moved, whole, axis), _by_whole_pixels(kept, whole, axis)
+    moved, kept = np.zeros_like(image), np.zeros_like(good)
+    add_moved_back(image, good, shift_px, 1.0, 1.0, moved, kept)
     return moved, kept
 
 
-def sinc_taps(part: float) -> np.ndarray:
-    """Return the 2 TAPS + 1 weights that interpolate at `part` (-0.5 to 0.5) pixels from the middle tap; sum 1."""
+def add_moved_back(
+    image: Image, good: Image, shift_px: tuple[float, float], weight: float, gain: float, total: Image, weights: Image
+) -> None:
+    """Add weight gain image(r + shift) to `total` and `weight` to `weights`, all (rows, cols) float32, in place.
+
+    Only where the pixels are good, 1 in `good`. Band-limited interpolation by a windowed sinc of 2 TAPS + 1 taps per
+    axis, which keeps the noise white up to 0.4 cycles per pixel; a pixel with a missing one under its taps, or from
+    beyond the image, is missing itself.
+    """
+    down, across = (round(shift) for shift in shift_px)
+    taps = sinc_taps(shift_px[0] - down), sinc_taps(shift_px[1] - across)
+    kernels.add_moved(
+        np.ascontiguousarray(image), np.ascontiguousarray(good), (down, across), taps, weight, gain, total, weights
+    )
+
+
+def sinc_taps(part: float) -> Image:
+    """Return the 2 TAPS + 1 weights, sum 1, that interpolate at `part` (-0.5 to 0.5) pixels from the middle tap.
+
+    For less than LEAST_PART_PX it is a single weight: nothing is interpolated.
+    """
+    if abs(part) <= LEAST_PART_PX:
+        return np.ones(1, np.float32)
     place = np.arange(-TAPS, TAPS + 1) - part
     weights = np.sinc(place) * np.i0(5 * np.sqrt(np.clip(1 - (place / (TAPS + 0.5)) ** 2, 0, 1)))
-    taps: np.ndarray = weights / weights.sum()
-    return taps
-
-
-def _by_whole_pixels(image: Image, shift: int, axis: int) -> Image:
-    """Return image(r + shift) along an axis; 0 where this is beyond the image."""
-    moved = np.zeros_like(image)
-    size = image.shape[axis]
-    to, source = [slice(None)] * 2, [slice(None)] * 2
-    to[axis] = slice(max(0, -shift), max(0, size - max(0, shift)))
-    source[axis] = slice(max(0, shift), max(0, size + min(0, shift)))
-    moved[tuple(to)] = image[tuple(source)]
-    return moved
+    return np.asarray(weights / weights.sum(), np.float32)
