@@ -63,13 +63,14 @@ class SeenFrame:
     """A frame that is ready to be joined: `BurstJoiner.see` makes it, before the other frames are known.
 
     `light`: DN above dark, and `good`: 1 for good pixels, both (rows, cols) of the sensor; `picture` on the grid of the
-    registration; `mean_dn`: mean light in DN.
+    registration; `mean_dn`: mean light in DN; `saturated`: share of saturated pixels.
     """
 
     light: Image
     good: Image
     picture: Image
     mean_dn: float
+    saturated: float | None
 
 
 class BurstJoiner:
@@ -90,6 +91,7 @@ class BurstJoiner:
         if min(shape) // coarse.bin < LEAST_COARSE or not isfinite(field_radius_px(calibration)):
             single = None
         self._calibration, self._shape = calibration, shape
+        self.registers_quick_looks = single is not None
         self._single = single or Reconstructor(
             calibration, shape, planner, clock, (fine,), psf_index=index, refract=False, timed=False
         )
@@ -144,12 +146,13 @@ class BurstJoiner:
         """
         counts = plane(frame, 0)
         report = self._single(counts, dark, quick=True).report
+        saturated = report.quality["saturated"]
         if NO_SIGNAL in report.warnings:
             raise FrameError("the frame holds no signal above the black level")
         # A preprocessor of its own: its buffers are the result, and those of all frames are needed at once.
         full = Preprocessor(self._calibration, Grid.periodic(self._shape, 1, float("inf")))
         linear = full(counts, dark, self._single.defects(counts, dark))
-        return SeenFrame(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn)
+        return SeenFrame(linear.y, linear.good, self._stage.picture.copy(), linear.mean_dn, saturated)
 
     def _field(self, pictures: Sequence[Image]) -> Image:
         """Return the lit field on the grid of the pictures, 0 to 1; found in their mean if it is not calibrated."""
@@ -259,4 +262,3 @@ def _refined(registrar: Registrar, flats: dict[int, Image], shifts: dict[int, Sh
         rest = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail).shift_px
         refined[k] = shifts[k][0] + rest[0], shifts[k][1] + rest[1]
     return refined
-

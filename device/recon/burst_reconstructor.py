@@ -4,19 +4,27 @@ The joined frame is solved as the sum of its frames: a sum has the gain of the s
 the number of frames. Its read noise, sqrt(N) times that of one frame, is small beside the shot noise of the sum.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Container, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from device.clock import Deadline
-from device.recon.burst import BurstJoiner, JoinedFrame
+from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
+from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join the burst"
+
+
+@dataclass(frozen=True)
+class PreparedFrame:
+    """A frame of a burst before the other ones are known: its quick look, and what is needed to join it."""
+
+    look: StageResult
+    seen: SeenFrame
 
 
 class BurstReconstructor:
@@ -29,52 +37,81 @@ class BurstReconstructor:
         calibration, shape, index = single.calibration, single.shape, single.psf_index
         self.single, self.clock = single, single.clock
         self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index, single)
-        self.join_cost = DurationEstimate()  # of one frame
+        self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()  # of one frame
         self._warm_up()
 
     def _warm_up(self) -> None:
         """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
         noise = np.random.default_rng(0).integers(100, 200, self.single.shape, dtype=np.uint16)
         for _ in range(2):  # the first one compiles
-            self.join_cost = DurationEstimate()
+            self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()
             run = _Run(self, None)
             for step in run.join([noise, noise], np.zeros_like(noise)):
                 assert isinstance(step, RoundDone)
 
+    def prepare(self, counts: Pixels, dark: Pixels | None = None) -> PreparedFrame:
+        """Return a frame (rows, cols) with its quick look, ready for `steps`, while the next frames are exposed.
+
+        FrameError for a frame without light, or with too many missing pixels.
+        """
+        seen, stage = self.joiner.see(counts, dark), self.single.stages[0]
+        if not self.joiner.registers_quick_looks:
+            self.single(counts, dark, quick=True)
+        is_last = stage is self.single.stages[-1]
+        return PreparedFrame(StageResult(stage.recipe, stage.shown.copy(), last=is_last), seen)
+
     def steps(
         self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
         deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
+        prepared: Mapping[int, PreparedFrame] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the quick look of the first frame, a pause after each frame and round, and the picture of the burst.
 
         `frames` are uint16 or float32 (rows, cols), all with the dark frame `dark`; `unusable` holds the reason of each
-        frame that must not enter the picture, by its index, never the first. The deadline moves by the time of
-        the pauses. A burst of one usable frame gives the picture of that frame; so does a deadline that leaves no time
-        to join them. FrameError for another shape, or if no frame can be used.
+        frame that must not enter the picture, by its index, never the first; `prepared` the frames that are prepared
+        with this dark frame, by index. The deadline moves by the time of the pauses. A burst of one usable frame gives
+        the picture of that frame; so does a deadline that leaves no time to join them. FrameError for another shape, or
+        if no frame can be used.
         """
         if len(frames) == 1:
             yield from self.single.steps(frames[0], dark, simulated=simulated, deadline=deadline)
             return
-        run, first = _Run(self, deadline), None
-        for step in self.single.steps(frames[0], dark, simulated=simulated, quick=True):
-            if isinstance(step, Reconstruction):
-                first = step
-            else:
-                yield step
-        assert first is not None
-        if not run.fits(len(frames) * self.join_cost.seconds):
+        run, ready = _Run(self, deadline), dict(prepared or {})
+        saturated = yield from self._quick_look(frames[0], dark, ready.get(0), simulated)
+        if not run.fits(self._cost_s(frames, ready, unusable)):
+            self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
             uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0) for k in range(len(frames))]
             yield from run.solve_one(frames[0], dark, uses, 0, simulated)
             return
-        yield from run.join(frames, dark, unusable)
+        yield from run.join(frames, dark, unusable, {k: one.seen for k, one in ready.items()})
         assert run.joined is not None
         uses = run.joined.frames
         used = [one.index for one in uses if one.used]
         if len(used) == 1:
             yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated)
         else:
-            yield from run.solve_joined(frames[used[0]], dark, first, simulated)
+            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated)
+
+    def _quick_look(
+        self, counts: Pixels, dark: Pixels | None, prepared: PreparedFrame | None, simulated: bool
+    ) -> Generator[Step, None, float | None]:
+        """Yield the quick look of a frame, and return its share of saturated pixels."""
+        if prepared is not None:
+            yield prepared.look
+            return prepared.seen.saturated
+        for step in self.single.steps(counts, dark, simulated=simulated, quick=True):
+            if isinstance(step, Reconstruction):
+                saturated: float | None = step.report.quality["saturated"]
+                return saturated
+            yield step
+        raise AssertionError("a reconstruction ends with a picture")
+
+    def _cost_s(self, frames: Sequence[Pixels], ready: Container[int], unusable: Mapping[int, str] | None) -> float:
+        """Return the estimated duration of joining the frames, in seconds; those that are `ready` cost less."""
+        usable = [k for k in range(len(frames)) if k not in (unusable or {})]
+        unseen = sum(k not in ready for k in usable)
+        return unseen * self.see_cost.seconds + len(usable) * self.join_cost.seconds
 
 
 class _Run:
@@ -90,26 +127,28 @@ class _Run:
         return self._deadline is None or self._deadline.fits(cost_s)
 
     def join(
-        self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str] | None = None
-    ) -> Iterator[RoundDone]:
-        """Join the frames; yield a pause after each of them, by which the deadline moves."""
+        self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str] | None = None,
+        ready: Mapping[int, SeenFrame] | None = None,
+    ) -> Iterator[RoundDone]:  # fmt: skip
+        """Join the frames; yield a pause after each one that is not ready, by which the deadline moves."""
         owner = self._owner
         begin_s = owner.clock.now_s()
-        for step in owner.joiner.steps(frames, unusable, dark):
+        for step in owner.joiner.steps(frames, unusable, dark, ready):
             paused_s = owner.clock.now_s()
             self._join_s += paused_s - begin_s
             if isinstance(step, JoinedFrame):
+                owner.join_cost.add((paused_s - begin_s) / len(step.frames))
                 self.joined = step
                 break
+            owner.see_cost.add(paused_s - begin_s)
             yield step
             begin_s = owner.clock.now_s()
             self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
-        owner.join_cost.add(self._join_s / len(frames))
 
     def solve_joined(
-        self, counts: Pixels, dark: Pixels | None, first: Reconstruction, simulated: bool
+        self, counts: Pixels, dark: Pixels | None, saturated: float | None, simulated: bool
     ) -> Iterator[Step]:
-        """Yield the steps of the picture of the joined frame; `counts` and `first`: first frame and its quick look."""
+        """Yield the steps of the picture of the joined frame; `counts` and `saturated` are those of its first frame."""
         owner, joined = self._owner, self.joined
         assert joined is not None
         total, is_solved = joined.counts * np.float32(joined.light), False
@@ -117,7 +156,7 @@ class _Run:
             if isinstance(step, RoundDone):
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:
-                quality = step.report.quality | {"saturated": first.report.quality["saturated"]}
+                quality = step.report.quality | {"saturated": saturated}
                 yield self._reported(replace(step, report=replace(step.report, quality=quality)), joined.frames)
             elif isinstance(step, Reconstruction):  # no time for the last stage: this is the picture of one frame
                 yield self._reported(step, only(next(one.index for one in joined.frames if one.used), joined.frames))

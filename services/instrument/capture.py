@@ -13,6 +13,7 @@ from device.light_safety.dose_report import DoseReport
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
+from device.recon.burst_reconstructor import PreparedFrame
 from device.values import EYES, Colour, Eye, Frame, Image, Report
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
@@ -77,7 +78,8 @@ class ExposedCapture:
     `verdict`: first verdict, on `frame`. `unusable`: reason of each frame that must not enter the picture, by its
     index. `colours`: one frame in each other colour of light; `missing`: reason of each that was not taken. `written`
     waits for the frames that are being written to the disk, and returns their files by the number of the frame.
-    `notes`: warnings on the exposure for the report.
+    `notes`: warnings on the exposure for the report. `prepared`: what was prepared of the frames during the exposure,
+    by their index.
     """
 
     press: Press
@@ -93,6 +95,7 @@ class ExposedCapture:
     missing: Mapping[Colour, str] = field(default_factory=dict)
     written: Callable[[], Mapping[int, WrittenFile]] = dict
     notes: tuple[str, ...] = ()
+    prepared: Mapping[int, PreparedFrame] = field(default_factory=dict)
 
     @property
     def frame(self) -> Frame:

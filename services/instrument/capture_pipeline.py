@@ -7,6 +7,7 @@ between two steps. One thread, the one that owns the head, calls it.
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +20,7 @@ from device.light_safety.burst import burst, require_lit
 from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
-from device.recon.burst_reconstructor import BurstReconstructor
+from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
 from device.recon.estimation.psf_selection import most_likely_psf
 from device.recon.estimation.refraction import RefractionEstimator
@@ -43,6 +44,7 @@ from device.values import (
 from services.imaging import picture_files
 from services.instrument.capture import FRAME_QUALITY, ExposedCapture, capture_files, capture_report
 from services.instrument.frame_feedback import FrameAssessor
+from services.instrument.frame_preparation import AssessedFrame, FramePreparation, Looked, ignore_look
 from services.records.blobs import FileContent
 from services.records.capture import NO_METHOD, Capture, RecordOrigin
 from services.records.capture_target import OTHER_COLOURS, CaptureTarget
@@ -83,9 +85,13 @@ class FrameReconstructor(Protocol):
 class FramesReconstructor(Protocol):
     """Reconstruction of bursts in steps, as `device.recon.burst_reconstructor.BurstReconstructor` does it."""
 
+    def prepare(self, counts: Pixels, dark: Pixels | None = None) -> PreparedFrame:
+        """Return a frame with its quick look, ready for `steps`; FrameError for a useless one."""
+
     def steps(
         self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
         deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
+        prepared: Mapping[int, PreparedFrame] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the quick look of the first frame, a pause after each frame and round, and the picture."""
 
@@ -124,9 +130,10 @@ class FrameFeedback(Protocol):
 class Exposure:
     """Frames of one press: lit ones, one in each other colour of light, and their dark frame.
 
-    `dark` is None if the press was interrupted before it. `begin_s` (clock seconds) and `duration_s` are those of all
+    `dark` is None if an interrupted press has none. `begin_s` (clock seconds) and `duration_s` are those of all
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
-    picture, by its index; `missing` the reason of each other colour that was not taken.
+    picture, by its index; `missing` the reason of each other colour that was not taken; `ready` what was prepared of
+    the frames during the exposure, by their numbers.
     """
 
     lit: tuple[Frame, ...]
@@ -137,6 +144,7 @@ class Exposure:
     dose_j_per_cm2: float
     unusable: Mapping[int, str] = field(default_factory=dict)
     missing: Mapping[Colour, str] = field(default_factory=dict)
+    ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -187,15 +195,31 @@ class CapturePipeline:
 
     def expose(
         self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
-        field: str | None = None, taken: Taken = ignore_frame,
+        field: str | None = None, taken: Taken = ignore_frame, looked: Looked = ignore_look,
     ) -> Exposure:  # fmt: skip
-        """Return up to `count` lit frames, one in each of `colours`, and a dark one, as the function `expose`."""
+        """Return a dark frame, up to `count` lit ones and one in each of `colours`, as the function `expose`.
+
+        A pipeline of bursts prepares each lit frame while the next one is exposed. `looked` is called in the thread of
+        the preparation, with the quick look of the first frame.
+        """
         count = count if self.bursts is not None else 1
         unable = self._unable(colours)
         able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
-        exposure = expose(
-            self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field, taken=taken
+        run = partial(
+            expose, self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field
         )
+        if self.bursts is None:
+            exposure = run(taken=taken)
+        else:
+            colour, begin_s = self._head.spec.light.colour, self._clock.now_s()
+            with FramePreparation(self._feedback, self.bursts, colour, begin_s, looked) as preparation:
+
+                def read_out(frame: Frame, dose_j_per_cm2: float, exposed_s: float) -> None:
+                    taken(frame, dose_j_per_cm2, exposed_s)
+                    preparation.add(frame)
+
+                exposure = run(taken=read_out)
+                exposure = replace(exposure, ready=preparation.finish())
         return replace(exposure, missing={**unable, **exposure.missing})
 
     def resume(self, taken: Exposure, colours: Sequence[Colour]) -> Exposure:
@@ -219,8 +243,7 @@ class CapturePipeline:
         Without a good frame the order stays, and the verdict is that on the first one. Frames with another verdict than
         the first one are marked as unusable.
         """
-        dark, begin_s = counts_of(exposure.dark), exposure.begin_s
-        verdicts = [self._feedback.assess(frame.counts, dark, begin_s) for frame in exposure.lit]
+        verdicts = [self._verdict(frame, exposure) for frame in exposure.lit]
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
         unusable = {
@@ -230,8 +253,16 @@ class CapturePipeline:
         }
         return replace(exposure, lit=tuple(exposure.lit[k] for k in order), unusable=unusable), verdicts[best]
 
+    def _verdict(self, frame: Frame, exposure: Exposure) -> Verdict:
+        """Return the verdict on a lit frame of an exposure."""
+        if (ready := exposure.ready.get(frame.number)) is not None:
+            return ready.verdict
+        return self._feedback.assess(frame.counts, counts_of(exposure.dark), exposure.begin_s)
+
     def quick_look(self, shot: ExposedCapture) -> Image:
         """Return the picture of the first stage, cropped to the illuminated field; FrameError for a useless frame."""
+        if (prepared := shot.prepared.get(0)) is not None:
+            return prepared.look.picture
         made = self.reconstructor(shot.frame.counts, counts_of(shot.dark), quick=True)
         return crop_to_field(made.picture, self._head)
 
@@ -253,7 +284,9 @@ class CapturePipeline:
             green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
         else:
             counts = [frame.counts for frame in shot.frames]
-            green = self.bursts.steps(counts, dark, unusable=shot.unusable, simulated=simulated, deadline=deadline)
+            green = self.bursts.steps(
+                counts, dark, simulated=simulated, deadline=deadline, unusable=shot.unusable, prepared=shot.prepared
+            )
         if self.colours is None or not (shot.colours or shot.missing):
             return green
         colours = {colour: frame.counts for colour, frame in shot.colours.items()}
@@ -336,7 +369,7 @@ def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
     colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
 ) -> Exposure:  # fmt: skip
-    """Return up to `count` lit frames, one in each of `colours`, and a dark one.
+    """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
 
     The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
     light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
@@ -351,10 +384,10 @@ def expose(
     announce_eye(head, eyes, field)
     head.camera.prepare(run.shot)
     try:
+        dark = head.camera.expose(run.shot)  # first: a frame can be prepared as soon as it has been read out
+        run.report(dark)
         lit = run.lit(Illumination(head.spec.light.colour), count)
         others, missing = run.colours(colours)
-        dark = head.camera.expose(run.shot)
-        run.report(dark)
         return Exposure(lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing)
     finally:
         head.light.off()
@@ -425,6 +458,12 @@ def announce_eye(head: Head, eyes: tuple[Eye, ...], field: str | None = None) ->
     """
     if len(eyes) == 1:
         head.present_eye(eyes[0], field)
+
+
+def prepared_frames(exposure: Exposure) -> dict[int, PreparedFrame]:
+    """Return what was prepared of the lit frames of an exposure, by their index."""
+    found = {k: exposure.ready.get(frame.number) for k, frame in enumerate(exposure.lit)}
+    return {k: one.prepared for k, one in found.items() if one is not None and one.prepared is not None}
 
 
 def counts_of(dark: Frame | None) -> Counts | None:

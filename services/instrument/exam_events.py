@@ -48,11 +48,24 @@ class ExamEvents:
         """Publish the estimated progress of a capture within its stage."""
         self._event_bus.publish("stage", **stage_event(press, id, self._progress.estimate(id)))
 
+    def early_look(self, press: Press, id: str, look: Image, simulated: bool) -> None:
+        """Publish the quick look of a capture whose next frames are being exposed; it remains in its stage.
+
+        The thread of the preparation calls it, while the thread `head` exposes and publishes nothing.
+        """
+        self._event_bus.publish(
+            "stage", **stage_event(press, id, self._progress.estimate(id), self._show(id, look, simulated))
+        )
+
     def quick_look(self, shot: ExposedCapture, image: Image) -> None:
-        """Publish the quick look of a capture in progress."""
-        jpeg = picture_files.to_jpeg(image, QUICK_PX, shot.frame.simulated)
-        self._show_quick_looks({**self.output.quick_looks, shot.id: jpeg})
-        self.stage(shot.press, shot.id, "quick", f"/api/captures/{shot.id}/quick.jpg")
+        """Publish the quick look of a capture whose frames are exposed."""
+        self.stage(shot.press, shot.id, "quick", self._show(shot.id, image, shot.frame.simulated))
+
+    def _show(self, id: str, look: Image, simulated: bool) -> str:
+        """Show a quick look, and return its URL."""
+        jpeg = picture_files.to_jpeg(look, QUICK_PX, simulated)
+        self._show_quick_looks({**self.output.quick_looks, id: jpeg})
+        return f"/api/captures/{id}/quick.jpg"
 
     def forget_quick_look(self, id: str) -> None:
         """Remove the quick look of a capture that is no longer in progress."""

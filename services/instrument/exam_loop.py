@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 
 from device.clock import Clock
 from device.errors import DiffuscopeError, FrameError, LightFault, StoreError
@@ -23,7 +24,7 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.background import run_in_thread
 from services.instrument.calibration_monitor import CalibrationMonitor
 from services.instrument.capture import ExposedCapture, Press
-from services.instrument.capture_pipeline import CapturePipeline, Exposure
+from services.instrument.capture_pipeline import CapturePipeline, Exposure, prepared_frames
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
 from services.instrument.exam_state import ExamEvent
@@ -140,6 +141,7 @@ class ExamLoop:
             colours=target.colours,
             field=target.field,
             taken=FrameSink(writer, shared, head.spec.light.colour),
+            looked=partial(self._events.early_look, press, id),
         )
         return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish)
 
@@ -150,7 +152,7 @@ class ExamLoop:
         light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
         return ExposedCapture(
             press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable,
-            exposure.colours, exposure.missing,
+            exposure.colours, exposure.missing, prepared=prepared_frames(exposure),
         )  # fmt: skip
 
     def _resume_oldest(self) -> None:

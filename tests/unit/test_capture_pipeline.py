@@ -158,14 +158,14 @@ class FailsInRed:
         return self._camera.expose(shot)
 
 
-def test_other_colours_are_taken_between_the_lit_and_the_dark_frame_and_their_dose_counts(bench: Bench) -> None:
+def test_other_colours_are_taken_after_the_dark_and_the_lit_frames_and_their_dose_counts(bench: Bench) -> None:
     head = bench.head
     green = expose(head, ("OD",), bench.clock, count=2)
     both = expose(head, ("OD",), bench.clock, count=2, colours=["red"])
     assert [frame.illumination for frame in both.lit] == [Illumination("green")] * 2
     assert both.colours["red"].illumination == Illumination("red")
     assert both.dark.illumination is None
-    numbers = [frame.number for frame in (*both.lit, both.colours["red"], both.dark)]
+    numbers = [frame.number for frame in (both.dark, *both.lit, both.colours["red"])]
     assert numbers == sorted(numbers)
     red_j_per_cm2 = head.light.hazard.dose_j_per_cm2(Illumination("red"), head.spec.camera.exposure_s)
     assert both.dose_j_per_cm2 - green.dose_j_per_cm2 == pytest.approx(red_j_per_cm2, rel=1e-3)
