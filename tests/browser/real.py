@@ -62,8 +62,9 @@ class MovableClock(GateClock):
         return datetime.now(UTC) + timedelta(seconds=self._ahead_s) + self.moved
 
     def sleep(self, duration_s: float) -> None:
-        self.is_sleeping.set()
-        assert self.gate.wait(HELD_S)
+        if self.world is None or self.world.illumination is not None:
+            self.is_sleeping.set()
+            assert self.gate.wait(HELD_S)
         time.sleep(max(0.0, duration_s))
 
     def advance(self, duration_s: float) -> None:

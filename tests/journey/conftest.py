@@ -52,7 +52,9 @@ SMALL_HEAD = small_head_toml("Small simulated head")
 
 
 class GateClock(VirtualClock):
-    """Virtual clock whose `sleep` blocks while the gate is closed."""
+    """Virtual clock whose `sleep` blocks while the gate is closed, and the lamp of `world` is on."""
+
+    world: World | None = None
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,8 +63,9 @@ class GateClock(VirtualClock):
         self.is_sleeping = Event()
 
     def sleep(self, duration_s: float) -> None:
-        self.is_sleeping.set()
-        assert self.gate.wait(30)
+        if self.world is None or self.world.illumination is not None:
+            self.is_sleeping.set()
+            assert self.gate.wait(30)
         super().sleep(duration_s)
 
 
@@ -95,7 +98,7 @@ class Rig:
         return [(event.kind, event.data) for event in self.event_bus.history]
 
     def block_exposures(self) -> None:
-        """Block every following exposure until the gate is opened."""
+        """Block every following exposure in light until the gate is opened."""
         self.clock.gate.clear()
         self.clock.is_sleeping.clear()
 
@@ -216,6 +219,7 @@ def rig_builder(template: tuple[World, Calibration], plans: Path) -> Callable[..
         owner = HeadArbiter(context, lambda: exam, lambda: open_bench(scene.spec, clock))
         door = PinAuthenticator(folder / "technician.json", clock)
         build_app = partial(create_app, owner, door, protocol, uploader=carrier, usb_drives=sticks)
+        clock.world = scene
         return Rig(scene, clock, records, event_bus, exam, owner, door, build_app, died)
 
     return build_rig

@@ -360,45 +360,47 @@ def test_events_of_a_capture_are_ordered_and_their_links_work(old_rig: Any, read
     news = [event for event in events if event[1] != "beat"]
     sequence = [(kind, data.get("state") or data.get("stage") or data.get("word")) for _, kind, data in news]
     assert sequence == [
-        ("state", "busy"), ("stage", "expose"), ("verdict", "good"), ("state", "making"), ("stage", "quick"),
-        ("stage", "keep"), ("kept", None), ("state", "aim"),
+        ("state", "busy"), ("stage", "expose"), ("stage", "expose"), ("verdict", "good"), ("state", "making"),
+        ("stage", "quick"), ("stage", "keep"), ("kept", None), ("state", "aim"),
     ]  # fmt: skip
     numbers = [number for number, _, _ in news]
-    assert numbers == list(range(numbers[0], numbers[0] + 8))
+    assert numbers == list(range(numbers[0], numbers[0] + 9))
     fractions = [data["fraction"] for _, kind, data in news if kind == "stage"]
     assert fractions == sorted(fractions)
-    stored = news[6][2]
+    stored = news[7][2]
     assert stored == old_rig.request("GET", f"/api/captures/{stored['id']}").json()
     assert {data["id"] for _, kind, data in news if kind == "stage"} == {stored["id"]}
-    first, last = news[2][2], stored["verdict"]
+    first, last = news[3][2], stored["verdict"]
     assert (first["id"], first["word"], first["code"]) == (stored["id"], last["word"], last["code"])
     assert first["numbers"].items() < last["numbers"].items()  # figures of the reconstructed picture are added later
-    assert old_rig.request("GET", news[4][2]["url"]).status_code == 200
+    first_look, look = news[2][2]["url"], news[5][2]["url"]  # while the next frame is exposed, and after the last one
+    assert first_look == look
+    assert old_rig.request("GET", look).status_code == 200
 
 
 def test_reconnected_stream_resumes_after_the_last_event_id(rig: Any, read_events: Any) -> None:
     stored = rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda events: len(events) == 10, {"Last-Event-ID": "0"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
-    assert news[7][2]["id"] == stored.id
-    later = read_events(rig.app, lambda events: len(events) == 3, {"Last-Event-ID": "7"})[1:]
-    assert [number for number, _, _ in later] == [8, 9]
+    news = read_events(rig.app, lambda events: len(events) == 11, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
+    assert news[8][2]["id"] == stored.id
+    later = read_events(rig.app, lambda events: len(events) == 3, {"Last-Event-ID": "8"})[1:]
+    assert [number for number, _, _ in later] == [9, 10]
     fresh = read_events(rig.app, lambda events: len(events) == 1)
-    assert fresh[0][1:] == ("beat", {"number": 9})
+    assert fresh[0][1:] == ("beat", {"number": 10})
     refused(rig.request("GET", "/api/events", headers={"Last-Event-ID": "yesterday"}), 422, "input")
 
 
 def test_event_id_of_an_earlier_process_replays_all_events(rig: Any, read_events: Any) -> None:
     rig.exam.press("OD").result(30)
-    news = read_events(rig.app, lambda events: len(events) == 10, {"Last-Event-ID": "500"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    news = read_events(rig.app, lambda events: len(events) == 11, {"Last-Event-ID": "500"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
 
 
 def test_damaged_capture_does_not_stop_the_event_stream(rig: Any, read_events: Any) -> None:
     stored = rig.exam.press("OD").result(30)
     (rig.store.folder / "captures" / stored.id).rename(rig.store.folder / "gone")
-    news = read_events(rig.app, lambda events: events[-1][0] == 9, {"Last-Event-ID": "0"})[1:]
-    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 9]
+    news = read_events(rig.app, lambda events: events[-1][0] == 10, {"Last-Event-ID": "0"})[1:]
+    assert [number for number, _, _ in news] == [1, 2, 3, 4, 5, 6, 7, 8, 10]
 
 
 def test_event_stream_has_a_heartbeat_every_second(old_rig: Any, read_events: Any) -> None:

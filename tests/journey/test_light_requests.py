@@ -77,7 +77,7 @@ def test_light_without_a_visit_ends_while_a_visit_gets_light(make_rig: MakeRig) 
     assert "Begin a visit" in refused.remedy
     assert status_problem(rig).code == "light.visit"
     assert rig.request("GET", "/api/preview?after=0&eye=OD").status_code == 204
-    assert (rig.world.frames, rig.world.illumination) == (frames, None)
+    assert (rig.world.frames, rig.world.illumination) == (frames + 1, None), "its dark frame alone"
     assert post_capture(rig, "OS").way == "verdict", "the other eye has its own limit"
     assert post_capture(rig, "OD", **slot).way == "verdict"
     assert live_status(rig, f"&eye=OD&visit={slot['visit']}") == 200

@@ -97,10 +97,11 @@ function promptOf(state) {
 
 function markPrompt(state) {
   const shot = currentShot(state);
+  if (shot?.stage.name === "expose" && !shot.verdict && !shot.capture) return ["hold", "hand", t("make.expose")];
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
   if (state.picture === "final") return ["done", "check", t(state.version ? "version.note" : "mark.final")];
   if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
-  return shot.stage.name === "expose" && !shot.verdict ? ["hold", "hand", t("make.expose")] : ["wait", "wait", t("make.refine")];
+  return ["wait", "wait", t("make.refine")];
 }
 
 function pictureName(state, shot) {

@@ -139,7 +139,7 @@ function versions(value, actions, capture) {
 function actionButtons(state, actions, shot) {
   if (state.visit?.finished_at) return button(actions.backToOutcome, "result", "left", "result.seen");
   if (!shot.verdict && !shot.over) {
-    const held = shot.stage.name === "expose" && state.picture === "none";
+    const held = shot.stage.name === "expose"; // the next frames may be exposed after the quick look
     return html`<button class="primary shutter" type="button" id="shutter" aria-disabled="true" @click=${actions.take}>
       ${icon(held ? "hand" : "wait")} <span>${t(held ? "take.hold" : "take.making")}</span>
     </button>`;
