@@ -11,6 +11,7 @@ import numpy as np
 
 from device.clock import Deadline
 from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame
+from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step
@@ -21,10 +22,14 @@ NO_TIME = "the time budget left no time to join the burst"
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """A frame of a burst before the other ones are known: its quick look, and what is needed to join it."""
+    """A frame of a burst before the other ones are known: its quick look, and what is needed to join it.
+
+    `refraction`: the task that estimates its refraction, if it has begun.
+    """
 
     look: StageResult
     seen: SeenFrame
+    refraction: RefractionTask | None = None
 
 
 class BurstReconstructor:
@@ -49,16 +54,19 @@ class BurstReconstructor:
             for step in run.join([noise, noise], np.zeros_like(noise)):
                 assert isinstance(step, RoundDone)
 
-    def prepare(self, counts: Pixels, dark: Pixels | None = None) -> PreparedFrame:
+    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
         """Return a frame (rows, cols) with its quick look, ready for `steps`, while the next frames are exposed.
 
-        FrameError for a frame without light, or with too many missing pixels.
+        With `refract` its refraction is being estimated, in a thread: for the first frame. FrameError for a frame
+        without light, or with too many missing pixels.
         """
         seen, stage = self.joiner.see(counts, dark), self.single.stages[0]
         if not self.joiner.registers_quick_looks:
             self.single(counts, dark, quick=True)
         is_last = stage is self.single.stages[-1]
-        return PreparedFrame(StageResult(stage.recipe, stage.shown.copy(), last=is_last), seen)
+        look = StageResult(stage.recipe, stage.shown.copy(), last=is_last)
+        task = self.single.begin_refraction(counts, dark, self.single.defects(counts, dark)) if refract else None
+        return PreparedFrame(look, seen, task)
 
     def steps(
         self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,
@@ -91,7 +99,8 @@ class BurstReconstructor:
         if len(used) == 1:
             yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated)
         else:
-            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated)
+            task = ready[used[0]].refraction if used[0] in ready else None
+            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated, task)
 
     def _quick_look(
         self, counts: Pixels, dark: Pixels | None, prepared: PreparedFrame | None, simulated: bool
@@ -146,13 +155,16 @@ class _Run:
             self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
 
     def solve_joined(
-        self, counts: Pixels, dark: Pixels | None, saturated: float | None, simulated: bool
-    ) -> Iterator[Step]:
-        """Yield the steps of the picture of the joined frame; `counts` and `saturated` are those of its first frame."""
+        self, counts: Pixels, dark: Pixels | None, saturated: float | None, simulated: bool,
+        refraction: RefractionTask | None,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the steps of the picture of the joined frame; the arguments are those of its first frame."""
         owner, joined = self._owner, self.joined
         assert joined is not None
         total, is_solved = joined.counts * np.float32(joined.light), False
-        for step in owner.single.steps(counts, dark, simulated=simulated, deadline=self._deadline, joined=total):
+        for step in owner.single.steps(
+            counts, dark, simulated=simulated, deadline=self._deadline, joined=total, refraction=refraction
+        ):
             if isinstance(step, RoundDone):
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite, isinf
+from threading import Lock
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from device.recon.estimation.refraction import (
     can_estimate_refraction,
 )
 from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
@@ -170,8 +172,9 @@ class Reconstructor:
     (for files). `audience`: the reader of the warnings. With `refract`, and with known geometry and field, the
     refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF scaled
     accordingly, or the stored PSF if there is no reliable estimate; `field_fixed` takes the field of the calibration as
-    exact. The cylinder is estimated after the picture, if it fits into the deadline. `methods`: the table in which the
-    recipes' methods are looked up. SettingError if a bin is below 1, or for a method that the table does not have.
+    exact. It is estimated in a thread; its cylinder, if it fits into the deadline, while the picture is solved.
+    `methods`: the table in which the recipes' methods are looked up. SettingError if a bin is below 1, or for a method
+    that the table does not have.
     """
 
     def __init__(
@@ -192,6 +195,7 @@ class Reconstructor:
         self.refractor = None
         if refract and can_estimate_refraction(calibration):
             self.refractor = RefractionEstimator(calibration, shape, planner, psf_index, field_fixed)
+        self._refraction_lock = Lock()
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
         self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
         self._cylinder_cost = DurationEstimate()
@@ -231,6 +235,7 @@ class Reconstructor:
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
         rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
+        refraction: RefractionTask | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -240,15 +245,15 @@ class Reconstructor:
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
         sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
-        use the PSF of the picture before. FrameError for another shape than that of the sensor, or if too many pixels
-        are missing (`Preprocessor`).
+        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun. FrameError for
+        another shape than that of the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run = _Run(self, counts, dark, deadline, rounds)
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick and refract:
-                self._estimate_refraction(run)
+                self._estimate_refraction(run, refraction)
             if not run.has_time_for(stage):
                 break
             pauses = stage is self.stages[-1] and len(self.stages) > 1
@@ -261,29 +266,52 @@ class Reconstructor:
         solve_s = solved_s - begin_s - run.refraction_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
         if isinstance(run.refraction, Refraction):
-            self._estimate_cylinder(run, run.refraction)
+            self._wait_for_cylinder(run)
             seconds["cylinder"] = self.clock.now_s() - finished_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
-    def _estimate_refraction(self, run: "_Run") -> None:
-        """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's."""
+    def begin_refraction(
+        self, counts: Pixels, dark: Pixels | None = None, defects: Places | None = None, *, with_cylinder: bool = True
+    ) -> RefractionTask | None:
+        """Begin to estimate the refraction of a frame (rows, cols) in a thread; None if the calibration permits none.
+
+        The task is for `steps` of this frame, with the same dark frame.
+        """
+        if self.refractor is None:
+            return None
+        frame = counts, dark, defects
+        return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder)
+
+    def _estimate_refraction(self, run: "_Run", task: RefractionTask | None) -> None:
+        """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
+
+        `task`: that of the frame, if it has begun.
+        """
         begin_s = self.clock.now_s()
         if self.refractor is None:
             return
-        if run.fits(self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])):
-            run.refraction = self.refractor.find(*run.brightest())
-            self._find_cost.add(self.clock.now_s() - begin_s)
+        cost_s = self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
+        if run.fits(cost_s):
+            with_cylinder = run.fits(cost_s + self._cylinder_s)
+            run.task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
+            assert run.task is not None
+            run.refraction = run.task.found()
+            self._find_cost.add(run.task.find_s)
         self._refocus(run.selected_dpt)
         run.refraction_s = self.clock.now_s() - begin_s
 
-    def _estimate_cylinder(self, run: "_Run", found: Refraction) -> None:
-        """Add the cylinder to the refraction of the run, if time is left after the picture."""
-        cost_s = max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
-        if self.refractor is None or not run.fits(cost_s):
+    @property
+    def _cylinder_s(self) -> float:
+        """Estimated duration of the search for a cylinder in seconds."""
+        return max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
+
+    def _wait_for_cylinder(self, run: "_Run") -> None:
+        """Set the refraction of the run to that with its cylinder, if the deadline permits to wait for it."""
+        assert run.task is not None
+        if not run.task.is_done and not run.fits(self._cylinder_s):
             return
-        begin_s = self.clock.now_s()
-        run.refraction = self.refractor.add_cylinder(found)
-        self._cylinder_cost.add(self.clock.now_s() - begin_s)
+        run.refraction = run.task.whole()
+        self._cylinder_cost.add(run.task.cylinder_s)
 
     def _refocus(self, m_dpt: float | None) -> None:
         """Set the OTF of the later stages to an eye with mean sphere `m_dpt`; None selects the stored PSF."""
@@ -361,6 +389,7 @@ class _Run:
         self.solved: _Solved | None = None  # None before the first stage
         self.rounds_done, self.stopped = 0, "done"
         self.refraction: Refraction | NoRefraction | None = None
+        self.task: RefractionTask | None = None
         self.refraction_s, self.between_s, self.psf_scale = 0.0, 0.0, 1.0
 
     @property

@@ -85,8 +85,8 @@ class FrameReconstructor(Protocol):
 class FramesReconstructor(Protocol):
     """Reconstruction of bursts in steps, as `device.recon.burst_reconstructor.BurstReconstructor` does it."""
 
-    def prepare(self, counts: Pixels, dark: Pixels | None = None) -> PreparedFrame:
-        """Return a frame with its quick look, ready for `steps`; FrameError for a useless one."""
+    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
+        """Return a frame with its quick look, ready for `steps`; `refract`: see there. FrameError for a useless one."""
 
     def steps(
         self, frames: Sequence[Pixels], dark: Pixels | None = None, *, simulated: bool,

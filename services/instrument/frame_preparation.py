@@ -38,8 +38,8 @@ class Assessor(Protocol):
 class Preparer(Protocol):
     """Preparation of frames, as `device.recon.burst_reconstructor.BurstReconstructor` does it."""
 
-    def prepare(self, counts: Pixels, dark: Pixels | None = None) -> PreparedFrame:
-        """Return a frame with its quick look; FrameError for a useless one."""
+    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
+        """Return a frame with its quick look, and `refract` it in a thread; FrameError for a useless one."""
 
 
 class FramePreparation:
@@ -81,7 +81,7 @@ class FramePreparation:
     def _prepare(self, frame: Frame) -> AssessedFrame:
         prepared = None
         with suppress(FrameError):  # its verdict says why
-            prepared = self._preparer.prepare(frame.counts, self._dark)
+            prepared = self._preparer.prepare(frame.counts, self._dark, refract=self._looked is not None)
         if prepared is not None and self._looked is not None:
             self._looked(prepared.look.picture, frame.simulated)
             self._looked = None

@@ -1,0 +1,59 @@
+"""Refraction of one frame, estimated in a thread while other work goes on: exposures, or rounds of a solver."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
+
+from device.clock import Clock
+from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
+from device.recon.model.kernels import Pixels, Places
+
+
+class RefractionTask:
+    """Estimation of mean sphere and field edge of a frame, then of its cylinder `with_cylinder`; begins at once.
+
+    `counts`, `dark` and `defects` as for `RefractionEstimator.find`. Tasks with the same `lock` run one after the
+    other: an estimator holds the state of one frame. Any thread may ask for the results.
+    """
+
+    def __init__(
+        self, estimator: RefractionEstimator, lock: Lock, clock: Clock,
+        frame: tuple[Pixels, Pixels | None, Places | None], with_cylinder: bool,
+    ) -> None:  # fmt: skip
+        self._estimator, self._lock, self._clock = estimator, lock, clock
+        self.find_s = self.cylinder_s = 0.0  # durations, once the results are there
+        aside = ThreadPoolExecutor(1, "refraction")
+        self._found = aside.submit(self._find, frame)
+        self._whole = aside.submit(self._finish, with_cylinder)
+        aside.shutdown(wait=False)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether `whole` returns without waiting."""
+        return self._whole.done()
+
+    def found(self) -> Refraction | NoRefraction:
+        """Wait for the refraction without its cylinder."""
+        return self._found.result()
+
+    def whole(self) -> Refraction | NoRefraction:
+        """Wait for the refraction, with its cylinder if the task has one."""
+        return self._whole.result()
+
+    def _find(self, frame: tuple[Pixels, Pixels | None, Places | None]) -> Refraction | NoRefraction:
+        self._lock.acquire()  # until the end of `_finish`, in the same thread
+        begin_s = self._clock.now_s()
+        found = self._estimator.find(*frame)
+        self.find_s = self._clock.now_s() - begin_s
+        return found
+
+    def _finish(self, with_cylinder: bool) -> Refraction | NoRefraction:
+        try:
+            found = self._found.result()
+            if not (with_cylinder and isinstance(found, Refraction)):
+                return found
+            begin_s = self._clock.now_s()
+            whole = self._estimator.add_cylinder(found)
+            self.cylinder_s = self._clock.now_s() - begin_s
+            return whole
+        finally:
+            self._lock.release()
