@@ -58,6 +58,19 @@ def test_a_burst_gives_one_quick_look_pauses_and_one_better_picture(bursts: Burs
     assert made.report.seconds["join"] > 0
 
 
+def test_frames_prepared_during_the_exposure_give_the_same_picture(bursts: BurstReconstructor, frames: list) -> None:
+    ready = {k: bursts.prepare(frames[k], refract=k == 0) for k in range(COUNT - 1)}  # the last one is not prepared
+    look, *steps = bursts.steps(frames, simulated=True, prepared=ready)
+    assert isinstance(look, StageResult)
+    assert np.array_equal(look.picture, next(iter(bursts.steps(frames, simulated=True))).picture)
+    made, apart = steps[-1], picture(bursts, frames)
+    assert isinstance(made, Reconstruction)
+    assert np.array_equal(made.picture, apart.picture)
+    assert made.report.frames == apart.report.frames
+    assert made.report.refraction_dpt == apart.report.refraction_dpt
+    assert made.report.quality == apart.report.quality
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_fewer_frames_than_planned_have_the_noise_of_fewer(
     bursts: BurstReconstructor, frames: list, count: int

@@ -1,0 +1,114 @@
+"""Preparation of the frames of a press: which frames, in which thread, and what happens after an error."""
+
+from threading import Event, current_thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from device.errors import FrameError
+from device.recon.assessment.frame_quality import Verdict
+from device.recon.burst import SeenFrame
+from device.recon.burst_reconstructor import PreparedFrame
+from device.recon.reconstructor import Recipe, StageResult
+from device.values import Colour, Frame, Illumination, Image
+from services.instrument.frame_preparation import FramePreparation
+
+USELESS, FATAL = 0, 99  # numbers of frames that cannot be prepared, and that raise an unknown exception
+
+
+class Bench:
+    """Assessor and preparer of frames that are told apart by their first count, and what they were asked for."""
+
+    def __init__(self) -> None:
+        self.go = Event()
+        self.go.set()
+        self.darks: set[float | None] = set()
+        self.refracted: list[int] = []
+        self.looks: list[tuple[int, bool, str]] = []
+
+    def assess(self, counts: Any, dark: Any, begin_s: float) -> Verdict:
+        assert begin_s == 5.0
+        self.darks.add(None if dark is None else float(dark[0, 0]))
+        return Verdict("good", None, {"number": int(counts[0, 0])})
+
+    def prepare(self, counts: Any, dark: Any = None, *, refract: bool = False) -> PreparedFrame:
+        assert self.go.wait(10)
+        number = int(counts[0, 0])
+        if number == USELESS:
+            raise FrameError("too many pixels are missing")
+        if number == FATAL:
+            raise ZeroDivisionError("unexpected")
+        self.refracted += [number] * refract
+        picture = np.full((2, 2), number, np.float32)
+        look = StageResult(Recipe(), picture, last=False)
+        return PreparedFrame(look, SeenFrame(picture, picture, picture, 1.0, 0.0))
+
+    def look(self, image: Image, simulated: bool) -> None:
+        self.looks.append((int(image[0, 0]), simulated, current_thread().name))
+
+    def preparation(self) -> FramePreparation:
+        return FramePreparation(self, self, "green", 5.0, self.look)
+
+
+def frame(number: int, colour: Colour | None = "green") -> Frame:
+    glow = None if colour is None else Illumination(colour)
+    return Frame(np.full((2, 2), number, np.uint16), 0.1, number, glow, True)
+
+
+def test_lit_frames_of_the_burst_are_prepared_with_the_dark_frame_in_a_thread() -> None:
+    bench = Bench()
+    with bench.preparation() as preparation:
+        for one in (frame(9, None), frame(1), frame(2), frame(3, "red")):
+            preparation.add(one)
+        ready = preparation.finish()
+    assert {number: one.verdict.numbers["number"] for number, one in ready.items()} == {1: 1, 2: 2}
+    assert bench.darks == {9.0}
+    ((look, simulated, thread),) = bench.looks
+    assert (look, simulated, bench.refracted) == (1, True, [1]), "the first one alone"
+    assert thread != current_thread().name
+
+
+def test_adding_a_frame_does_not_wait_for_its_preparation() -> None:
+    bench = Bench()
+    bench.go.clear()
+    with bench.preparation() as preparation:
+        preparation.add(frame(1))
+        assert bench.looks == []
+        bench.go.set()
+        assert preparation.finish().keys() == {1}
+
+
+def test_a_useless_frame_has_a_verdict_and_the_next_one_gives_the_quick_look() -> None:
+    bench = Bench()
+    with bench.preparation() as preparation:
+        for number in (USELESS, 1, 2):
+            preparation.add(frame(number))
+        ready = preparation.finish()
+    assert ready[USELESS].prepared is None
+    assert ready[USELESS].verdict.word == "good"
+    assert [number for number, *_ in bench.looks] == bench.refracted == [1]
+
+
+def test_an_unexpected_error_is_raised_in_the_thread_of_the_press() -> None:
+    with Bench().preparation() as preparation:
+        preparation.add(frame(FATAL))
+        with pytest.raises(ZeroDivisionError):
+            preparation.finish()
+
+
+def test_after_an_error_of_the_press_no_further_frame_is_prepared() -> None:
+    bench = Bench()
+    bench.go.clear()
+
+    def press() -> None:
+        with bench.preparation() as preparation:
+            for number in (1, 2, 3):
+                preparation.add(frame(number))
+            bench.go.set()
+            raise FrameError("the camera failed")
+
+    with pytest.raises(FrameError):
+        press()
+    seen = len(bench.looks), len(bench.darks)
+    assert seen <= (1, 1), "at most the one that was being prepared"

@@ -1,0 +1,68 @@
+"""Refraction tasks: order of the calls of their estimator, which holds the state of one frame, and errors."""
+
+from threading import Event, Lock
+from typing import Any
+
+import numpy as np
+import pytest
+
+from device.clock import SystemClock
+from device.recon.estimation.refraction import NoRefraction, Refraction
+from device.recon.estimation.refraction_field import FieldEdge
+from device.recon.estimation.refraction_task import RefractionTask
+
+EDGE = FieldEdge(33.4, 0.1, 0.0, 0.0, 0.0)
+
+
+class Estimator:
+    """Estimator whose result is the first count of the frame in dpt; waits for `go`, and records its calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, float]] = []
+        self.go = Event()
+
+    def find(self, counts: Any, dark: Any = None, defects: Any = None) -> Refraction | NoRefraction:
+        assert self.go.wait(10)
+        self.calls.append(("find", float(counts[0, 0])))
+        if counts[0, 0] < 0:
+            raise ZeroDivisionError("unexpected")
+        if counts[0, 0] == 0:
+            return NoRefraction("the frame holds no light of the field")
+        return Refraction(float(counts[0, 0]), 0.1, 1.0, 500.0, (), EDGE, 0.0)
+
+    def add_cylinder(self, found: Refraction) -> Refraction:
+        self.calls.append(("cylinder", found.sphere_dpt))
+        return found
+
+
+def begin(estimator: Estimator, lock: Lock, sphere_dpt: float, with_cylinder: bool = True) -> RefractionTask:
+    frame = np.full((2, 2), sphere_dpt, np.float32), None, None
+    return RefractionTask(estimator, lock, SystemClock(), frame, with_cylinder)  # type: ignore[arg-type]
+
+
+def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> None:
+    estimator, lock = Estimator(), Lock()
+    tasks = [begin(estimator, lock, dpt) for dpt in (1.0, 2.0, 3.0)]
+    assert not any(task.is_done for task in tasks)
+    estimator.go.set()
+    assert [task.whole().sphere_dpt for task in tasks] == [1.0, 2.0, 3.0]  # type: ignore[union-attr]
+    pairs = [tuple(estimator.calls[k : k + 2]) for k in (0, 2, 4)]
+    assert sorted(pairs) == [(("find", dpt), ("cylinder", dpt)) for dpt in (1.0, 2.0, 3.0)]
+
+
+def test_a_refused_frame_and_a_task_without_cylinder_search_for_none() -> None:
+    estimator, lock = Estimator(), Lock()
+    estimator.go.set()
+    assert isinstance(begin(estimator, lock, 0.0).whole(), NoRefraction)
+    assert isinstance(begin(estimator, lock, 2.0, with_cylinder=False).whole(), Refraction)
+    assert [name for name, _ in estimator.calls] == ["find", "find"]
+
+
+def test_an_unexpected_error_reaches_who_asks_and_does_not_block_the_next_task() -> None:
+    estimator, lock = Estimator(), Lock()
+    estimator.go.set()
+    failed = begin(estimator, lock, -1.0)
+    for ask in (failed.found, failed.whole):
+        with pytest.raises(ZeroDivisionError):
+            ask()
+    assert isinstance(begin(estimator, lock, 2.0).whole(), Refraction)
