@@ -101,17 +101,28 @@ def without_figures(kind: str, data: dict[str, Any]) -> dict[str, Any]:
 
 
 class TracedEventBus(EventBus):
-    """An EventBus that appends each event to a trace; `at_quick` is called once, after the first quick look."""
+    """An EventBus that appends each event to a trace; `at_quick` is called once, after the first quick look.
+
+    The quick look that is published during the exposure comes at no fixed moment, from the thread of the preparation:
+    it is recorded before the verdict, without estimates, and not at all for a press that fails.
+    """
 
     def __init__(self, trace: Trace) -> None:
         super().__init__()
         self._trace = trace
+        self._early_look: dict[str, Any] | None = None
         self.at_quick: Callable[[], Any] | None = None
 
     def publish(self, kind: str, **data: Any) -> None:
         """Record the event, then publish it."""
         recorded = without_figures(kind, data)
-        self._trace.add(event=kind, data=recorded)
+        if data.get("stage") == "expose" and data["url"] is not None:
+            self._early_look = {key: value for key, value in recorded.items() if key not in ("fraction", "left_s")}
+        else:
+            look, self._early_look = self._early_look, None
+            if kind == "verdict" and look is not None:
+                self._trace.add(event="stage", data=look)
+            self._trace.add(event=kind, data=recorded)
         super().publish(kind, **data)
         if data.get("stage") == "quick" and self.at_quick is not None:
             act, self.at_quick = self.at_quick, None
@@ -140,8 +151,8 @@ class Stage:
         self.answers.append(pressed)
         return pressed
 
-    def soon(self, act: Callable[[], Any], after_s: float = 0.05) -> None:
-        """Call `act` after a delay, by default during a lit exposure."""
+    def soon(self, act: Callable[[], Any], after_s: float = 0.15) -> None:
+        """Call `act` after a delay, by default during the first lit exposure, which follows the dark one."""
         self.clock.at(self.clock.now_s() + after_s, act)
 
     def break_(self, *faults: str) -> None:
