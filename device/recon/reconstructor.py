@@ -249,11 +249,11 @@ class Reconstructor:
         another shape than that of the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
-        run = _Run(self, counts, dark, deadline, rounds)
+        run, task = _Run(self, counts, dark, deadline, rounds), refraction
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick and refract:
-                self._estimate_refraction(run, refraction)
+                task = self._estimate_refraction(run, task)
             if not run.has_time_for(stage):
                 break
             pauses = stage is self.stages[-1] and len(self.stages) > 1
@@ -265,8 +265,8 @@ class Reconstructor:
         run.done.finish_cost.add(finished_s - solved_s)
         solve_s = solved_s - begin_s - run.refraction_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
-        if isinstance(run.refraction, Refraction):
-            self._wait_for_cylinder(run)
+        if task is not None and isinstance(run.refraction, Refraction):
+            self._wait_for_cylinder(run, task)
             seconds["cylinder"] = self.clock.now_s() - finished_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
@@ -282,36 +282,36 @@ class Reconstructor:
         frame = counts, dark, defects
         return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder)
 
-    def _estimate_refraction(self, run: "_Run", task: RefractionTask | None) -> None:
+    def _estimate_refraction(self, run: "_Run", task: RefractionTask | None) -> RefractionTask | None:
         """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
 
-        `task`: that of the frame, if it has begun.
+        `task`: that of the frame, if it has begun. Return the task, None without a refractor or without time.
         """
         begin_s = self.clock.now_s()
         if self.refractor is None:
-            return
+            return None
         cost_s = self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
         if run.fits(cost_s):
             with_cylinder = run.fits(cost_s + self._cylinder_s)
-            run.task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
-            assert run.task is not None
-            run.refraction = run.task.found()
-            self._find_cost.add(run.task.find_s)
+            task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
+            assert task is not None
+            run.refraction = task.found()
+            self._find_cost.add(task.find_s)
         self._refocus(run.selected_dpt)
         run.refraction_s = self.clock.now_s() - begin_s
+        return task
 
     @property
     def _cylinder_s(self) -> float:
         """Estimated duration of the search for a cylinder in seconds."""
         return max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
 
-    def _wait_for_cylinder(self, run: "_Run") -> None:
+    def _wait_for_cylinder(self, run: "_Run", task: RefractionTask) -> None:
         """Set the refraction of the run to that with its cylinder, if the deadline permits to wait for it."""
-        assert run.task is not None
-        if not run.task.is_done and not run.fits(self._cylinder_s):
+        if not task.is_done and not run.fits(self._cylinder_s):
             return
-        run.refraction = run.task.whole()
-        self._cylinder_cost.add(run.task.cylinder_s)
+        run.refraction = task.whole()
+        self._cylinder_cost.add(task.cylinder_s)
 
     def _refocus(self, m_dpt: float | None) -> None:
         """Set the OTF of the later stages to an eye with mean sphere `m_dpt`; None selects the stored PSF."""
@@ -389,7 +389,6 @@ class _Run:
         self.solved: _Solved | None = None  # None before the first stage
         self.rounds_done, self.stopped = 0, "done"
         self.refraction: Refraction | NoRefraction | None = None
-        self.task: RefractionTask | None = None
         self.refraction_s, self.between_s, self.psf_scale = 0.0, 0.0, 1.0
 
     @property

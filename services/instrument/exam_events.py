@@ -9,7 +9,7 @@ from device.recon.assessment.aiming import Aim
 from device.recon.assessment.frame_quality import Verdict
 from device.values import Image
 from services.imaging import picture_files
-from services.instrument.capture import QUICK_PX, ExposedCapture, Press, Preview
+from services.instrument.capture import QUICK_PX, Press, Preview
 from services.instrument.events import EventBus
 from services.instrument.exam_requests import ExamOutput, ExamRequests
 from services.instrument.progress import Progress, ProgressEstimate
@@ -48,24 +48,18 @@ class ExamEvents:
         """Publish the estimated progress of a capture within its stage."""
         self._event_bus.publish("stage", **stage_event(press, id, self._progress.estimate(id)))
 
-    def early_look(self, press: Press, id: str, look: Image, simulated: bool) -> None:
-        """Publish the quick look of a capture whose next frames are being exposed; it remains in its stage.
+    def quick_look(self, press: Press, id: str, look: Image, simulated: bool, *, is_exposing: bool = False) -> None:
+        """Publish the quick look of a capture in progress.
 
-        The thread of the preparation calls it, while the thread `head` exposes and publishes nothing.
+        With `is_exposing` it remains in its stage: the next frames are being exposed. The thread of the preparation
+        calls this then, while the thread `head` publishes nothing.
         """
-        self._event_bus.publish(
-            "stage", **stage_event(press, id, self._progress.estimate(id), self._show(id, look, simulated))
-        )
-
-    def quick_look(self, shot: ExposedCapture, image: Image) -> None:
-        """Publish the quick look of a capture whose frames are exposed."""
-        self.stage(shot.press, shot.id, "quick", self._show(shot.id, image, shot.frame.simulated))
-
-    def _show(self, id: str, look: Image, simulated: bool) -> str:
-        """Show a quick look, and return its URL."""
-        jpeg = picture_files.to_jpeg(look, QUICK_PX, simulated)
+        jpeg, url = picture_files.to_jpeg(look, QUICK_PX, simulated), f"/api/captures/{id}/quick.jpg"
         self._show_quick_looks({**self.output.quick_looks, id: jpeg})
-        return f"/api/captures/{id}/quick.jpg"
+        if is_exposing:
+            self._event_bus.publish("stage", **stage_event(press, id, self._progress.estimate(id), url))
+        else:
+            self.stage(press, id, "quick", url)
 
     def forget_quick_look(self, id: str) -> None:
         """Remove the quick look of a capture that is no longer in progress."""

@@ -141,7 +141,7 @@ class ExamLoop:
             colours=target.colours,
             field=target.field,
             taken=FrameSink(writer, shared, head.spec.light.colour),
-            looked=partial(self._events.early_look, press, id),
+            looked=partial(self._events.quick_look, press, id, is_exposing=True),
         )
         return replace(self._assessed(press, id, taken_at, exposure), written=writer.finish)
 
@@ -244,7 +244,7 @@ class ExamLoop:
         for step in self._pipeline.reconstruct(shot, budget_s):
             match step:
                 case StageResult(last=False):
-                    self._events.quick_look(shot, step.picture)
+                    self._events.quick_look(shot.press, shot.id, step.picture, shot.frame.simulated)
                 case RoundDone():
                     self._parts.watchdog.beat()
                     self._serve_between_rounds(shot)
@@ -276,7 +276,8 @@ class ExamLoop:
             shot = self._exposed.pop()
             with self._resolving(shot.press, shot.id, ExamEvent.FAILED):
                 with suppress(FrameError):  # its own reconstruction will report the error
-                    self._events.quick_look(shot, self._pipeline.quick_look(shot))
+                    look = self._pipeline.quick_look(shot)
+                    self._events.quick_look(shot.press, shot.id, look, shot.frame.simulated)
                 self._exposed.append(shot)
 
 

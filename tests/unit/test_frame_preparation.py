@@ -18,7 +18,7 @@ USELESS, FATAL = 0, 99  # numbers of frames that cannot be prepared, and that ra
 
 
 class Bench:
-    """Assessor and preparer of frames that are told apart by their first count, and what they were asked for."""
+    """Assessor and preparer of frames whose first count is their number, and what they were asked for."""
 
     def __init__(self) -> None:
         self.go = Event()
