@@ -73,14 +73,18 @@ class MovableClock(GateClock):
 
 
 class HoldingBus(PressHookBus):
-    """Event bus that holds a capture: `publish` does not return while `hold` is the stage that it has published."""
+    """Event bus that holds a capture: `publish` does not return while `hold` is the stage that it has published.
+
+    `look` is the quick look that is published while the next frames are exposed.
+    """
 
     hold: str | None = None
 
     def publish(self, kind: str, **data: Any) -> None:
         super().publish(kind, **data)
         if kind == "stage":
-            self.wait_while_held(str(data["stage"]))
+            is_look = data["stage"] == "expose" and data["url"] is not None
+            self.wait_while_held("look" if is_look else str(data["stage"]))
 
     def wait_while_held(self, stage: str) -> None:
         until(lambda: self.hold != stage, HELD_S)

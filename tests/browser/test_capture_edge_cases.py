@@ -39,6 +39,19 @@ def wait_for_verdict(page: Page) -> None:
     page.wait_for_selector("[data-phase=assessed], [data-phase=kept]")
 
 
+def test_the_eye_is_held_still_until_the_last_frame_also_with_a_quick_look(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    begin_visit(page, real)
+    real.hold = "look"
+    tap(page, f"{SHUTTER}[aria-disabled=false]")
+    page.wait_for_selector("[data-mark=quick]")
+    expect(page.locator(".prompt")).to_contain_text("Hold still")
+    expect(page.locator(SHUTTER)).to_contain_text("Hold still")
+    real.hold = None
+    wait_for_verdict(page)
+    expect(page.locator(".prompt")).not_to_contain_text("Hold still")
+
+
 def test_fast_tapping_keeps_every_picture(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     for _ in range(FAST):
