@@ -216,8 +216,8 @@ FRAMES ?= 60
 bench-refraction: .venv/ready ## Print error and coverage of the refraction on textbook frames; DATA=folder has photographs, FRAMES=60 of each sensor and field.
 	@$(BIN)/python -m tests.bench.refraction --data "$(DATA)" --frames $(FRAMES)
 
-bench-montage: .venv/ready ## Print the acceptance figures of the montage on photographs; DATA=folder has them.
-	@$(BIN)/python -m tests.bench.montage --data "$(DATA)"
+bench-montage: .venv/ready ## Print the acceptance figures of the montage on photographs; DATA=folder has them, FIELD_DEG=33.4 turns an eye.
+	@$(BIN)/python -m tests.bench.montage --data "$(DATA)" $(if $(FIELD_DEG),--field-deg $(FIELD_DEG))
 
 bench-sides: .venv/ready ## Print how often left and right eyes are told apart, and how often wrongly; DATA=folder has photographs.
 	@$(BIN)/python -m tests.bench.sides "$(DATA)"

@@ -195,11 +195,18 @@ def montage(
     picture: Annotated[list[Path], typer.Argument(help="Pictures of one eye in several gaze directions.")],
     output: Annotated[Path, typer.Option("--output", "-o", help=".npy or .tiff: linear float32; .png: for eyes.")],
     report: Annotated[Path | None, typer.Option(help="Where to write the place of each picture as JSON.")] = None,
+    head: Annotated[
+        Path | None, typer.Option(help="Head file of the pictures: joined on the sphere with its scale.")
+    ] = None,
 ) -> None:
-    """Join pictures of one eye to one larger picture, on the plane of the first; others are left out with a reason."""
-    joined = montage_files(picture, output, report, _progress)
+    """Join pictures of one eye to one larger picture around the first; others are left out with a reason.
+
+    Without a head file their scale in degrees is unknown, and they are joined on the plane; the report says so.
+    """
+    joined = montage_files(picture, output, report, _progress, head)
     rows, cols = joined.picture.shape[:2]
-    typer.echo(f"{output}: {sum(one.used for one in joined.placed)} of {len(picture)} pictures, {rows} x {cols} pixels")
+    used = sum(one.used for one in joined.placed)
+    typer.echo(f"{output}: {used} of {len(picture)} pictures on the {joined.projection}, {rows} x {cols} pixels")
     for line in placed_lines(joined, picture):
         _progress(line)
 

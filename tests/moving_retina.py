@@ -3,10 +3,14 @@
 from math import cos, radians, sin
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft, ndimage
+from scipy.spatial.transform import Rotation
 
 from device.recon.model.grid import disc
 from device.values import Calibration, Counts, Geometry, Image, Psf, Sensor
+
+Floats = NDArray[np.float64]
 
 SHAPE = (360, 480)
 FIELD_PX = 300
@@ -74,5 +78,39 @@ def gaze(retina: Image, shift_px: tuple[float, float], turn_deg: float = 0.0, se
     middle, source = (GAZE_SIZE - 1) / 2, (np.array(retina.shape) - 1) / 2
     offset = source - np.array(shift_px) - back @ np.array([middle, middle])
     seen = ndimage.affine_transform(retina, back, offset, (GAZE_SIZE, GAZE_SIZE), order=3)
+    seen = seen + NOISE * np.random.default_rng(seed).normal(size=seen.shape)
+    return np.asarray(seen * disc((GAZE_SIZE, GAZE_SIZE), (middle, middle), GAZE_FIELD_PX / 2), np.float32)
+
+
+def directions(places_px: Floats, px_per_deg: float) -> Floats:
+    """Return the unit vectors (n, 3) of places (n, 2) from the centre: angle and distance are proportional."""
+    angle = np.radians(np.linalg.norm(places_px, axis=1) / px_per_deg)
+    azimuth = np.arctan2(places_px[:, 1], places_px[:, 0])
+    return np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=1)
+
+
+def places(vectors: Floats, px_per_deg: float) -> Floats:
+    """Return the places (n, 2) of directions (n, 3)."""
+    away_px = np.degrees(np.arccos(np.clip(vectors[:, 2], -1, 1))) * px_per_deg
+    azimuth = np.arctan2(vectors[:, 1], vectors[:, 0])
+    return np.stack([away_px * np.cos(azimuth), away_px * np.sin(azimuth)], axis=1)
+
+
+def eye_turn(moved_px: Floats, turn_deg: float, px_per_deg: float) -> Rotation:
+    """Return the rotation of an eye that takes the centre straight to `moved_px` and then turns about the axis."""
+    down, right = np.radians(moved_px / px_per_deg)
+    # Rows, cols and axis are right-handed: a turn by +90 degrees about it takes rows (down) to cols (right), which is
+    # counter-clockwise as displayed.
+    return Rotation.from_rotvec([0.0, 0.0, np.radians(turn_deg)]) * Rotation.from_rotvec([-right, down, 0.0])
+
+
+def turned_gaze(retina: Image, shift_px: tuple[float, float], turn_deg: float, seed: int, px_per_deg: float) -> Image:
+    """Return a picture of an eye that has turned, for a retina that is linear in the angle from its middle."""
+    middle = (GAZE_SIZE - 1) / 2
+    here = np.indices((GAZE_SIZE, GAZE_SIZE)).reshape(2, -1).T - middle
+    eye = eye_turn(np.array(shift_px), turn_deg, px_per_deg)
+    there = places(eye.inv().apply(directions(here, px_per_deg)), px_per_deg)
+    at = there.T + (np.array(retina.shape)[:, None] - 1) / 2
+    seen = ndimage.map_coordinates(retina, at, order=3).reshape(GAZE_SIZE, GAZE_SIZE)
     seen = seen + NOISE * np.random.default_rng(seed).normal(size=seen.shape)
     return np.asarray(seen * disc((GAZE_SIZE, GAZE_SIZE), (middle, middle), GAZE_FIELD_PX / 2), np.float32)

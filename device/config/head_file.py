@@ -277,6 +277,11 @@ class InstrumentSpec(Table):
     sim: SimSpec | None = None
     replay: ReplaySpec | None = None
 
+    @property
+    def px_per_deg(self) -> float | None:
+        """Sensor pixels per degree of field at the eye; None without the table [optics]."""
+        return None if self.optics is None else self.optics.geometry(self.camera.pitch_um).px_per_deg
+
 
 class _LightTable(Table):
     """The table [light] of a head file as written, without its other tables."""

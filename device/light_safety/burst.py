@@ -8,6 +8,8 @@ from device.light_safety.guard import GuardedLight
 from device.ports import Camera, Light
 from device.values import EYES, Colour, ExposureSettings, Eye, Frame, Illumination
 
+ROUNDING_S = 1e-6  # of sums of durations
+
 
 def ignore_frame(_: Frame) -> None:
     """Do nothing with a frame that was taken."""
@@ -23,26 +25,32 @@ def burst(
     eyes: Sequence[Eye] = EYES,
     *,
     in_visit: bool = False,
+    parts: int = 1,
     taken: Callable[[Frame], None] = ignore_frame,
 ) -> tuple[Frame, ...]:
     """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
-    off. The dose counts for `eyes`, without a visit up to a lower limit. `taken` is called with each frame after its
-    read-out, while the lamp is on: it must return at once. Raises LightCut if the guard has ended the first exposure; a
-    frame that it ended later is left out. The lamp is dark at every exit.
+    off. With `parts` above 1 each of the `count` exposures is split into so many frames, and `shot` is one of them: the
+    lamp is then on no longer than for the whole exposures, each with the overhead of one frame, so that the last frames
+    may be missing. The dose counts for `eyes`, without a visit up to a lower limit. `taken` is called with each frame
+    after its read-out, while the lamp is on: it must return at once. Raises LightCut if the guard has ended the first
+    exposure; a frame that it ended later is left out. The lamp is dark at every exit.
     """
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):
         begin_s = last_s = clock.now_s()
-        longest_s = 0.0
-        while len(frames) < count and (not frames or last_s + longest_s - begin_s < light.max_on_s):
+        longest_s, most_s = 0.0, light.max_on_s
+        while len(frames) < count * parts and (not frames or last_s + longest_s - begin_s < most_s):
             frame = camera.expose(shot)
             if frames and frame.illumination is None:
                 break
             frames.append(require_lit(frame))
             taken(frame)
             longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
+            if parts > 1 and len(frames) == 1:
+                whole_s = (parts - 1) * shot.exposure_s + longest_s  # of an exposure, and its overhead
+                most_s = min(most_s, count * whole_s + ROUNDING_S)
     return tuple(frames)
 
 

@@ -1,13 +1,14 @@
-"""Montage: pictures of one eye in several gaze directions, placed on the plane of the first one.
+"""Montage: pictures of one eye in several gaze directions, joined to one picture in the projection of the first.
 
 Each picture is registered to those that are placed already (`estimation.masked_correlation`), and accepted only where
 the correlation is high, unambiguous and rests on a large enough overlap; else it stays apart, with the reason. Blended
-with weights that fall to 0 at the edge of each field. The plane is that of the first picture: no projection onto the
-sphere of the eye. NUMERICS.md 11.
+with weights that fall to 0 at the edge of each field. With a known scale in degrees a picture is placed by a rotation
+of the sphere of directions, else by a shift and a rotation of the plane (`model.field_projection`). NUMERICS.md 11.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,9 @@ from device.recon.estimation.masked_correlation import (
     MaskedCorrelator,
     Match,
     flatten,
-    rotation_matrix,
 )
 from device.recon.model.field_of_view import lit_field
+from device.recon.model.field_projection import STILL, WIDEST_DEG, FieldProjection, Motion, Plane, Sphere
 from device.recon.model.grid import Grid
 from device.recon.model.resampling import block_mean
 from device.values import Image, check_image_shape
@@ -33,6 +34,7 @@ FIELD_SAMPLES = 260  # across the field when registered: vessels stay resolved
 FEATHER_SHARE = 0.25  # of the field's radius over which a picture's weight rises from its edge
 RIM_PX = 3.0  # at the edge of a field, whose light falls off
 MOST_PICTURES, LEAST_PX = 64, 32
+ROUNDING_PX = 1e-6  # of a place that is a whole pixel
 
 Floats = NDArray[np.float64]
 
@@ -42,9 +44,9 @@ class Placement:
     """Place of one picture in a montage, relative to the first picture.
 
     What is at (r, c) of the first picture stands in this one at (r, c) + `shift_px`, turned about the picture's centre
-    by `rotation_deg`, counter-clockwise as displayed. `peak` is the normalised correlation with the picture to which it
-    was registered, `overlap` their common part as a share of the smaller field; both None for the first. `reason` says
-    why a picture is not used.
+    by `rotation_deg`, counter-clockwise as displayed; on the sphere exactly so at the centre only. `peak` is the
+    normalised correlation with the picture to which it was registered, `overlap` their common part as a share of the
+    smaller field; both None for the first. `reason` says why a picture is not used.
     """
 
     index: int
@@ -55,25 +57,44 @@ class Placement:
     overlap: float | None
     reason: str | None = None
 
+    @property
+    def motion(self) -> Motion:
+        """Motion from the first picture to this one, in pixels; only of a picture that is used."""
+        assert self.shift_px is not None
+        assert self.rotation_deg is not None
+        return Motion(self.shift_px, self.rotation_deg)
+
 
 @dataclass(frozen=True)
 class Montage:
     """Joined picture, linear (rows, cols) or (rows, cols, 3), and the place of each picture.
 
-    Pixel (0, 0) of the montage is at `origin_px` (rows, cols) of the first picture.
+    Pixel (0, 0) of the montage is at `origin_px` (rows, cols) of the first picture. `px_per_deg` is the scale with
+    which the pictures were placed on the sphere; None: on the plane.
     """
 
     picture: Image
     origin_px: tuple[int, int]
     placed: tuple[Placement, ...]
+    px_per_deg: float | None = None
+
+    @property
+    def projection(self) -> Literal["sphere", "plane"]:
+        """Name of the map between the pictures."""
+        return "plane" if self.px_per_deg is None else "sphere"
 
 
-def make_montage(pictures: Sequence[Image], progress: Callable[[int], None] = lambda _: None) -> Montage:
+def make_montage(
+    pictures: Sequence[Image], progress: Callable[[int], None] = lambda _: None, px_per_deg: float | None = None
+) -> Montage:
     """Return the montage of linear pictures (rows, cols) or (rows, cols, 3) of one size; FrameError otherwise.
 
     The first picture is always used; a montage of one is that picture. `progress` gets the number of placed pictures.
+    `px_per_deg`: pixels per degree of pictures that are linear in the field angle, FrameError if their corners are then
+    more than WIDEST_DEG from the centre; None if unknown: the pictures are joined on the plane.
     """
     _refuse_different(pictures)
+    _refuse_too_wide(pictures[0], px_per_deg)
     fields = [_field(one) for one in pictures]
     n = max(1, round(_diameter_px(fields) / FIELD_SAMPLES))
     box = _middle_box(fields)
@@ -81,24 +102,35 @@ def make_montage(pictures: Sequence[Image], progress: Callable[[int], None] = la
         flatten(block_mean(_grey(one)[box], n), block_mean(field[box], n))
         for one, field in zip(pictures, fields, strict=True)
     ]
-    placed = place(flats, n, progress)
+    placed = place(flats, n, progress, px_per_deg)
     used = [one for one in placed if one.used]
-    picture, origin_px = _blended({one.index: pictures[one.index] for one in used}, fields, used)
-    return Montage(picture, origin_px, tuple(placed))
+    picture, origin_px = _blended(
+        {one.index: pictures[one.index] for one in used}, fields, used, projection_of(px_per_deg)
+    )
+    return Montage(picture, origin_px, tuple(placed), px_per_deg)
 
 
-def place(flats: Sequence[FlatPicture], n: int, progress: Callable[[int], None] = lambda _: None) -> list[Placement]:
-    """Return the placement of each picture; `n` pixels per sample.
+def projection_of(per_deg: float | None) -> FieldProjection:
+    """Return the map between pictures with this scale, pixels or samples per degree; None: the plane."""
+    return Plane() if per_deg is None else Sphere(per_deg)
+
+
+def place(
+    flats: Sequence[FlatPicture], n: int, progress: Callable[[int], None] = lambda _: None,
+    px_per_deg: float | None = None,
+) -> list[Placement]:  # fmt: skip
+    """Return the placement of each picture; `n` pixels per sample, `px_per_deg` as in `make_montage`.
 
     The picture with the best match is placed first, and the rest are searched in it too, so that a picture that has
     nothing in common with the first can be placed by another one.
     """
-    placed = {0: Placement(0, True, (0.0, 0.0), 0.0, None, None)}
+    projection = projection_of(None if px_per_deg is None else px_per_deg / n)
+    placed = {0: Placement(0, True, STILL.shift, STILL.rotation_deg, None, None)}
     best: dict[int, tuple[Match, int]] = {}
     newest, waiting = 0, set(range(1, len(flats)))
     while waiting:
         progress(len(placed))
-        search = MaskedCorrelator(flats[newest])
+        search = MaskedCorrelator(flats[newest], projection)
         for k in waiting:
             match = search.find(flats[k])
             if k not in best or _rank(match) > _rank(best[k][0]):
@@ -108,7 +140,9 @@ def place(flats: Sequence[FlatPicture], n: int, progress: Callable[[int], None] 
             break
         newest = max(ready, key=lambda k: _rank(best[k][0]))
         match, target = best[newest]
-        placed[newest] = _composed(newest, match, placed[target], n)
+        found = Motion((match.shift[0] * n, match.shift[1] * n), match.rotation_deg)
+        whole = projection_of(px_per_deg).composed(placed[target].motion, found)
+        placed[newest] = Placement(newest, True, whole.shift, whole.rotation_deg, match.peak, match.overlap)
         waiting.remove(newest)
     for k in waiting:
         match, _ = best[k]
@@ -132,18 +166,6 @@ def _rank(match: Match) -> tuple[bool, float]:
     return refusal(match) is None, match.peak
 
 
-def _composed(index: int, match: Match, target: Placement, n: int) -> Placement:
-    """Return the placement relative to the first picture of a match with a picture that is placed.
-
-    p -> R2(R1(p + s1) + s2) = R2 R1 (p + s1 + R1^-1 s2).
-    """
-    assert target.shift_px is not None
-    assert target.rotation_deg is not None
-    own_px = rotation_matrix(-target.rotation_deg) @ (np.array(match.shift) * n)
-    shift_px = (target.shift_px[0] + float(own_px[0]), target.shift_px[1] + float(own_px[1]))
-    return Placement(index, True, shift_px, target.rotation_deg + match.rotation_deg, match.peak, match.overlap)
-
-
 def _refuse_different(pictures: Sequence[Image]) -> None:
     if not 0 < len(pictures) <= MOST_PICTURES:
         raise FrameError(f"a montage has 1 to {MOST_PICTURES} pictures, not {len(pictures)}", "Give fewer pictures.")
@@ -162,6 +184,18 @@ def _refuse_different(pictures: Sequence[Image]) -> None:
         raise FrameError("a picture holds values that are not numbers", "Reconstruct it again.")
     if not all(_grey(one).max() > 0 for one in pictures):
         raise FrameError("a picture is black", "Leave it out.")
+
+
+def _refuse_too_wide(first: Image, px_per_deg: float | None) -> None:
+    if px_per_deg is None:
+        return
+    half_px = float(np.hypot(*first.shape[:2])) / 2
+    if not px_per_deg * WIDEST_DEG >= half_px:
+        raise FrameError(
+            f"with {px_per_deg:.3g} pixels per degree the corners of a picture of {first.shape[0]} x {first.shape[1]} "
+            f"pixels are more than {WIDEST_DEG:g} degrees from its centre",
+            "Give the head file of the instrument that took the pictures.",
+        )
 
 
 def _grey(picture: Image) -> Image:
@@ -193,24 +227,23 @@ def _middle_box(fields: Sequence[Image]) -> tuple[slice, slice]:
 
 
 def _blended(
-    pictures: Mapping[int, Image], fields: Sequence[Image], used: Sequence[Placement]
+    pictures: Mapping[int, Image], fields: Sequence[Image], used: Sequence[Placement], projection: FieldProjection
 ) -> tuple[Image, tuple[int, int]]:
-    """Return the weighted mean of the pictures on the plane of the first, and its origin in pixels of the first."""
+    """Return the weighted mean of the pictures in the projection of the first, and its origin in pixels of that."""
     first = pictures[used[0].index]
-    rows, cols = first.shape[:2]
-    corners = np.array([[0, 0], [0, cols - 1], [rows - 1, 0], [rows - 1, cols - 1]], float)
-    middle = (np.array([rows, cols]) - 1) / 2
-    there = np.concatenate([_in_first(corners - middle, one) + middle for one in used])
-    low, high = np.floor(there.min(axis=0)).astype(int), np.ceil(there.max(axis=0)).astype(int)
-    size = tuple(int(one) for one in high - low + 1)
+    middle = (np.array(first.shape[:2]) - 1) / 2
+    border = _border(first.shape[:2]) - middle
+    there = np.concatenate([projection.moved_back(border, one.motion) + middle for one in used])
+    low = np.floor(there.min(axis=0) + ROUNDING_PX).astype(int)
+    high = np.ceil(there.max(axis=0) - ROUNDING_PX).astype(int)
+    size = int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1
+    places = np.moveaxis(np.indices(size, dtype=np.float64), 0, -1) + low - middle
     total = np.zeros((*size, *first.shape[2:]), np.float32)
     weights = np.zeros(size, np.float32)
     for one in used:
-        feather = _feather(fields[one.index])
-        turn = rotation_matrix(one.rotation_deg or 0.0)
-        offset = middle + turn @ (low - middle + np.array(one.shift_px))
-        weight = ndimage.affine_transform(feather, turn, offset, size, order=1)
-        moved = _resampled(pictures[one.index], turn, offset, size)
+        at = np.moveaxis(projection.moved(places, one.motion) + middle, -1, 0)
+        weight = ndimage.map_coordinates(_feather(fields[one.index]), at, order=1)
+        moved = _resampled(pictures[one.index], at)
         both = (weights > 0.1) & (weight > 0.1)
         gain = 1.0
         if both.any():  # the same retina in another exposure
@@ -225,10 +258,11 @@ def _blended(
     )  # fmt: skip
 
 
-def _in_first(points: Floats, placement: Placement) -> Floats:
-    """Return where points of a picture, from its centre, are in the first one: p = R^-1 q - shift."""
-    back = points @ rotation_matrix(-(placement.rotation_deg or 0.0)).T
-    return np.asarray(back - np.array(placement.shift_px))
+def _border(shape: tuple[int, ...]) -> Floats:
+    """Return the pixels (n, 2) along the four sides of a picture."""
+    outside = np.ones(shape, bool)
+    outside[1:-1, 1:-1] = False
+    return np.argwhere(outside).astype(np.float64)
 
 
 def _feather(field: Image) -> Image:
@@ -238,8 +272,8 @@ def _feather(field: Image) -> Image:
     return np.asarray(np.clip(depth / max(FEATHER_SHARE * float(depth.max()), 1.0), 0, 1), np.float32)
 
 
-def _resampled(picture: Image, turn: Floats, offset: Floats, size: tuple[int, ...]) -> Image:
-    """Return the picture on the plane of the first one by cubic interpolation, 0 outside."""
+def _resampled(picture: Image, at: Floats) -> Image:
+    """Return the picture at places (2, rows, cols) by cubic interpolation, 0 outside."""
     planes = [picture] if picture.ndim == 2 else [picture[..., c] for c in range(3)]
-    moved = [ndimage.affine_transform(one, turn, offset, size, order=3) for one in planes]
+    moved = [ndimage.map_coordinates(one, at, order=3) for one in planes]
     return np.asarray(moved[0] if len(moved) == 1 else np.stack(moved, axis=2), np.float32)

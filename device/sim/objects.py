@@ -12,6 +12,7 @@ from functools import partial
 from math import atan, ceil, degrees, floor, hypot
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from device.config.head_file import OpticsSpec
@@ -27,9 +28,12 @@ SignedDistance = Callable[
     [Image, Image], Image
 ]  # signed distance of (right, down) in um to a drawing; inside: negative
 
+Floats = NDArray[np.float64]
+
 SUBPIXELS = 3  # 3 x 3 samples per pixel for its covered area: the error of a disc's light is then 0.05 %
 MAX_ANGLE_RAD = 1.4  # no field is wider; keeps tan() finite in the corners
 TICK_UM, FIFTH_TICK_UM = 1500.0, 3000.0  # heights of a ruler's ticks and of every fifth tick
+SMALLEST_SINE = 1e-12  # keeps the quotient of angle and sine finite on the axis
 TOLERANCE_DEG = 0.05  # tolerance for an object that ends on the field's edge
 
 
@@ -38,13 +42,15 @@ def draw_object(
 ) -> Fundus:
     """Return the object of a scene in the middle of `shape` (rows, cols): reflectances in 0..1, zero outside the field.
 
-    The object is shifted by `at_deg` of the scene plus the eye's gaze and `turn_deg`. SpecError for a drawing that does
-    not fit into the field, or a photograph that cannot be read.
+    The object is shifted by `at_deg` of the scene plus the eye's gaze and `turn_deg`; a retina is shifted by `at_deg`
+    and turns with the eye as a sphere (OPTICS.md 3.9). SpecError for a drawing that does not fit into the field, or a
+    photograph that cannot be read.
     """
     what, gaze = scene.object, scene.eye.gaze_deg
-    at_deg = (what.at_deg[0] + gaze[0] + turn_deg[0], what.at_deg[1] + gaze[1] + turn_deg[1])
+    gaze_deg = (gaze[0] + turn_deg[0], gaze[1] + turn_deg[1])
+    at_deg = (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
     if what.kind in ("retina", "image"):
-        found = _shifted_picture(scene, optics, eye, shape, px_per_deg, at_deg)
+        found = _moved_picture(scene, optics, eye, shape, px_per_deg, gaze_deg)
         return found if what.cut_deg is None else _cut(found, what.cut_deg, px_per_deg)
     if what.kind == "chart":
         return _chart(scene.eye.focal_length_um, optics.field_deg, shape, px_per_deg, at_deg)
@@ -78,20 +84,21 @@ def height_um(angle_off_deg: float, focal_length_um: float) -> float:
     return float(focal_length_um * np.tan(np.radians(angle_off_deg)))
 
 
-def _shifted_picture(
-    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, at_deg: Pair
+def _moved_picture(
+    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, gaze_deg: Pair
 ) -> Fundus:
-    """Return a retina or photograph shifted by `at_deg` (right, down), cropped by the field, which stays centred."""
-    what = scene.object
-    if at_deg == (0.0, 0.0) and what.size_deg is None:
+    """Return a retina or photograph, shifted and turned (right, down), cropped by the field, which stays centred."""
+    what, is_retina = scene.object, scene.object.kind == "retina"
+    if what.at_deg == gaze_deg == (0.0, 0.0) and what.size_deg is None:
         return _picture(scene, eye, shape, px_per_deg, optics.field_deg)
-    wide_deg, beyond_deg = what.size_deg or optics.field_deg, hypot(*at_deg) if what.kind == "retina" else 0.0
+    turn_deg = gaze_deg if is_retina else (0.0, 0.0)
+    at_deg = what.at_deg if is_retina else (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
+    wide_deg, beyond_deg = what.size_deg or optics.field_deg, hypot(*at_deg) + hypot(*turn_deg) if is_retina else 0.0
     wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * beyond_deg)) + 4
     rows, cols = (max(wide + (wide - n) % 2, n) for n in shape)
     found = _picture(scene, eye, (rows, cols), px_per_deg, wide_deg, beyond_deg)
-    return _crop_to_field(
-        found, shape, px_per_deg * optics.field_deg / 2, (at_deg[1] * px_per_deg, at_deg[0] * px_per_deg)
-    )
+    move_px, turn_px = ((one[1] * px_per_deg, one[0] * px_per_deg) for one in (at_deg, turn_deg))
+    return _crop_to_field(found, shape, px_per_deg, optics.field_deg / 2, move_px, turn_px)
 
 
 def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float) -> Fundus:
@@ -133,23 +140,57 @@ def _picture(
     )  # fmt: skip
 
 
-def _crop_to_field(found: Fundus, shape: tuple[int, int], radius_px: float, move_px: Pair) -> Fundus:
-    """Return the middle of a larger picture, moved by `move_px` (down, right) and cropped to the round field."""
+def _crop_to_field(
+    found: Fundus, shape: tuple[int, int], px_per_deg: float, half_field_deg: float, move_px: Pair, turn_px: Pair
+) -> Fundus:
+    """Return the middle of a larger picture, shifted, turned (down, right) and cropped to the round field."""
+    radius_px = px_per_deg * half_field_deg
     edge, field = _soft_field(shape, radius_px), field_mask(shape, radius_px)
     size = found.field.shape
     first = [(n - want) // 2 for n, want in zip(size, shape, strict=True)]
     window = tuple(slice(a, a + want) for a, want in zip(first, shape, strict=True))
+    middle = (np.array(shape) - 1) / 2
+    if turn_px != (0.0, 0.0):
+        seen = turned_places(np.indices(shape) - middle[:, None, None], turn_px, px_per_deg, back=True)
+        at = seen + (np.array(size) - 1)[:, None, None] / 2 - np.array(move_px)[:, None, None]
 
-    def shifted(plane: Image) -> Image:
-        moved = plane if move_px == (0.0, 0.0) else ndimage.shift(plane, move_px, order=3)
-        return np.maximum(moved[window], 0)
+    def moved(plane: Image) -> Image:
+        if turn_px != (0.0, 0.0):
+            return np.maximum(ndimage.map_coordinates(plane, at, order=3), 0)
+        shifted = plane if move_px == (0.0, 0.0) else ndimage.shift(plane, move_px, order=3)
+        return np.maximum(shifted[window], 0)
 
     def place(position: Pair | None) -> Pair | None:
-        return None if position is None else (position[0] - first[0] + move_px[0], position[1] - first[1] + move_px[1])
+        if position is None:
+            return None
+        there = np.array(position) - (np.array(size) - 1) / 2 + np.array(move_px)
+        row, col = turned_places(there, turn_px, px_per_deg) + middle
+        return float(row), float(col)
 
-    planes = {colour: (shifted(plane) * edge).astype(np.float32) for colour, plane in found.reflectance.items()}
-    vessels = None if found.vessels is None else (shifted(found.vessels.astype(np.float32)) > 0.5) & field
+    planes = {colour: (moved(plane) * edge).astype(np.float32) for colour, plane in found.reflectance.items()}
+    vessels = None if found.vessels is None else (moved(found.vessels.astype(np.float32)) > 0.5) & field
     return Fundus(planes, field, vessels, place(found.disc), place(found.fovea))
+
+
+def turned_places(places: Floats, turn_px: Pair, px_per_deg: float, *, back: bool = False) -> Floats:
+    """Return where places (2, ...) from the centre stand after the eye has turned the centre to `turn_px`.
+
+    Rows and cols in pixels. The directions of the retina turn as a rigid body about the axis across the turn; `back`
+    inverts it. OPTICS.md 3.9.
+    """
+    length_px = hypot(*turn_px)
+    if length_px == 0:
+        return places
+    down, right = turn_px[0] / length_px, turn_px[1] / length_px
+    by = np.radians(length_px / px_per_deg) * (-1 if back else 1)
+    away_px = np.hypot(places[0], places[1])
+    angle = np.radians(away_px / px_per_deg)
+    shrunk = np.sinc(angle / np.pi) * np.radians(1 / px_per_deg)
+    along, across = shrunk * (down * places[0] + right * places[1]), shrunk * (down * places[1] - right * places[0])
+    along, axial = np.cos(by) * along + np.sin(by) * np.cos(angle), np.cos(by) * np.cos(angle) - np.sin(by) * along
+    sine = np.hypot(along, across)
+    stretch = px_per_deg * np.degrees(np.arctan2(sine, axial)) / np.maximum(sine, SMALLEST_SINE)
+    return np.stack([stretch * (down * along - right * across), stretch * (right * along + down * across)])
 
 
 def _cut(found: Fundus, cut_deg: Pair, px_per_deg: float) -> Fundus:

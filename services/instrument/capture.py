@@ -11,6 +11,7 @@ import numpy as np
 
 from device.light_safety.dose_report import DoseReport
 from device.recon.assessment.aiming import Aim
+from device.recon.assessment.exposure_split import ExposureSplit
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import PreparedFrame
@@ -101,6 +102,16 @@ class ExposedCapture:
     def frame(self) -> Frame:
         """The first lit frame: the reference of the burst, and the quick look."""
         return self.frames[0]
+
+
+def split_notes(split: ExposureSplit) -> tuple[str, ...]:
+    """Return the note of a report on split exposures, with the reason; none for whole ones."""
+    if split.parts == 1:
+        return ()
+    return (
+        f"each exposure was split into {split.parts} frames with the same light: the eye moved by "
+        f"{split.motion_deg:.2f} degrees during one (predicted gain {split.gain_db:.1f} dB)",
+    )
 
 
 class IdempotencyKeys:

@@ -18,6 +18,7 @@ from device.errors import DiffuscopeError, FrameError
 from device.head import Head
 from device.light_safety.burst import burst, require_lit
 from device.recon.assessment.aiming import Aim
+from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, choose_split
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
@@ -116,6 +117,9 @@ class FrameFeedback(Protocol):
     def aim(self, counts: Pixels, exposed_s: float) -> Aim:
         """Return the aiming hint after one more live frame."""
 
+    def speed_deg_per_s(self, now_s: float) -> float | None:
+        """Return the speed of the eye in the aiming stream; None if it is unknown."""
+
     def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on a raw frame."""
 
@@ -132,8 +136,8 @@ class Exposure:
 
     `dark` is None if an interrupted press has none. `begin_s` (clock seconds) and `duration_s` are those of all
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
-    picture, by its index; `missing` the reason of each other colour that was not taken; `ready` what was prepared of
-    the frames during the exposure, by their numbers.
+    picture, by its index; `missing` the reason of each other colour that was not taken; `split` how the exposures of
+    the lit frames were split; `ready` what was prepared of the frames during the exposure, by their numbers.
     """
 
     lit: tuple[Frame, ...]
@@ -144,6 +148,7 @@ class Exposure:
     dose_j_per_cm2: float
     unusable: Mapping[int, str] = field(default_factory=dict)
     missing: Mapping[Colour, str] = field(default_factory=dict)
+    split: ExposureSplit = WHOLE
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
 
 
@@ -192,6 +197,7 @@ class CapturePipeline:
     ) -> None:  # fmt: skip
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
         self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
+        self._light_e_per_um2_s: float | None = None  # of the last good frame
 
     def expose(
         self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
@@ -200,14 +206,17 @@ class CapturePipeline:
         """Return a dark frame, up to `count` lit ones and one in each of `colours`, as the function `expose`.
 
         A pipeline of bursts prepares each lit frame while the next one is exposed. `looked` is called in the thread of
-        the preparation, with the quick look of the first frame.
+        the preparation, with the quick look of the first frame. While the eye moves the exposures of the lit frames are
+        split, as `choose_split` decides from the speed of the eye in the aiming stream and the light of the last good
+        frame.
         """
-        count = count if self.bursts is not None else 1
+        count, split = (count, self._split(count)) if self.bursts is not None else (1, WHOLE)
         unable = self._unable(colours)
         able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
         run = partial(
-            expose, self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field
-        )
+            expose, self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field,
+            parts=split.parts,
+        )  # fmt: skip
         if self.bursts is None:
             exposure = run(taken=taken)
         else:
@@ -220,7 +229,11 @@ class CapturePipeline:
 
                 exposure = run(taken=read_out)
                 exposure = replace(exposure, ready=preparation.finish())
-        return replace(exposure, missing={**unable, **exposure.missing})
+        return replace(exposure, missing={**unable, **exposure.missing}, split=split)
+
+    def _split(self, count: int) -> ExposureSplit:
+        speed_deg_per_s = self._feedback.speed_deg_per_s(self._clock.now_s())
+        return choose_split(count, self._head.spec.camera.exposure_s, speed_deg_per_s, self._light_e_per_um2_s)
 
     def resume(self, taken: Exposure, colours: Sequence[Colour]) -> Exposure:
         """Return the frames of an interrupted press, with the reason of each of its `colours` that has none."""
@@ -245,6 +258,9 @@ class CapturePipeline:
         """
         verdicts = [self._verdict(frame, exposure) for frame in exposure.lit]
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
+        light_e_per_um2 = verdicts[best].numbers.get("light_e_per_um2")
+        if verdicts[best].word == "good" and light_e_per_um2 is not None:
+            self._light_e_per_um2_s = light_e_per_um2 / exposure.lit[best].exposure_s
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
         unusable = {
             place: f"{FRAME_QUALITY}: {verdicts[k].code}"
@@ -290,6 +306,8 @@ class CapturePipeline:
         if self.colours is None or not (shot.colours or shot.missing):
             return green
         colours = {colour: frame.counts for colour, frame in shot.colours.items()}
+        if shot.dark is not None and any(one.exposure_s > 1.5 * shot.dark.exposure_s for one in shot.colours.values()):
+            dark = None  # that of a split exposure has the dark current of a part, at most half of it
         return self.colours.steps(green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing)
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
@@ -367,26 +385,28 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
+    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame, parts: int = 1,
 ) -> Exposure:  # fmt: skip
     """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
 
-    The dose counts for `eyes`, without a visit up to a lower limit. There are fewer lit frames if the guard permits no
-    light for so long. A colour that cannot be taken is missing, with the reason; the lit frames are kept. `field`:
-    field of view of the programme, to which a simulated eye turns. `taken` is called with each frame after its
-    read-out and must return at once: the lamp may be on.
+    With `parts` above 1 each of the `count` exposures is split into so many frames of equal length, in the same light;
+    the dark frame is as long as a part, those in other colours are whole. The dose counts for `eyes`, without a visit
+    up to a lower limit. There are fewer lit frames if the guard permits no light for so long. A colour that cannot be
+    taken is missing, with the reason; the lit frames are kept. `field`: field of view of the programme, to which a
+    simulated eye turns. `taken` is called with each frame after its read-out and must return at once: the lamp may be
+    on.
 
-    Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not
-    or cannot be on. The lamp is off at every exit.
+    Raises the error of `Head.check` if a part of the head is not ready, LightLimit or LightFault if the lamp may not or
+    cannot be on. The lamp is off at every exit.
     """
     head.check()
-    run = _Exposing(head, eyes, clock, in_visit, taken)
+    run, part = _Exposing(head, eyes, clock, in_visit, taken), ExposureSettings(head.spec.camera.exposure_s / parts)
     announce_eye(head, eyes, field)
-    head.camera.prepare(run.shot)
+    head.camera.prepare(part)
     try:
-        dark = head.camera.expose(run.shot)  # first: a frame can be prepared as soon as it has been read out
+        dark = head.camera.expose(part)  # first: a frame can be prepared as soon as it has been read out
         run.report(dark)
-        lit = run.lit(Illumination(head.spec.light.colour), count)
+        lit = run.lit(Illumination(head.spec.light.colour), part, count, parts)
         others, missing = run.colours(colours)
         return Exposure(lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing)
     finally:
@@ -398,7 +418,6 @@ class _Exposing:
 
     def __init__(self, head: Head, eyes: tuple[Eye, ...], clock: Clock, in_visit: bool, taken: Taken) -> None:
         self._head, self._eyes, self._clock, self._in_visit, self._taken = head, eyes, clock, in_visit, taken
-        self.shot = ExposureSettings(head.spec.camera.exposure_s)
         self.begin_s, self.given_j_per_cm2 = clock.now_s(), 0.0  # of the stretches of light that are over
 
     @property
@@ -410,12 +429,13 @@ class _Exposing:
         """Report a frame after its read-out, with the dose until now."""
         self._taken(frame, self.given_j_per_cm2 + self._head.light.running_j_per_cm2, self.duration_s)
 
-    def lit(self, glow: Illumination, count: int) -> tuple[Frame, ...]:
-        """Return up to `count` frames in one light."""
+    def lit(self, glow: Illumination, shot: ExposureSettings, count: int = 1, parts: int = 1) -> tuple[Frame, ...]:
+        """Return up to `count` exposures in one light, each split into `parts` frames of `shot`."""
         camera, light = self._head.camera, self._head.light
         frames = burst(
-            camera, light, glow, self.shot, count, self._clock, self._eyes, in_visit=self._in_visit, taken=self.report
-        )
+            camera, light, glow, shot, count, self._clock, self._eyes, in_visit=self._in_visit, parts=parts,
+            taken=self.report,
+        )  # fmt: skip
         self.given_j_per_cm2 += light.given_j_per_cm2
         return frames
 
@@ -423,9 +443,12 @@ class _Exposing:
         """Return one frame in each of `colours`, and the reason of each that could not be taken."""
         taken: dict[Colour, Frame] = {}
         missing: dict[Colour, str] = {}
+        whole = ExposureSettings(self._head.spec.camera.exposure_s)
+        if colours:
+            self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
         for colour in colours:
             try:
-                (taken[colour],) = self.lit(Illumination(colour, self._head.light.hazard.highest_level(colour)), 1)
+                (taken[colour],) = self.lit(Illumination(colour, self._head.light.hazard.highest_level(colour)), whole)
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
                 missing[colour] = error.message

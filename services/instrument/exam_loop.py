@@ -23,7 +23,7 @@ from services.errors import Busy, RequestRefused
 from services.imaging.raw_metadata import RawMetadata
 from services.instrument.background import run_in_thread
 from services.instrument.calibration_monitor import CalibrationMonitor
-from services.instrument.capture import ExposedCapture, Press
+from services.instrument.capture import ExposedCapture, Press, split_notes
 from services.instrument.capture_pipeline import CapturePipeline, Exposure, prepared_frames
 from services.instrument.exam_events import ExamEvents
 from services.instrument.exam_requests import ExamRequests, ExamSnapshot
@@ -152,7 +152,7 @@ class ExamLoop:
         light = replace(self._parts.head.light.dose_report(), dose_j_per_cm2=exposure.dose_j_per_cm2)
         return ExposedCapture(
             press, id, taken_at, exposure.lit, exposure.dark, exposure.duration_s, light, verdict, exposure.unusable,
-            exposure.colours, exposure.missing, prepared=prepared_frames(exposure),
+            exposure.colours, exposure.missing, notes=split_notes(exposure.split), prepared=prepared_frames(exposure),
         )  # fmt: skip
 
     def _resume_oldest(self) -> None:

@@ -32,6 +32,10 @@ class FrameAssessor:
         """Return the aiming hint after one more live frame, exposed at `exposed_s` (clock seconds)."""
         return self._aimer(self._frame_assessor(counts), self._frame_assessor.picture, exposed_s)
 
+    def speed_deg_per_s(self, now_s: float) -> float | None:
+        """Return the speed of the eye between the last two live frames, deg/s; None if unknown or too old."""
+        return self._aimer.speed_deg_per_s(now_s)
+
     def assess(self, counts: Pixels, dark: Pixels | None, begin_s: float) -> Verdict:
         """Return the verdict on the raw frame of a capture before its reconstruction.
 

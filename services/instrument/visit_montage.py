@@ -45,10 +45,14 @@ class VisitPicture:
 
 @dataclass(frozen=True)
 class JoinedPictures:
-    """Places of pictures in their order, and the montage as PNG, None if fewer than two pictures were joined."""
+    """Places of pictures in their order, and the montage as PNG, None if fewer than two pictures were joined.
+
+    `projection`: "sphere", or "plane" if the scale of the pictures is unknown.
+    """
 
     placed: tuple[Placement, ...]
     png: bytes | None
+    projection: Literal["sphere", "plane"]
 
 
 @dataclass(frozen=True)
@@ -70,11 +74,11 @@ class MontageMaker:
     """Montages of a store, computed one after the other in a thread that ends when none is requested.
 
     The mutex `_lock` guards the waiting requests, the results and `_is_busy`; it is held over no computation.
-    `is_idle` returns whether background work may run.
+    `is_idle` returns whether background work may run. `px_per_deg`: scale of the head's pictures, None if unknown.
     """
 
-    def __init__(self, store: CaptureStore, is_idle: Callable[[], bool]) -> None:
-        self._store, self._is_idle = store, is_idle
+    def __init__(self, store: CaptureStore, is_idle: Callable[[], bool], px_per_deg: float | None) -> None:
+        self._store, self._is_idle, self._px_per_deg = store, is_idle, px_per_deg
         self._lock = Condition()
         self._waiting: OrderedDict[str, tuple[VisitPicture, ...]] = OrderedDict()
         self._kept: OrderedDict[str, JoinedPictures | DiffuscopeError] = OrderedDict()
@@ -157,7 +161,7 @@ class MontageMaker:
         content = [self._store.read(one.capture, PICTURE) for one in pictures]
         simulated = any(one.simulated for one in pictures)
         joined: JoinedPictures = run_in_subprocess(
-            join_pictures, content, simulated, report=lambda _: None, may_run=self._may_run
+            join_pictures, content, simulated, self._px_per_deg, report=lambda _: None, may_run=self._may_run
         )
         return joined
 
@@ -167,22 +171,26 @@ class MontageMaker:
         return self._is_idle()
 
 
-def join_pictures(content: Sequence[bytes], simulated: bool, progress: Callable[[int], None]) -> JoinedPictures:
+def join_pictures(
+    content: Sequence[bytes], simulated: bool, px_per_deg: float | None, progress: Callable[[int], None]
+) -> JoinedPictures:
     """Return the montage of stored pictures (PNG); `progress` gets the number of placed pictures.
+
+    `px_per_deg`: as in `make_montage`.
 
     Pictures of another size than the first one come from another calibration and stay apart. FrameError for a file that
     is no picture, or black. Numbers are rounded to what they mean: 0.1 pixels and degrees, 0.01 of peak and overlap.
     """
     pictures = [read_png(one) for one in content]
     fitting = [k for k, one in enumerate(pictures) if one.shape == pictures[0].shape]
-    joined = make_montage([pictures[k] for k in fitting], progress)
+    joined = make_montage([pictures[k] for k in fitting], progress, px_per_deg)
     placed = {k: replace(_rounded(one), index=k) for k, one in zip(fitting, joined.placed, strict=True)}
     for k in range(len(pictures)):
         if k not in placed:
             placed[k] = Placement(k, False, None, None, None, None, "it was taken with another calibration")
     is_joined = sum(one.used for one in placed.values()) > 1
     png = to_png(joined.picture, simulated, "montage") if is_joined else None
-    return JoinedPictures(tuple(placed[k] for k in range(len(pictures))), png)
+    return JoinedPictures(tuple(placed[k] for k in range(len(pictures))), png, joined.projection)
 
 
 def _rounded(one: Placement) -> Placement:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from device.config.head_file import load_head
 from device.config.image_files import is_marked_simulated, only_frame, read_image_file
-from device.errors import FrameError
+from device.errors import FrameError, SpecError
 from device.recon.montage import Montage, make_montage
 from device.values import Image
 from services.imaging.picture_files import from_srgb
@@ -16,23 +17,40 @@ from services.lab.reconstruct_file import refuse_output, refuse_overwriting, wri
 
 
 def montage_files(
-    pictures: Sequence[Path], output: Path, report: Path | None, progress: Callable[[str], None]
-) -> Montage:
+    pictures: Sequence[Path], output: Path, report: Path | None, progress: Callable[[str], None],
+    head: Path | None = None,
+) -> Montage:  # fmt: skip
     """Join picture files (.npy, .tiff or .png), write the montage and its report, and return it.
 
-    `progress` gets a line for each picture that is placed. FrameError for a file that is no picture, or for pictures of
-    different sizes; SettingError for an output that cannot be written or would replace a picture.
+    `progress` gets a line for each picture that is placed. `head` is the head file of the instrument that took them:
+    its scale in degrees places them on the sphere; None: on the plane. FrameError for a file that is no picture, or for
+    pictures of different sizes; SettingError for an output that cannot be written or would replace a picture; SpecError
+    for a wrong head file, or one without optics.
     """
     refuse_output(output)
     refuse_overwriting((output, report), pictures)
+    px_per_deg = None if head is None else _scale_px_per_deg(head)
     joined = make_montage(
-        [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed")
-    )
+        [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed"),
+        px_per_deg,
+    )  # fmt: skip
     write_picture(output, joined.picture, any(is_marked_simulated(path) for path in pictures))
     if report is not None:
-        text = json.dumps({"placed": [asdict(one) for one in joined.placed], "origin_px": joined.origin_px}, indent=1)
+        entries = {
+            "placed": [asdict(one) for one in joined.placed], "origin_px": joined.origin_px,
+            "projection": joined.projection, "px_per_deg": joined.px_per_deg,
+        }  # fmt: skip
+        text = json.dumps(entries, indent=1)
         write_or_raise(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
     return joined
+
+
+def _scale_px_per_deg(head: Path) -> float:
+    """Return the pixels per degree of a head's pictures; SpecError for a head file without optics."""
+    scale = load_head(head).px_per_deg
+    if scale is None:
+        raise SpecError(f"{head} has no table [optics], so the scale of its pictures is not known")
+    return scale
 
 
 def read_picture(path: Path) -> Image:

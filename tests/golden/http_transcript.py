@@ -188,14 +188,14 @@ def _montages(log: Transcript) -> None:
     picture, visit = f"{montage}/picture.png", send("POST", "/api/visits", json=log.key()).json()["id"]
     at = f"/api/visits/{visit}"
     send("PATCH", at, json=log.key(field="consent", value="agreed"))
-    for slot in ("R-centre", "R-nerve"):
-        assert send("POST", "/api/captures", json=log.key(eye="OD", visit=visit, slot=slot)).status_code == 201
-    log.ask(montage, f"{at}/montage/OS", note="no picture of this eye")
-    log.ask(picture, f"{at}/montage/OS/picture.png")
-    until(lambda: send("GET", f"{at}/montage/OD").json()["state"] != "computing")
-    log.ask(montage, f"{at}/montage/OD")
-    log.ask(picture, f"{at}/montage/OD/picture.png", racing=("size",), note="its size follows the measured shift")
-    log.ask(montage, f"/api/visits/{UNKNOWN_VISIT}/montage/OD")
+    for slot in ("L-centre", "L-nerve"):
+        assert send("POST", "/api/captures", json=log.key(eye="OS", visit=visit, slot=slot)).status_code == 201
+    log.ask(montage, f"{at}/montage/OD", note="no picture of this eye")
+    log.ask(picture, f"{at}/montage/OD/picture.png")
+    until(lambda: send("GET", f"{at}/montage/OS").json()["state"] != "computing")
+    log.ask(montage, f"{at}/montage/OS")
+    log.ask(picture, f"{at}/montage/OS/picture.png", racing=("size",), note="its size follows the measured shift")
+    log.ask(montage, f"/api/visits/{UNKNOWN_VISIT}/montage/OS")
     log.ask(montage, f"{at}/montage/left")
 
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from services.imaging.picture_files import to_png
 from services.lab.montage_files import read_picture
@@ -17,12 +18,18 @@ def test_two_pictures_are_joined_and_their_places_reported(tmp_path: Path) -> No
     words = ["montage", str(tmp_path / "a.npy"), str(tmp_path / "b.npy")]
     done = call([*words, "-o", str(tmp_path / "out.tiff"), "--report", str(tmp_path / "r.json")])
     assert done.code == 0, done.err
-    assert "2 of 2 pictures" in done.out
-    first, second = json.loads((tmp_path / "r.json").read_text())["placed"]
+    assert "2 of 2 pictures on the plane" in done.out
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert (report["projection"], report["px_per_deg"]) == ("plane", None), "the scale of the pictures is unknown"
+    first, second = report["placed"]
     assert set(first) == {"index", "used", "shift_px", "rotation_deg", "peak", "overlap", "reason"}
     assert (first["shift_px"], first["rotation_deg"], first["used"]) == ([0, 0], 0, True)
     assert np.allclose(second["shift_px"], (60, -20), atol=0.6)  # as in the unit test
     assert call([*words, "-o", str(tmp_path / "out.png")]).code == 0
+    head = str(Path("hardware/heads/paper.toml"))
+    done = call([*words, "-o", str(tmp_path / "out.npy"), "--head", head, "--report", str(tmp_path / "r.json")])
+    assert "2 of 2 pictures on the sphere" in done.out, done.err
+    assert json.loads((tmp_path / "r.json").read_text())["px_per_deg"] == pytest.approx(15.583, abs=1e-3)  # the paper's
 
 
 def test_a_png_is_read_as_the_light_that_it_shows(tmp_path: Path) -> None:

@@ -62,6 +62,7 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     right_px, down_px = (turn * eye_rig.world.geometry.px_per_deg for turn in FIXATION_DEG["nerve"])
     assert placed["shift_px"] == pytest.approx([down_px, right_px], abs=0.6)  # what a montage may be off by
     assert abs(placed["rotation_deg"]) < 0.5
+    assert joined["projection"] == "sphere"
     content = eye_rig.request("GET", picture)
     assert content.headers["content-type"] == "image/png"
     with Pillow.open(BytesIO(content.content)) as image:
@@ -98,7 +99,7 @@ def test_pictures_that_do_not_fit_stay_apart_with_the_reason(simulated: bool) ->
     other = np.asarray(OTHER_RETINA[:400, :400], np.float32)
     first, second = (to_png(gaze(retina, (0, 0)), simulated) for retina in (WIDE_RETINA, other))
     smaller = to_png(gaze(WIDE_RETINA, (0, 0))[2:], simulated)
-    made = join_pictures([first, second, smaller], simulated, nothing)
+    made = join_pictures([first, second, smaller], simulated, None, nothing)
     assert made.png is None
     assert [one.used for one in made.placed] == [True, False, False]
     assert "no picture shows the same part" in (made.placed[1].reason or "")
@@ -107,7 +108,7 @@ def test_pictures_that_do_not_fit_stay_apart_with_the_reason(simulated: bool) ->
 
 def test_stored_pictures_are_joined_as_the_light_that_they_show() -> None:
     first, second = (gaze(WIDE_RETINA, shift, 0, 1) for shift in ((0, 0), (-20, 84)))
-    made = join_pictures([to_png(first, True), to_png(second, True)], True, nothing)
+    made = join_pictures([to_png(first, True), to_png(second, True)], True, None, nothing)
     assert made.placed[1].shift_px == pytest.approx((-20, 84), abs=0.6)
     assert made.png is not None
     light = read_png(made.png)
@@ -118,4 +119,4 @@ def test_data_that_are_no_picture_are_refused() -> None:
     good = to_png(gaze(WIDE_RETINA, (0, 0)), False)
     for broken in (b"", b"no picture", good[: len(good) // 2]):
         with pytest.raises(DiffuscopeError, match="not a whole PNG"):
-            join_pictures([good, broken], False, nothing)
+            join_pictures([good, broken], False, None, nothing)

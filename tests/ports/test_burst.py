@@ -36,6 +36,37 @@ def test_a_burst_ends_before_the_guard_would_end_it():
     assert light.illumination is None
 
 
+class SlowCamera:
+    """Camera that takes longer for a frame than its exposure."""
+
+    def __init__(self, camera, clock, overhead_s):
+        self.camera, self.clock, self.overhead_s = camera, clock, overhead_s
+
+    def expose(self, shot):
+        self.clock.sleep(self.overhead_s)
+        return self.camera.expose(shot)
+
+
+@pytest.mark.parametrize("overhead_s", [0.0, 0.004, 0.05])
+@pytest.mark.parametrize(("count", "parts"), [(1, 8), (2, 3), (4, 2)])
+def test_split_exposures_have_no_more_light_than_whole_ones(overhead_s, count, parts):
+    lit_s, exposed_s = [], []
+    for number in (1, parts):
+        rig = guarded_rig()
+        light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock))
+        camera, shot = SlowCamera(rig.camera, rig.clock, overhead_s), ExposureSettings(0.1 / number)
+        begin_s = rig.clock.now_s()
+        frames = burst(camera, light, Illumination("green"), shot, count, rig.clock, parts=number)
+        lit_s.append(rig.clock.now_s() - begin_s)
+        exposed_s.append(sum(frame.exposure_s for frame in frames))
+        assert light.given_j_per_cm2 == pytest.approx(light.hazard.dose_j_per_cm2(Illumination("green"), lit_s[-1]))
+        assert light.illumination is None
+    assert lit_s[1] <= lit_s[0] + 1e-5, "the dose grows"  # rounding
+    assert exposed_s[1] <= exposed_s[0] + 1e-9
+    if overhead_s == 0:
+        assert exposed_s[1] == pytest.approx(exposed_s[0]), "a camera without overhead loses no light"
+
+
 class UnpluggedCamera:
     """Camera that is unplugged after its first exposure."""
 

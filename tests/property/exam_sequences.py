@@ -237,6 +237,9 @@ class PlainFeedback:
     def aim(self, counts: Pixels, exposed_s: float) -> Aim:
         return NO_AIM
 
+    def speed_deg_per_s(self, now_s: float) -> float | None:
+        return None
+
     def assess(self, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
         return Verdict("good", None, {})
 

@@ -1,6 +1,6 @@
 """Capture pipeline by itself, in virtual time: exposure, verdict, steps of the reconstruction, record, live picture."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +14,15 @@ from device.errors import CameraMissing, CameraStalled, LightFault
 from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
+from device.recon.assessment.frame_quality import Verdict
+from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import RoundDone, StageResult, Step
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Colour, ExposureSettings, Frame, Illumination, Reconstruction
-from services.instrument.capture import ExposedCapture, Press
+from services.instrument.capture import ExposedCapture, Press, split_notes
 from services.instrument.capture_pipeline import NO_PSF, CapturePipeline, expose
 from services.records.capture_target import CaptureTarget
 from tests.journey.conftest import SMALL_HEAD
@@ -139,6 +141,49 @@ class NoColours:
 
     def steps(self, green: Iterator[Step], *_: object, **__: object) -> Iterator[Step]:
         return green
+
+
+class RedOnly(NoColours):
+    """Reconstruction of red light."""
+
+    others = ("red",)
+
+
+class NoBursts:
+    """Reconstruction of bursts, which is not reached."""
+
+    def steps(self, frames: Sequence[Pixels], *_: object, **__: object) -> Iterator[Step]:
+        raise AssertionError("no burst is reconstructed here")
+
+
+class MovingEye(PlainFeedback):
+    """Feedback on an eye that moves by 10 degrees per second in enough light for a split."""
+
+    def speed_deg_per_s(self, now_s: float) -> float | None:
+        return 10.0
+
+    def assess(self, counts: Pixels, dark: Pixels, begin_s: float) -> Verdict:
+        return Verdict("good", None, {"light_e_per_um2": 200.0})
+
+
+def test_exposures_are_split_while_the_eye_moves_and_the_report_says_why(bench: Bench) -> None:
+    pipeline = CapturePipeline(
+        bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, MovingEye(), bursts=NoBursts(),
+        colours=RedOnly(),
+    )  # fmt: skip
+    first = pipeline.expose("OD", count=1, colours=["red"])
+    assert [len(first.lit), split_notes(first.split)] == [1, ()], "the light of this eye is not known yet"
+    pipeline.assess(first)
+    second = pipeline.expose("OD", count=1, colours=["red"])
+    assert len(second.lit) == second.split.parts > 1
+    exposure_s = bench.head.spec.camera.exposure_s
+    assert sum(frame.exposure_s for frame in second.lit) == pytest.approx(exposure_s)
+    assert second.dose_j_per_cm2 == pytest.approx(first.dose_j_per_cm2, rel=1e-6), "the same light"
+    assert second.dark.exposure_s == second.lit[0].exposure_s, "dark current of a part"
+    assert second.colours["red"].exposure_s == exposure_s
+    (note,) = split_notes(second.split)
+    assert f"split into {len(second.lit)} frames" in note
+    assert f"{10 * exposure_s:.2f} degrees" in note
 
 
 class FailsInRed:

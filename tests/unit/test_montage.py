@@ -6,8 +6,21 @@ from scipy import ndimage
 
 from device.errors import FrameError
 from device.recon.estimation.masked_correlation import Match
+from device.recon.model.field_projection import Motion, Plane, Sphere
 from device.recon.montage import make_montage, refusal
-from tests.moving_retina import GAZE_FIELD_PX, GAZE_SIZE, OTHER_RETINA, WIDE_RETINA, gaze
+from tests.moving_retina import (
+    GAZE_FIELD_PX,
+    GAZE_SIZE,
+    OTHER_RETINA,
+    WIDE_RETINA,
+    directions,
+    eye_turn,
+    gaze,
+    places,
+    turned_gaze,
+)
+
+PX_PER_DEG = GAZE_FIELD_PX / 45
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 3.0, -4.5])
@@ -23,6 +36,82 @@ def test_shift_and_rotation_are_found(shift_px: tuple[float, float], turn_deg: f
     distance = np.hypot(*shift_px) / GAZE_FIELD_PX
     overlap = 2 / np.pi * (np.arccos(distance) - distance * np.sqrt(1 - distance**2))
     assert found.overlap == pytest.approx(overlap, abs=0.05)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, -3.0])
+@pytest.mark.parametrize("shift_px", [(-20.5, 84.3), (110.0, -40.0)])  # turns of 20 and 26 degrees
+def test_turns_of_an_eye_are_found_on_the_sphere(shift_px: tuple[float, float], turn_deg: float) -> None:
+    pictures = [
+        turned_gaze(WIDE_RETINA, (0, 0), 0, 0, PX_PER_DEG),
+        turned_gaze(WIDE_RETINA, shift_px, turn_deg, 1, PX_PER_DEG),
+    ]
+    errors_px = []
+    for scale in (None, PX_PER_DEG):
+        joined = make_montage(pictures, px_per_deg=scale)
+        found = joined.placed[1]
+        assert found.used, found.reason
+        assert joined.projection == ("plane" if scale is None else "sphere")
+        errors_px.append(np.hypot(*np.subtract(found.shift_px, shift_px)))
+    assert found.shift_px == pytest.approx(shift_px, abs=0.6)  # what a montage may be off by (half a vessel)
+    assert found.rotation_deg == pytest.approx(turn_deg, abs=0.3)
+    assert errors_px[1] < errors_px[0]
+
+
+def test_the_montage_of_a_turned_eye_shows_its_retina() -> None:
+    pictures = [turned_gaze(WIDE_RETINA, shift, 0, k, PX_PER_DEG) for k, shift in enumerate([(0, 0), (10, 80)])]
+    agreement = []
+    for scale in (None, PX_PER_DEG):
+        joined = make_montage(pictures, px_per_deg=scale)
+        rows, cols = joined.picture.shape
+        middle = (np.array(WIDE_RETINA.shape) - 1) / 2 - (GAZE_SIZE - 1) / 2 + np.array(joined.origin_px)
+        truth = ndimage.affine_transform(WIDE_RETINA, np.eye(2), middle, (rows, cols), order=3)
+        # the part that only the second picture shows: the first one is its own truth
+        lit = ndimage.binary_erosion(joined.picture > 0.2, iterations=6)
+        lit[:, -joined.origin_px[1] + (GAZE_SIZE - GAZE_FIELD_PX) // 2 :] = False
+        assert lit.sum() > 5000
+        agreement.append(np.corrcoef(joined.picture[lit], truth[lit])[0, 1])
+    assert agreement[1] > 0.95
+    assert agreement[1] > agreement[0]
+
+
+def test_three_turns_about_different_axes_are_composed_as_rotations() -> None:
+    """Two turns about different axes are a turn with a torsion of its own, which shifts of a plane do not have."""
+    steps = [(0.0, 0.0), (75.0, 20.0), (40.0, 110.0)]
+    placed = make_montage(
+        [turned_gaze(WIDE_RETINA, step, 0, k, PX_PER_DEG) for k, step in enumerate(steps)], px_per_deg=PX_PER_DEG
+    ).placed
+    assert all(one.used for one in placed)
+    assert placed[2].shift_px == pytest.approx(steps[2], abs=1.2)  # twice the error of one step
+    assert placed[2].rotation_deg == pytest.approx(0, abs=0.6)
+
+
+def test_a_composed_motion_moves_places_as_both_motions_do() -> None:
+    here = np.random.default_rng(3).uniform(-100, 100, (40, 2))
+    first, then = ((30.0, -80.0), 3.0), ((-55.0, -20.0), -4.0)
+    sphere = Sphere(PX_PER_DEG)
+    true = here
+    for shift_px, turn_deg in (first, then):
+        turn = eye_turn(np.array(shift_px), turn_deg, PX_PER_DEG)
+        true = places(turn.apply(directions(true, PX_PER_DEG)), PX_PER_DEG)
+    both = sphere.composed(Motion(*first), Motion(*then))
+    assert sphere.moved(here, both) == pytest.approx(true, abs=1e-6)
+    assert sphere.moved_back(true, both) == pytest.approx(here, abs=1e-6)
+
+
+def test_the_sphere_of_a_small_field_is_the_plane() -> None:
+    here, motion = np.array([[0.0, 0.0], [90.0, -40.0], [-15.0, 70.0]]), Motion((30.0, -80.0), 3.0)
+    then = Motion((-10.0, 5.0), -2.0)
+    plane, sphere = Plane(), Sphere(1e5)  # a picture of 0.002 degrees
+    assert sphere.moved(here, motion) == pytest.approx(plane.moved(here, motion), abs=1e-6)
+    assert plane.moved_back(plane.moved(here, motion), motion) == pytest.approx(here)
+    both, flat = (one.composed(motion, then) for one in (sphere, plane))
+    assert both.shift == pytest.approx(flat.shift, abs=1e-6)
+    assert both.rotation_deg == pytest.approx(flat.rotation_deg, abs=1e-6)
+
+
+def test_a_scale_that_makes_a_picture_wider_than_half_a_sphere_is_refused() -> None:
+    with pytest.raises(FrameError, match="more than 90 degrees from its centre"):
+        make_montage([gaze(WIDE_RETINA, (0, 0))], px_per_deg=1.5)
 
 
 def test_the_montage_shows_the_retina_of_all_pictures_on_the_plane_of_the_first() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image as Pictures
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from device.config.head_file import OpticsSpec
 from device.config.scene import EyeSpec, ObjectSpec, SimSpec
@@ -124,20 +125,31 @@ def test_shifted_photograph_is_dark_outside_its_edge(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("eye", ["OD", "OS"])
-def test_a_turned_eye_shows_the_same_retina_and_what_is_beyond_its_field(eye) -> None:
+def test_a_turned_eye_shows_the_same_retina_as_a_sphere_and_what_is_beyond_its_field(eye) -> None:
     sim, lens = SimSpec(object=ObjectSpec(kind="retina", haemorrhages=2)), optics(33.4)
-    turn_px = (5, -31)  # rows, columns: whole pixels, so that both are the same without interpolation
-    turn_deg = (turn_px[1] / PX_PER_DEG, turn_px[0] / PX_PER_DEG)
+    down_deg, right_deg = 0.6, -8.0
     straight = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG)
-    turned = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG, turn_deg)
-    moved = np.roll(straight.reflectance["green"], turn_px, axis=(0, 1))
-    both = ndimage.binary_erosion((moved > 0) & (turned.reflectance["green"] > 0), iterations=6)
+    turned = draw_object(sim, lens, eye, (300, 301), PX_PER_DEG, (right_deg, down_deg))
+    back = Rotation.from_rotvec([right_deg, -down_deg, 0.0], degrees=True)  # (down, right, axis), the turn inverted
+    middle = (np.array(straight.field.shape) - 1) / 2
+    angles = np.radians((np.indices(straight.field.shape).reshape(2, -1).T - middle) / PX_PER_DEG)
+    away = np.linalg.norm(angles, axis=1, keepdims=True)
+    seen_from = back.apply(np.hstack([np.sin(away) * angles / away.clip(1e-9), np.cos(away)]))
+    azimuth = np.arctan2(seen_from[:, 1], seen_from[:, 0])
+    radius_px = np.degrees(np.arccos(seen_from[:, 2])) * PX_PER_DEG
+    at = middle[:, None] + radius_px * np.stack([np.cos(azimuth), np.sin(azimuth)])
+    moved = ndimage.map_coordinates(straight.reflectance["green"], at, order=3).reshape(straight.field.shape)
+    whole = ndimage.map_coordinates(straight.field.astype(float), at, order=1).reshape(straight.field.shape) > 0.99
+    both = ndimage.binary_erosion(whole & turned.field, iterations=6)
     assert both.sum() > 0.6 * straight.field.sum()
     # the ends of vessels at the edge of the field of the straight view are continued, which changes their taper
     assert np.quantile(np.abs(moved - turned.reflectance["green"])[both] / moved[both], 0.99) < 0.01
     assert (turned.reflectance["green"] > 0).sum() == (straight.reflectance["green"] > 0).sum()
     assert straight.disc is not None
-    assert turned.disc == pytest.approx((straight.disc[0] + turn_px[0], straight.disc[1] + turn_px[1]))
+    assert turned.disc is not None
+    near = np.hypot(at[0] - straight.disc[0], at[1] - straight.disc[1]).argmin()
+    found = np.unravel_index(near, straight.field.shape)  # the pixel that shows the disc's middle
+    assert turned.disc == pytest.approx(found, abs=0.8)  # half the diagonal of a pixel
 
 
 def test_cut_retina_is_dark_above_and_below_and_unchanged_inside() -> None:

@@ -40,6 +40,7 @@ class AimingGuide:
         self._most_deg_per_s, self._deg_per_sample = MOST_DEG_PER_SHOT / shot_s, deg_per_sample
         self._before: Image | None = None
         self._before_s = self._since_s = float("-inf")
+        self._moved_deg_per_s: float | None = None
         self.aim = Aim("noeye", 0.0)
 
     def __call__(self, reading: FrameFigures, picture: Image | None, now_s: float) -> Aim:
@@ -48,7 +49,8 @@ class AimingGuide:
         The code changes at most once in MIN_DISPLAY_S. `reading` holds the figures of the frame, `picture` is its
         coarse picture, None without a known field.
         """
-        code = _instruction(reading, self._speed_deg_per_s(reading, picture, now_s) > self._most_deg_per_s)
+        self._moved_deg_per_s = self._speed_between_deg_per_s(reading, picture, now_s)
+        code = _instruction(reading, (self._moved_deg_per_s or 0.0) > self._most_deg_per_s)
         fill = 0.0 if code == "noeye" else min(max(reading.coverage or 0.0, 0.0), 1.0)
         if code != self.aim.code and now_s - self._since_s < MIN_DISPLAY_S:
             code = self.aim.code
@@ -61,14 +63,21 @@ class AimingGuide:
         """Return True if the last live frame showed an eye, and is less than MAX_FRAME_GAP_S before `now_s`."""
         return self._before is not None and now_s - self._before_s < MAX_FRAME_GAP_S
 
-    def _speed_deg_per_s(self, reading: FrameFigures, picture: Image | None, now_s: float) -> float:
-        """Return the speed of the picture in degrees per second since the previous frame; 0 if unknown."""
+    def speed_deg_per_s(self, now_s: float) -> float | None:
+        """Return the speed of the picture between the last two live frames, degrees per second.
+
+        None if it is unknown, or the last live frame is MAX_FRAME_GAP_S or more before `now_s`.
+        """
+        return self._moved_deg_per_s if self.eye_was_visible(now_s) else None
+
+    def _speed_between_deg_per_s(self, reading: FrameFigures, picture: Image | None, now_s: float) -> float | None:
+        """Return the speed of the picture in degrees per second since the previous frame; None if unknown."""
         before, before_s = self._before, self._before_s
         is_eye = picture is not None and reading.through is not None and reading.through >= LEAST_THROUGH
         self._before, self._before_s = (picture.copy() if picture is not None and is_eye else None), now_s
         step_s = now_s - before_s
         if before is None or self._before is None or self._deg_per_sample is None or not 0 < step_s < MAX_FRAME_GAP_S:
-            return 0.0
+            return None
         return moved_samples(before, self._before) * self._deg_per_sample / step_s
 
 
@@ -105,8 +114,19 @@ def moved_samples(before: Image, now: Image) -> float:
     cycles = np.hypot(np.fft.fftfreq(rows, 1 / rows)[:, None], np.fft.rfftfreq(cols, 1 / cols)[None])
     band = (cycles > VESSELS[0]) & (cycles < VESSELS[1])
     cross = np.fft.rfft2(_detail(before)) * np.conj(np.fft.rfft2(_detail(now))) * band
-    row, col = np.unravel_index(int(np.argmax(np.fft.irfft2(cross, before.shape))), before.shape)
-    return hypot(min(row, rows - row), min(col, cols - col))
+    surface = np.fft.irfft2(cross, before.shape)
+    row, col = (int(at) for at in np.unravel_index(int(np.argmax(surface)), before.shape))
+    down = _top(surface[(row - 1) % rows, col], surface[row, col], surface[(row + 1) % rows, col])
+    right = _top(surface[row, (col - 1) % cols], surface[row, col], surface[row, (col + 1) % cols])
+    return hypot(
+        row + down if row < rows / 2 else rows - row - down, col + right if col < cols / 2 else cols - col - right
+    )
+
+
+def _top(before: float, peak: float, after: float) -> float:
+    """Return where the parabola through a maximum and its neighbours has its top, -0.5 to 0.5 samples."""
+    curve = before - 2 * peak + after
+    return float(np.clip(0.5 * (before - after) / curve, -0.5, 0.5)) if curve < 0 else 0.0
 
 
 def _detail(picture: Image) -> Image:

@@ -6,12 +6,12 @@ correlations of pictures and masks (D. Padfield, IEEE Transactions on Image Proc
 """
 
 from dataclasses import dataclass, replace
-from math import cos, degrees, radians, sin
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from device.recon.model.field_projection import FieldProjection, Motion, Plane
 from device.values import Image
 
 FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of the smoothing against noise
@@ -21,6 +21,7 @@ SECOND_SAMPLES = 8  # distance from the peak at which another one begins
 SECOND_OVERLAP = 0.2  # of another place, as much as a picture needs to be placed
 ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search: at most 1 degree off (NUMERICS.md 11)
 REFINEMENTS = 8  # of shift and rotation; they converge in three or four
+MOST_STEP_DEG = 1.7  # of one of them
 
 Floats = NDArray[np.float64]
 
@@ -29,9 +30,10 @@ Floats = NDArray[np.float64]
 class Match:
     """Best shift and rotation of a picture against a reference, in samples and degrees.
 
-    What is at p in the reference stands at R(p + shift) in the picture, both from the centre; R turns by `rotation_deg`
-    counter-clockwise as displayed. `peak` is the normalised correlation, -1 to 1, `second` the highest one elsewhere,
-    `overlap` the common part of both fields as a share of the smaller one.
+    What is at p in the reference stands in the picture where `field_projection` moves it: on the plane at R(p + shift),
+    both from the centre; R turns by `rotation_deg` counter-clockwise as displayed. `peak` is the normalised
+    correlation, -1 to 1, `second` the highest one elsewhere, `overlap` the common part of both fields as a share of the
+    smaller one.
     """
 
     shift: tuple[float, float]
@@ -61,10 +63,13 @@ def flatten(picture: Image, field: Image) -> FlatPicture:
 
 
 class MaskedCorrelator:
-    """Search for other pictures in one reference; the spectra of the reference are computed once."""
+    """Search for other pictures in one reference; the spectra of the reference are computed once.
 
-    def __init__(self, reference: FlatPicture) -> None:
-        self._reference = reference
+    The correlation is that of the plane; `projection` (in samples; None: the plane) refines its best place.
+    """
+
+    def __init__(self, reference: FlatPicture, projection: FieldProjection | None = None) -> None:
+        self._reference, self._projection = reference, projection
         self._shape = tuple(fft.next_fast_len(2 * size, real=True) for size in reference.field.shape)
         self._area = float(reference.field.sum())
         self._spectra = self._of(reference)
@@ -72,9 +77,9 @@ class MaskedCorrelator:
     def find(self, picture: FlatPicture) -> Match:
         """Return the best match over all shifts and rotations within ANGLES_DEG."""
         found = max((self._at(picture, angle) for angle in ANGLES_DEG), key=lambda one: one.peak)
-        turn_deg = refined(self._reference, picture, found).rotation_deg
+        turn_deg = refined(self._reference, picture, found, self._projection).rotation_deg
         found = self._at(picture, turn_deg)  # with the rotation taken out, peak and shift are those of the whole field
-        better = refined(self._reference, picture, found)
+        better = refined(self._reference, picture, found, self._projection)
         return better if better.peak > found.peak else found
 
     def _at(self, picture: FlatPicture, rotation_deg: float) -> Match:
@@ -123,36 +128,52 @@ class MaskedCorrelator:
         return whole + float(np.clip(off, -0.5, 0.5))
 
 
-def refined(reference: FlatPicture, picture: FlatPicture, start: Match) -> Match:
+def refined(
+    reference: FlatPicture, picture: FlatPicture, start: Match, projection: FieldProjection | None = None
+) -> Match:
     """Return a match with shift and rotation improved by Gauss-Newton steps on the normalised difference.
 
-    The start must be nearer than the width of a vessel (enhanced correlation coefficient: G. Evangelidis and
-    E. Psarakis, IEEE TPAMI 30, 1858, 2008).
+    `projection`: map between the pictures, in samples; None: the plane. The start must be nearer than the width of a
+    vessel (enhanced correlation coefficient: G. Evangelidis and E. Psarakis, IEEE TPAMI 30, 1858, 2008). A step moves
+    the reference before the motion found so far, which makes the slopes those of the moved picture.
     """
+    projection = projection or Plane()
     middle = (np.array(reference.field.shape) - 1) / 2
-    rows, cols = np.indices(reference.field.shape, dtype=np.float64) - middle[:, None, None]
-    shift: Floats = np.array(start.shift)
-    turn_rad, best = radians(start.rotation_deg), start
+    places = np.moveaxis(np.indices(reference.field.shape, dtype=np.float64), 0, -1) - middle
+    rates = _rates(projection, places)
+    coefficients = ndimage.spline_filter(picture.detail, order=3, output=np.float32)
+    motion, best = Motion(start.shift, start.rotation_deg), start
     for _ in range(REFINEMENTS):
-        turn = rotation_matrix(degrees(turn_rad))
-        offset = middle + turn @ (shift - middle)
-        field = ndimage.affine_transform(picture.field, turn, offset, order=1) > 0.99
-        both = (reference.field > 0) & field
+        at = np.moveaxis(projection.moved(places, motion) + middle, -1, 0)
+        both = (reference.field > 0) & (ndimage.map_coordinates(picture.field, at, order=1) > 0.99)
         if both.sum() < LEAST_OVERLAP * reference.field.sum():
             return best
-        moved: Image = ndimage.affine_transform(picture.detail, turn, offset, order=3)
+        moved: Image = ndimage.map_coordinates(coefficients, at, order=3, prefilter=False)
         down, right = np.asarray(np.gradient(moved, axis=0)), np.asarray(np.gradient(moved, axis=1))
-        twist = right * (rows + shift[0]) - down * (cols + shift[1])
         a, b = (_normalised(one[both]) for one in (reference.detail, moved))
         correlation = float(a @ b)
         if correlation > best.peak or best is start:
-            place = float(shift[0]), float(shift[1])
-            best = replace(best, shift=place, rotation_deg=degrees(turn_rad), peak=correlation)
-        scale = np.linalg.norm(moved[both] - moved[both].mean())
-        slopes = np.stack([one[both] for one in (down, right, twist)], axis=1) / max(float(scale), 1e-30)
+            best = replace(best, shift=motion.shift, rotation_deg=motion.rotation_deg, peak=correlation)
+        scale = max(float(np.linalg.norm(moved[both] - moved[both].mean())), 1e-30)
+        slopes = np.stack([(down * rate[..., 0] + right * rate[..., 1])[both] for rate in rates], axis=1) / scale
         step = np.linalg.lstsq(slopes - slopes.mean(axis=0), a - b, rcond=None)[0]
-        shift, turn_rad = shift + np.clip(step[:2], -2, 2), turn_rad + float(np.clip(step[2], -0.03, 0.03))
+        first, second = np.clip(step[:2], -2, 2)
+        small = Motion((float(first), float(second)), float(np.clip(step[2], -MOST_STEP_DEG, MOST_STEP_DEG)))
+        motion = projection.composed(small, motion)
     return best
+
+
+def _rates(projection: FieldProjection, places: Floats) -> list[Floats]:
+    """Return the velocity of places (..., 2) for a shift along rows and cols, per sample, and a rotation, per degree.
+
+    Central differences over half a sample and half a degree; maps of the plane and the sphere are smooth there.
+    """
+    half = 0.25
+    pairs = [(Motion((h, 0.0), 0.0), Motion((0.0, h), 0.0), Motion((0.0, 0.0), h)) for h in (half, -half)]
+    return [
+        np.asarray((projection.moved(places, ahead) - projection.moved(places, behind)) / (2 * half))
+        for ahead, behind in zip(*pairs, strict=True)
+    ]
 
 
 def _normalised(values: Image) -> Floats:
@@ -168,12 +189,6 @@ def turned(picture: FlatPicture, rotation_deg: float) -> FlatPicture:
     detail = ndimage.rotate(picture.detail, rotation_deg, reshape=False, order=1)
     field = ndimage.rotate(picture.field, rotation_deg, reshape=False, order=1) > 0.99
     return FlatPicture(np.asarray(detail * field, np.float32), np.asarray(field, np.float32))
-
-
-def rotation_matrix(rotation_deg: float) -> Floats:
-    """Return the matrix on (rows down, cols right) that turns counter-clockwise as displayed."""
-    c, s = cos(radians(rotation_deg)), sin(radians(rotation_deg))
-    return np.array([[c, -s], [s, c]])
 
 
 def _second(surface: Floats, overlap: Floats, peak: tuple[int, int]) -> float:

@@ -31,7 +31,7 @@ def montage_router(repository: VisitRepository, montages: MontageMaker) -> APIRo
         "/api/visits/{id}/montage/{eye}/picture.png", response_class=PngResponse, responses=file_responses("image/png")
     )
     def montage_picture(id: str, eye: Eye) -> PngResponse:
-        """Return the montage of one eye of a visit as PNG, on the plane of its first picture.
+        """Return the montage of one eye of a visit as PNG, around its first picture.
 
         404 for an unknown visit, or while the `state` of the montage is not `joined`.
         """
@@ -48,6 +48,7 @@ def montage_answer(one: VisitMontage) -> MontageAnswer:
     placed = one.made.placed if one.made is not None else ()
     return MontageAnswer(
         state=one.state, digest=one.digest, pictures=len(one.pictures), problem=error_text(one.problem),
+        projection=None if one.made is None else one.made.projection,
         placed=[
             PlacedPicture(
                 index=at.index, slot=taken.slot, capture=taken.capture, used=at.used, shift_px=at.shift_px,

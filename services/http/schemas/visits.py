@@ -138,11 +138,13 @@ class MontageAnswer(ResponseBody):
 
     `state`: `none` with fewer than two pictures, `computing` until it is known (it waits while the camera is used),
     `joined`, `apart` if no two pictures could be joined, `failed` with `problem`. `digest`: names the set of pictures.
-    `pictures`: their number. `placed`: the place of each, empty before it is known.
+    `pictures`: their number. `placed`: the place of each, empty before it is known. `projection`: of the places,
+    "sphere", or "plane" if the scale of the pictures is unknown; null before it is known.
     """
 
     state: MontageState
     digest: str
     pictures: int
     placed: list[PlacedPicture]
+    projection: Literal["sphere", "plane"] | None
     problem: ErrorText | None

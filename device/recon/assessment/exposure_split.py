@@ -1,0 +1,78 @@
+"""Split of an exposure into shorter ones while the eye moves: the same light in more frames, which are registered.
+
+Loss of a picture against one exposure of a still eye, in dB, for m frames that share the light of a press:
+
+    loss(m) = 2 / (1 + (d0 m / D)^2) + min(0.2 ((m - 1) D / (m d0))^2, 0.55) + 0.0106 (m - 1) (220 / L)^0.7
+    d0      = 0.372 (220 / L)^0.34        degrees
+
+The first term is the motion blur of one frame, the second the displacement between the frames, the third read noise and
+registration. D: motion of the eye over the light of the press, degrees; L: light of the press, mean electrons per um^2
+of the sensor. Fitted to twelve pictures of one photograph (one exposure, 4 and 8 frames; none to 12 pixels of 0.064
+degrees; 22 and 220 electrons per um^2), at most 0.16 dB off. NUMERICS.md 9.3.
+"""
+
+from dataclasses import dataclass
+from math import pow
+
+from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
+
+MOST_FRAMES = 8  # of a press: what the fit rests on
+LEAST_MOTION_DEG = 0.257  # during one exposure: 4 pixels of the paper's sensor
+LEAST_GAIN_DB = 0.16  # the largest error of the fit
+LEAST_PART_E_PER_UM2 = 1.25 * LEAST_E_PER_UM2  # of one frame, which the frame quality must not call dark
+
+REFERENCE_E_PER_UM2, BLUR_DEG, BLUR_DB, BLUR_POWER = 220.0, 0.372, 2.0, 0.34
+DISPLACED_DB, MOST_DISPLACED_DB = 0.2, 0.55
+FRAME_DB, FRAME_POWER = 0.0106, 0.7
+
+
+@dataclass(frozen=True)
+class ExposureSplit:
+    """Split of each exposure of a press into `parts` of equal length, 1 for none, with its predicted gain.
+
+    `motion_deg`: motion of the eye during one whole exposure. `gain_db`: against exposures that are not split.
+    """
+
+    parts: int = 1
+    motion_deg: float = 0.0
+    gain_db: float = 0.0
+
+
+WHOLE = ExposureSplit()
+
+
+def choose_split(
+    count: int, exposure_s: float, speed_deg_per_s: float | None, light_e_per_um2_s: float | None
+) -> ExposureSplit:
+    """Return how to split each of the `count` exposures of a press, `exposure_s` seconds each.
+
+    `speed_deg_per_s`: of the eye in the aiming stream; `light_e_per_um2_s`: mean light on the sensor per second of
+    exposure; None if unknown: then nothing is split. A split has at most MOST_FRAMES frames in all, each with enough
+    light of its own, and is chosen for the largest predicted gain, at least LEAST_GAIN_DB, if the eye moves by more
+    than LEAST_MOTION_DEG during one exposure. The sum of the parts is the exposure: no light is added.
+    """
+    if speed_deg_per_s is None or light_e_per_um2_s is None or light_e_per_um2_s <= 0:
+        return WHOLE
+    motion_deg, light_e_per_um2 = speed_deg_per_s * exposure_s, light_e_per_um2_s * exposure_s
+    if motion_deg <= LEAST_MOTION_DEG:
+        return WHOLE
+    whole_db = loss_db(count, count * motion_deg, count * light_e_per_um2)
+    allowed = [parts for parts in range(2, MOST_FRAMES // count + 1) if light_e_per_um2 / parts >= LEAST_PART_E_PER_UM2]
+    splits = [
+        ExposureSplit(parts, motion_deg, whole_db - loss_db(count * parts, count * motion_deg, count * light_e_per_um2))
+        for parts in allowed
+    ]
+    best = max(splits, key=lambda one: one.gain_db, default=WHOLE)
+    return best if best.gain_db >= LEAST_GAIN_DB else WHOLE
+
+
+def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
+    """Return the loss of a picture of that many frames against one exposure of a still eye, dB; 0 or more.
+
+    `motion_deg`: of the eye over the light of all frames, degrees; `light_e_per_um2`: of all frames, above 0.
+    """
+    relative = REFERENCE_E_PER_UM2 / light_e_per_um2
+    moved = motion_deg / (BLUR_DEG * pow(relative, BLUR_POWER))
+    blur_db = BLUR_DB * moved**2 / (moved**2 + frames**2)
+    displaced_db = min(DISPLACED_DB * ((frames - 1) / frames * moved) ** 2, MOST_DISPLACED_DB)
+    return blur_db + displaced_db + FRAME_DB * (frames - 1) * pow(relative, FRAME_POWER)
