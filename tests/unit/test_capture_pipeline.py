@@ -10,11 +10,12 @@ import pytest
 
 from device.clock import VirtualClock
 from device.config.head_file import load_head
-from device.errors import CameraMissing, CameraStalled, LightFault
+from device.errors import CameraMissing, CameraStalled, FrameError, LightFault
 from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.recon.assessment.frame_quality import Verdict
+from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import RoundDone, StageResult, Step
 from device.sim.camera import SimCamera
@@ -150,7 +151,10 @@ class RedOnly(NoColours):
 
 
 class NoBursts:
-    """Reconstruction of bursts, which is not reached."""
+    """Reconstruction of bursts, which is not reached; no frame can be prepared."""
+
+    def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
+        raise FrameError("nothing is prepared here")
 
     def steps(self, frames: Sequence[Pixels], *_: object, **__: object) -> Iterator[Step]:
         raise AssertionError("no burst is reconstructed here")
