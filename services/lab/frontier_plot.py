@@ -4,24 +4,31 @@ from collections.abc import Mapping, Sequence
 from math import log10
 
 from device.recon.methods import METHODS, Method
-from services.lab.frontier_result import Frontier, Point
-from services.lab.plot import Mark, Plot, Series, svg, time_axis, value_axis
+from services.lab.frontier_result import Frontier, LightPoint, Point
+from services.lab.plot import Mark, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
+
+BURST_KIND, BOUND_KIND = 6, 7  # of marks, the same in both plots
 
 
 def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> str:
-    """Return the SVG of `found`, the result of `frontier.measure_frontier` with `methods`."""
+    """Return the SVG of `found`, the result of `frontier.measure_frontier` with `methods`.
+
+    Accuracy against time; below it, if bursts were measured, accuracy against the dose.
+    """
+    time = _time_plot(found, methods)
+    return stacked_svg([time, _light_plot(found)] if found.light else [time])
+
+
+def _time_plot(found: Frontier, methods: Mapping[str, Method]) -> Plot:
     points, choice, budget_s = found.points, found.choice, found.budget_s
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
-    seconds = [p.seconds_median for p in points] + [choice.solve_s, budget_s]
-    worths = [p.psnr_db for p in points] + [choice.psnr_db]
-    for one in found.light:
-        seconds.append(one.seconds_median)
-        worths += [one.psnr_db, one.bound_psnr_db]
-    seconds += [one.seconds for one in found.peers]
-    worths += [one.psnr_db for one in found.peers]
+    others = [(one.seconds_median, one.psnr_db) for one in found.light]
+    others += [(one.seconds, one.psnr_db) for one in found.peers]
+    seconds = [p.seconds_median for p in points] + [choice.solve_s, budget_s] + [one[0] for one in others]
+    worths = [p.psnr_db for p in points] + [choice.psnr_db] + [one[1] for one in others]
     y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
     words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
-    plot = Plot(
+    return Plot(
         title=f"What accuracy costs in time{' and light' if found.light else ''}: {found.scene}",
         subtitle=_subtitle(found),
         description=_description(found, edge),
@@ -33,14 +40,47 @@ def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> s
             if any(p.method == method.name for p in points)
         )
         + _peers(found)
-        + _light(found),
+        + _bursts_in_time(found),
         edge=tuple(edge),
         limit=(budget_s, f"budget {budget_s:g} s"),
         ring=(choice.solve_s, choice.psnr_db, "chosen" if found.light else "the instrument's choice"),
         right=_correlations(y.low, y.high, found.region.truth_variance),
         right_title="the same as correlation (PCC)",
     )
-    return svg(plot)
+
+
+def _light_plot(found: Frontier) -> Plot:
+    """Return accuracy against the dose: bursts, and the bound of a linear filter with as much light."""
+    bursts, bounds = [], []
+    for one in found.light:
+        dose_uj_per_cm2, words = one.dose_j_per_cm2 * 1e6, _frames(one)
+        spent = f"{words}, {dose_uj_per_cm2:.3g} uJ/cm2: {one.seconds_median * 1e3:.0f} ms"
+        label = f"{words} in {one.seconds_median:.2g} s"
+        bursts.append(Mark(dose_uj_per_cm2, one.psnr_db, label, f"{spent}, {one.psnr_db:.2f} dB"))
+        bound = f"{spent}, linear bound {one.bound_psnr_db:.2f} dB"
+        bounds.append(Mark(dose_uj_per_cm2, one.bound_psnr_db, "", bound, 0.7))
+    doses = [one.x for one in bursts]
+    worths = [one.y for one in bursts + bounds]
+    y = value_axis(worths, "PSNR in dB", 0.15)
+    return Plot(
+        title="What more light buys",
+        subtitle="bursts as the instrument solves them, refraction included; the best linear filter for as much light",
+        description="",
+        x=log_axis(doses, "retinal dose of all frames in uJ/cm2, weighted with the photochemical hazard", _number),
+        y=y,
+        series=(Series("burst", (tuple(bursts),), BURST_KIND), Series("linear bound", (tuple(bounds),), BOUND_KIND)),
+        right=_correlations(y.low, y.high, found.region.truth_variance),
+        right_title="PCC",
+        height=360,
+    )
+
+
+def _frames(one: LightPoint) -> str:
+    return f"{one.frames} frame{'s' if one.frames > 1 else ''}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
 
 
 def _subtitle(found: Frontier) -> str:
@@ -95,20 +135,14 @@ def _peers(found: Frontier) -> tuple[Series, ...]:
     return (Series("LenslessPiCam", (marks,)),) if marks else ()
 
 
-def _light(found: Frontier) -> tuple[Series, ...]:
-    """Return the bursts, and over or under each the bound of a linear filter with as much light."""
-    if not found.light:
-        return ()
-    bursts, bounds = [], []
-    for one in found.light:
-        words = f"{one.frames} frame{'s' if one.frames > 1 else ''}"
-        dose = f"{one.dose_j_per_cm2 * 1e6:.3g} uJ/cm2"
-        spent = f"{words}, {dose}: {one.seconds_median * 1e3:.0f} ms"
-        bursts.append(Mark(one.seconds_median, one.psnr_db, f"{words}, {dose}", f"{spent}, {one.psnr_db:.2f} dB"))
-        bounds.append(
-            Mark(one.seconds_median, one.bound_psnr_db, "", f"{spent}, linear bound {one.bound_psnr_db:.2f} dB", 0.7)
-        )
-    return Series("burst", (tuple(bursts),)), Series("linear bound", (tuple(bounds),))
+def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
+    """Return the bursts at their times, refraction included."""
+    marks = tuple(
+        Mark(one.seconds_median, one.psnr_db, _frames(one),
+             f"{_frames(one)}: {one.seconds_median * 1e3:.0f} ms, {one.psnr_db:.2f} dB")
+        for one in found.light
+    )  # fmt: skip
+    return (Series("burst", (marks,), BURST_KIND),) if marks else ()
 
 
 def _mark(point: Point, method: Method, label: str) -> Mark:

@@ -47,10 +47,14 @@ class Mark:
 
 @dataclass(frozen=True)
 class Series:
-    """Marks of one shape and colour; a thin line joins the marks of each trail."""
+    """Marks of one shape and colour; a thin line joins the marks of each trail.
+
+    `kind`: number of the shape and colour, 0 to KINDS - 1; None: the place among the series of the plot.
+    """
 
     name: str
     trails: tuple[tuple[Mark, ...], ...]
+    kind: int | None = None
 
 
 @dataclass(frozen=True)
@@ -125,19 +129,27 @@ def value_axis(values: Iterable[float], title: str, room: float = 0.06) -> Axis:
 
 def svg(plot: Plot) -> str:
     """Return the plot as a complete SVG document."""
-    wide, tall = plot.width, plot.height
-    inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot), *_labels(plot)]
+    return stacked_svg([plot])
+
+
+def stacked_svg(plots: Sequence[Plot]) -> str:
+    """Return plots one below the other as one SVG document, with the title of the first one."""
+    wide, tall = max(plot.width for plot in plots), sum(plot.height for plot in plots)
+    panels, down = [], 0
+    for plot in plots:
+        inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot)]
+        heads = [text(LEFT, 32, plot.title, "title"), text(LEFT, 54, plot.subtitle, "quiet small")]
+        panels += [f'<g transform="translate(0 {down})">', *heads, *inner, *_labels(plot), "</g>"]
+        down += plot.height
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
             'role="img" aria-labelledby="plot-title plot-desc">',
-            f'<title id="plot-title">{escape(plot.title)}</title>',
-            f'<desc id="plot-desc">{escape(plot.description)}</desc>',
+            f'<title id="plot-title">{escape(plots[0].title)}</title>',
+            f'<desc id="plot-desc">{escape(" ".join(plot.description for plot in plots))}</desc>',
             f"<style>{STYLE}</style>",
             f'<rect class="ground" width="{wide}" height="{tall}"/>',
-            text(LEFT, 32, plot.title, "title"),
-            text(LEFT, 54, plot.subtitle, "quiet small"),
-            *inner,
+            *panels,
             "</svg>\n",
         ]
     )
@@ -207,9 +219,14 @@ def _limit(plot: Plot) -> list[str]:
     ]
 
 
+def _by_kind(plot: Plot) -> list[tuple[int, Series]]:
+    """Return the series with the number of their shape and colour."""
+    return [(place if one.kind is None else one.kind, one) for place, one in enumerate(plot.series)]
+
+
 def _series(plot: Plot) -> list[str]:
     out = []
-    for k, series in enumerate(plot.series):
+    for k, series in _by_kind(plot):
         out.append(f'<g class="s{k % KINDS}">')
         for trail in series.trails:
             places = [(_x(plot, mark.x), _y(plot, mark.y)) for mark in trail]
@@ -255,7 +272,7 @@ def _ring(plot: Plot) -> list[str]:
 def _legend(plot: Plot) -> list[str]:
     """Return one row above the frame: shape and name of each series, then the Pareto edge and the ring."""
     out, at = [], float(LEFT + 6)
-    for k, series in enumerate(plot.series):
+    for k, series in _by_kind(plot):
         out += [
             f'<g class="s{k % KINDS}">{_shape(k, at, TOP - 20, 6.0)}</path></g>',
             text(at + 11, TOP - 16, series.name, "small"),
@@ -281,7 +298,7 @@ def _labels(plot: Plot) -> list[str]:
         x, y = _x(plot, plot.ring[0]), _y(plot, plot.ring[1])
         taken.append((x - 13, y - 13, x + 13, y + 13))
     out = []
-    for k, series in enumerate(plot.series):
+    for k, series in _by_kind(plot):
         for mark in (mark for trail in series.trails for mark in trail if mark.label):
             place = _free_position(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
             if place is not None:

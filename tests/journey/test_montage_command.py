@@ -51,6 +51,7 @@ def test_wrong_inputs_are_refused_with_the_remedy(tmp_path: Path) -> None:
         ([a, str(tmp_path / "none.npy"), "-o", out], "none.npy"),
         ([a, "-o", a], "would be overwritten"),
         ([a, "-o", str(tmp_path / "out.jpg")], "Choose one of these."),
+        ([a, "-o", out, "--head", "hardware/heads/bench.toml"], "has no table [optics]"),
     ):
         done = call(["montage", *words])
         assert (done.code, message in done.err) == (2, True), done.err

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.lab.frontier import pareto_front
-from services.lab.plot import Mark, Plot, Series, svg, time_axis, value_axis
+from services.lab.plot import Mark, Plot, Series, stacked_svg, svg, time_axis, value_axis
 
 SVG = "{http://www.w3.org/2000/svg}"
 places = st.lists(st.tuples(st.integers(1, 9).map(float), st.integers(0, 9).map(float)), min_size=1, max_size=30)
@@ -69,3 +69,18 @@ def test_labels_do_not_overlap():
     for k, (x, y, wide) in enumerate(boxes):
         for a, b, other in boxes[:k]:
             assert abs(y - b) >= 12.8 or x + wide <= a + 0.2 or a + other <= x + 0.2
+
+
+def test_plots_stand_one_below_the_other():
+    marks = (Mark(0.1, 1.0, tooltip="a"), Mark(0.2, 2.0, tooltip="b"))
+    x, y = time_axis([m.x for m in marks], "time"), value_axis([m.y for m in marks], "worth")
+    upper, lower = (
+        Plot(name, "", f"{name} is", x, y, (Series("s", (marks,)),), width=900, height=tall)
+        for name, tall in (("upper", 500), ("lower", 300))
+    )
+    root = ElementTree.fromstring(stacked_svg([upper, lower]))
+    assert (root.get("width"), root.get("height")) == ("900", "800")
+    panels = [group for group in root.findall(f"{SVG}g") if (group.get("transform") or "").startswith("translate")]
+    assert [panel.get("transform") for panel in panels] == ["translate(0 0)", "translate(0 500)"]
+    assert [next(panel.iter(f"{SVG}text")).text for panel in panels] == ["upper", "lower"]
+    assert root.findtext(f"{SVG}desc") == "upper is lower is"
