@@ -36,7 +36,8 @@ FITTED_RINGS = 10
 MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
 MOST_ITERATIONS = 40  # of conjugate gradients; with 80 the errors are the same
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
-MODEL_SHARE = 0.0027  # of the mean: sd of what the model lacks; with it 79 frames have z scores of rms 0.9 to 1.06
+MODEL_SHARE = 0.0022  # of the mean: sd of what the model lacks
+MODEL_SD_DPT = 0.03  # of each component by the model, beside noise: RMS error of the paper's sensor in full light
 MOST_STEPS = 6
 SETTLED_SDS = 0.2
 MOST_MISFIT = 1.2
@@ -66,7 +67,7 @@ class Refined:
     @property
     def sds_dpt(self) -> Floats:
         """Standard deviations of M, J0 and J45, (3,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance) * max(self.misfit, 1.0)))
+        return np.asarray(np.sqrt(np.diag(self.covariance) * max(self.misfit, 1.0) + MODEL_SD_DPT**2))
 
 
 @dataclass(frozen=True)
