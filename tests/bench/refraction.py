@@ -48,6 +48,16 @@ class Case:
     zoom: float = 1.0
     turn_deg: float = 0.0
 
+    @property
+    def edge_kind(self) -> str:
+        """Deviation of the edge from the calibration."""
+        edge = self.edge
+        if edge.width_deg > 0:
+            return "soft"
+        if edge.diameter_deg != self.field_deg:
+            return f"{self.field_deg - edge.diameter_deg:+.1f} deg"
+        return "off centre" if edge.right_deg or edge.down_deg else "exact"
+
 
 def cases(
     camera: Camera, field_deg: float, count: int, seed: int, cylinder_dpt: float = 0.0, name: str = ""
@@ -184,6 +194,24 @@ def summarise(title: str, scored: list[Scored], k: int, limits: Limits) -> bool:
     return holds
 
 
+def tabulate(scored: list[Scored]) -> None:
+    """Print a Markdown table of the error of M and its coverage by light, field edge and object of one group."""
+    cells: dict[tuple[str, str], list[Scored]] = {}
+    for one in scored:
+        case = one.case
+        for key in (("light", f"{case.light:g}"), ("edge", case.edge_kind), ("object", case.photo)):
+            cells.setdefault(key, []).append(one)
+    print("| by | value | frames | refused | RMS M, dpt | below 1 sd | below 2 sd |\n|---|---|---|---|---|---|---|")
+    for (by, value), ones in sorted(cells.items()):
+        known = [one for one in ones if one.refused is None]
+        error, sd = (np.array([column[0] for column in columns]) for columns in (
+            [one.errors_dpt for one in known], [one.sds_dpt for one in known]
+        ))  # fmt: skip
+        shares = [f"{np.mean(np.abs(error) < k * sd):.0%}" if known else "-" for k in (1, 2)]
+        rms = f"{np.sqrt(np.mean(error**2)):.3f}" if known else "-"
+        print(f"| {by} | {value} | {len(ones)} | {len(ones) - len(known)} | {rms} | {' | '.join(shares)} |", flush=True)
+
+
 @dataclass(frozen=True)
 class Group:
     """Frames of one sensor and field, with cylinders of up to `cylinder_dpt` in J0 and J45, and their lines."""
@@ -302,6 +330,7 @@ def main() -> None:
         for case in cases(group.camera, group.field_deg, arguments.frames, arguments.seed, group.cylinder_dpt):
             found.append(score(case, arguments.data))
             print(found[-1].line, flush=True)
+        tabulate(found)
         for k, limits in enumerate(group.limits):
             held.append(summarise(f"{name} {('M', 'J0', 'J45')[k]}", found, k, limits))
     raise SystemExit(0 if all(held) else 1)

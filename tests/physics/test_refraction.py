@@ -74,12 +74,12 @@ def test_the_warped_psf_agrees_with_wave_propagation(eye: Refraction, pitch_um: 
 
 
 def test_the_refraction_is_estimated_from_the_frame(reconstruct: Reconstructor) -> None:
-    """Over 23 frames of photographs 0.09 dpt RMS, 0.24 at most; the report gives the correction, of opposite sign."""
+    """The report gives the correction, of opposite sign to the wavefront; its sd is that of the refinement."""
     errors = []
     for m_dpt in EYES_DPT:
         report = reconstruct(counts_of(m_dpt)).report
         assert report.refraction_dpt is not None
-        assert 0.03 < report.refraction_dpt["sd"] < 0.25
+        assert 0.03 < report.refraction_dpt["sd"] < 0.15
         assert report.psf_scale == pytest.approx(1 - 0.003375 * m_dpt, abs=0.001)
         errors.append(report.refraction_dpt["sphere"] + m_dpt)
     assert np.sqrt(np.mean(np.square(errors))) < 0.15

@@ -5,6 +5,7 @@ paraxial transfer function, and the eye is given as sphere, minus cylinder and T
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,14 @@ def diffuser(optics: Optics, samples: int, seed: int) -> Plane:
     return np.asarray(rough * (np.deg2rad(optics.slope_fwhm_deg) / 2.3548 / slope))
 
 
+@cache
+def transfer(optics: Optics, samples: int, wavelength_um: float) -> NDArray[np.complex128]:
+    """Return the paraxial transfer function from diffuser to sensor, (samples, samples)."""
+    frequency = fft.fftfreq(samples, optics.pitch_um)
+    squared = frequency[:, None] ** 2 + frequency[None] ** 2
+    return np.asarray(np.exp(-1j * np.pi * wavelength_um * optics.distance_um * squared))
+
+
 def caustic(optics: Optics, surface_um: Plane, eye: Prescription) -> Plane:
     """Return the intensity on the sensor behind a retinal point of an uncorrected eye, unit sum, row 0 on top.
 
@@ -73,14 +82,14 @@ def caustic(optics: Optics, surface_um: Plane, eye: Prescription) -> Plane:
     radius_um = np.hypot(right, up)
     lacking_dpt = eye.power_dpt(np.arctan2(up, right))
     eye_um = optics.magnification**2 * lacking_dpt * 1e-6 * radius_um**2 / 2
-    open_iris = np.clip((optics.iris_um / 2 - radius_um) / optics.pitch_um + 0.5, 0, 1)
-    frequency = fft.fftfreq(samples, optics.pitch_um)
-    squared = frequency[:, None] ** 2 + frequency[None] ** 2
-    light = np.zeros_like(surface_um)
+    iris = np.clip((optics.iris_um / 2 - radius_um) / optics.pitch_um + 0.5, 0, 1)
+    is_open = iris > 0
+    path_um, share = (surface_um + eye_um)[is_open], iris[is_open]
+    light, wave = np.zeros_like(surface_um), np.zeros(surface_um.shape, np.complex128)
     for wavelength_um in optics.wavelengths_um:
-        wave = open_iris * np.exp(2j * np.pi / wavelength_um * (surface_um + eye_um))
-        transfer = np.exp(-1j * np.pi * wavelength_um * optics.distance_um * squared)
-        light += np.abs(fft.ifft2(fft.fft2(wave, workers=1) * transfer, workers=1)) ** 2
-    pixel = np.sinc(frequency * optics.pitch_um)
+        wave[is_open] = share * np.exp(2j * np.pi / wavelength_um * path_um)
+        spectrum = fft.fft2(wave, workers=1) * transfer(optics, samples, wavelength_um)
+        light += np.abs(fft.ifft2(spectrum, overwrite_x=True, workers=1)) ** 2
+    pixel = np.sinc(fft.fftfreq(samples, optics.pitch_um) * optics.pitch_um)
     light = fft.ifft2(fft.fft2(light) * pixel[:, None] * pixel[None]).real
     return np.asarray(light / light.sum())

@@ -19,6 +19,7 @@ from scipy import ndimage
 
 from device.recon.assessment.field_edge import FieldEdgeFit
 from device.recon.estimation.refraction import LEAST_FREQUENCIES, RefractionEstimator, Search
+from device.recon.estimation.refraction_likelihood import noise_power
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import Linear
 from device.values import Image
@@ -74,7 +75,7 @@ class PsfMatchTest:
         if not likelihood.fit_smooth(frame, likelihood.model.stored) > 0:
             return None
         likelihood.residual(frame, 0.0)
-        noise = likelihood.noise_power(frame)
+        noise = noise_power(likelihood.noise(frame), frame, likelihood.sample_weights)
 
         def unlikelihood(m_dpt: float) -> float:
             between()

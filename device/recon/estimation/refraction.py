@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.refraction_crop import CropRefinement
 from device.recon.estimation.refraction_cylinder import find_cylinder
 from device.recon.estimation.refraction_edge import EdgeLikelihood
 from device.recon.estimation.refraction_field import FieldEdge
@@ -45,6 +46,7 @@ SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the 
 MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MOST_ROUNDS the edge was not found
 CURVATURE_STEP_DPT = 0.25
 MOST_SD_DPT = 1.5
+MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
 Floats = NDArray[np.float64]
 
@@ -116,6 +118,7 @@ class RefractionEstimator:
         self._spread = float((taper**4).sum() * taper.size / (taper**2).sum() ** 2)
         self._blocks = block_of_frequency(bands.whole)
         reach_px = support_radius_px(calibration.psfs[index])
+        self._refinement = CropRefinement(self._edges, planner, reach_px)
         lever = bands.high / self._edges.grid.n * 2 * reach_px * geometry.scale_per_dpt
         self.step_dpt = float(np.clip(FRINGES / lever, 0.1, 2.0))
 
@@ -170,10 +173,17 @@ class RefractionEstimator:
         sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
         if sds_dpt.max() > MOST_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
-        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = model.minimum.tolist(), sds_dpt.tolist()
+        refined = self._refinement(model.minimum)
+        if not refined.is_valid:
+            return NoRefraction("no retina explains the frame with this PSF")
+        distance = np.abs(refined.eye_dpt - model.minimum) / np.hypot(sds_dpt, refined.sds_dpt)
+        if distance.max() > MOST_DISTANCE_SDS:
+            return NoRefraction("the frame and its spectrum give different refractions")
+        sds_dpt = np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
+        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = refined.eye_dpt.tolist(), sds_dpt.tolist()
         return replace(
             found, sphere_dpt=m_dpt, sd_dpt=sd_dpt, psf_scale=self.scale(m_dpt),
-            edge=self._edges.field_edge(self._edges.edge_model(model.minimum)),
+            edge=self._edges.field_edge(self._edges.edge_model(refined.eye_dpt)),
             cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
         )  # fmt: skip
 

@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction_field import MARGIN_DEG, EdgePrior, FieldEdge, LitField
-from device.recon.estimation.refraction_likelihood import SMEAR, TURNS, Band, RefractionLikelihood
+from device.recon.estimation.refraction_likelihood import SMEAR, TURNS, Band, RefractionLikelihood, noise_power
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.grid import Pair
@@ -61,8 +62,9 @@ class EdgeLikelihood:
     """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape.
 
     An eye is an array of M, or of M, J0 and J45, in dpt. With `edge_is_known` the calibrated edge is kept. It holds the
-    state of the frame of the last `start`: the edge, and the smooth part of the last `fit_smooth`. `band` holds the
-    frequencies.
+    state of the `frame` of the last `start`: the edge, the `noise` of a sample, and the `smooth` part of the last
+    `fit_smooth`. `band` holds the frequencies, `levels` the level of the retina's detail of each ring in the last
+    likelihood.
     """
 
     def __init__(
@@ -80,26 +82,29 @@ class EdgeLikelihood:
         self._field = LitField(self.grid, self.edge, self.prior.largest_samples)
         self._moved_objects: list[Spectrum] = []
         self._flat_places = np.arange(self.band.where.size)
-        self._levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
+        self.levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
+        self.noise = Noise(0.0, 1.0)
         self._noise_dn2 = 1.0
 
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
-        self._frame = self.likelihood.frame(counts, dark, defects)
+        self.frame = self.likelihood.frame(counts, dark, defects)
         self.edge = self.prior.calibrated
-        return self._frame
+        return self.frame
 
     def set_noise(self, eye_dpt: Floats) -> None:
         """Set the noise from the sensor's gain, or from the residual of this candidate."""
-        self.likelihood.residual_of(self._frame, transform(self.likelihood.geometry, *eye_dpt))
-        self._noise_dn2 = self.likelihood.noise_power(self._frame)
+        self.likelihood.residual_of(self.frame, transform(self.likelihood.geometry, *eye_dpt))
+        self.noise = self.likelihood.noise(self.frame)
+        self._noise_dn2 = noise_power(self.noise, self.frame, self.likelihood.sample_weights)
 
     def fit_smooth(self, eye_dpt: Floats) -> float:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
         stretch = transform(self.likelihood.geometry, *eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
-        smooth = self._field.fit(self._frame, otf, self.edge)
-        self.likelihood.set_smooth(self._frame, smooth.image, smooth.stray_dn, otf)
+        smooth = self._field.fit(self.frame, otf, self.edge)
+        self.smooth = smooth.image
+        self.likelihood.set_smooth(self.frame, smooth.image, smooth.stray_dn, otf)
         self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
         return smooth.level_dn
 
@@ -124,7 +129,7 @@ class EdgeLikelihood:
         """Return residual and OTF at the band's frequencies, (K,), and the scale of the smooth part."""
         band, likelihood = self.band, self.likelihood
         stretch = transform(likelihood.geometry, *eye_dpt)
-        level, _ = likelihood.residual_of(self._frame, stretch)
+        level, _ = likelihood.residual_of(self.frame, stretch)
         rest = likelihood.fft.spectrum.ravel()[band.where]
         otf = likelihood.interpolated_otf.at_frequencies(band.rows, band.cols, band.share, self.grid.n, stretch)
         return rest, otf, level
@@ -149,7 +154,7 @@ class EdgeLikelihood:
         """Return the negative log likelihood of a residual; the levels, energies and powers of the band are kept."""
         band = self.band
         return fused_kernels.negative_log_likelihood(
-            rest[None], otf, self._flat_places, band.ring, self._noise_dn2, SMEAR, TURNS, self._levels, band.energy,
+            rest[None], otf, self._flat_places, band.ring, self._noise_dn2, SMEAR, TURNS, self.levels, band.energy,
             band.power,
         )  # fmt: skip
 
@@ -159,7 +164,7 @@ class EdgeLikelihood:
 
     def _spectrum(self) -> Image:
         """Return the model S of the last likelihood, (K,)."""
-        return np.asarray(self.band.power * self._levels[self.band.ring] + self._noise_dn2, np.float32)
+        return np.asarray(self.band.power * self.levels[self.band.ring] + self._noise_dn2, np.float32)
 
     def move_edge(self, step: Floats) -> float:
         """Move the first parameters of the edge by `step` (samples), within their range; return the largest change."""

@@ -255,14 +255,18 @@ class RefractionLikelihood:
             part.power,
         )
 
-    def noise_power(self, frame: Linear) -> float:
-        """Return the noise power per frequency of the tapered window's DFT in DN^2.
+    def noise(self, frame: Linear) -> Noise:
+        """Return the noise of a sample of the frame.
 
         It comes from the sensor's gain, or, if that is unknown, from the quarter of the frequencies with the lowest
         |H|^2 in the spectrum of the last `residual`.
         """
         stopband_power = np.abs(self.fft.spectrum.ravel()[self.bands.stopband].astype(np.complex128)) ** 2
         weight = float(np.vdot(self.sample_weights, self.sample_weights))
-        noise = Noise.of(self.sensor, self.grid.n, float(np.median(stopband_power)) / np.log(2) / weight, frame.mean_dn)
-        lit = float(np.einsum("ij,ij,ij->", frame.y, self.sample_weights, self.sample_weights))
-        return max(noise.per_dn * lit + noise.floor_dn2 * weight, 1e-20)
+        return Noise.of(self.sensor, self.grid.n, float(np.median(stopband_power)) / np.log(2) / weight, frame.mean_dn)
+
+
+def noise_power(noise: Noise, frame: Linear, weights: Image) -> float:
+    """Return the noise power per frequency of the DFT of a frame's window with weights, in DN^2."""
+    squared = np.square(weights, dtype=np.float64)
+    return max(noise.per_dn * float((squared * frame.y).sum()) + noise.floor_dn2 * float(squared.sum()), 1e-20)

@@ -87,14 +87,18 @@ class Bench:
         made = self._ladder[1](take.staged.counts, simulated=True)
         return take.sampled(made.picture), made.report
 
-    def refraction(self, take: "SimulatedFrame") -> float:
-        """Return the mean sphere estimated from the frame, in dpt (positive: myopia); NaN without an estimate."""
+    def refraction(self, take: "SimulatedFrame") -> tuple[float, float, float]:
+        """Return M, J0 and J45 estimated from the frame as wavefront in dpt (positive M: myopia); NaN if refused."""
         if self._refractor is None or self._refractor[0] != take.calibration.id:
             found = RefractionEstimator(take.calibration, take.shape, self.planner, 0)
             self._refractor = take.calibration.id, found
         refractor, counts = self._refractor[1], take.staged.counts
         eye = refractor.find(counts, None, refractor.defects(counts))
-        return eye.sphere_dpt if isinstance(eye, Refraction) else float("nan")
+        if isinstance(eye, Refraction):
+            eye = refractor.add_cylinder(eye)
+        if not isinstance(eye, Refraction) or eye.cylinder is None:
+            return (float("nan"),) * 3
+        return eye.sphere_dpt, eye.cylinder.j0_dpt, eye.cylinder.j45_dpt
 
     def tikhonov(self, take: "SimulatedFrame", mu: float) -> Image:
         """Return the paper's solution for one weight mu, on the samples of the scores."""
