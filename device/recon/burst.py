@@ -38,10 +38,12 @@ from device.values import Calibration, FrameUse, Image
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
 LEAST_SD = 6.0  # a match by chance: the highest of 10,000 independent values lies at about 4 sd
-LEAST_OF_TYPICAL = 0.75  # of the median correlation of the matching frames; half a lid reaches 0.5 of it
+LEAST_OF_TYPICAL = (
+    0.75  # of the median correlation of the matching frames; a frame half covered by the lid reaches 0.5 of it
+)
 LEAST_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
 MOST_FRAMES = 64
-LEAST_COARSE = 200  # samples along the shorter side
+LEAST_COARSE = 200  # samples of a quick look along its shorter side, to be registered
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class BurstReconstructor:
     def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
         """Return a frame (rows, cols) with its quick look, ready for `steps`, while the next frames are exposed.
 
-        With `refract` its refraction is being estimated, in a thread: for the first frame. FrameError for a frame
+        With `refract` a thread begins to estimate its refraction: for the first useful frame. FrameError for a frame
         without light, or with too many missing pixels.
         """
         seen, stage = self.joiner.see(counts, dark), self.single.stages[0]
@@ -81,26 +81,29 @@ class BurstReconstructor:
         the picture of that frame; so does a deadline that leaves no time to join them. FrameError for another shape, or
         if no frame can be used.
         """
-        if len(frames) == 1:
-            yield from self.single.steps(frames[0], dark, simulated=simulated, deadline=deadline)
-            return
         run, ready = _Run(self, deadline), dict(prepared or {})
+        tasks = {k: one.refraction for k, one in ready.items()}
+        if len(frames) == 1:
+            yield from self.single.steps(
+                frames[0], dark, simulated=simulated, deadline=deadline, refraction=tasks.get(0)
+            )
+            return
         saturated = yield from self._quick_look(frames[0], dark, ready.get(0), simulated)
         if not run.fits(self._cost_s(frames, ready, unusable)):
             self.see_cost.halve_maximum()
             self.join_cost.halve_maximum()
-            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0) for k in range(len(frames))]
-            yield from run.solve_one(frames[0], dark, uses, 0, simulated)
+            reasons = unusable or {}
+            uses: Sequence[FrameUse] = [FrameUse(k, False, None, 0.0, reasons.get(k)) for k in range(len(frames))]
+            yield from run.solve_one(frames[0], dark, uses, 0, simulated, tasks.get(0))
             return
         yield from run.join(frames, dark, unusable, {k: one.seen for k, one in ready.items()})
         assert run.joined is not None
         uses = run.joined.frames
         used = [one.index for one in uses if one.used]
         if len(used) == 1:
-            yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated)
+            yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, tasks.get(used[0]))
         else:
-            task = ready[used[0]].refraction if used[0] in ready else None
-            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated, task)
+            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated, tasks.get(used[0]))
 
     def _quick_look(
         self, counts: Pixels, dark: Pixels | None, prepared: PreparedFrame | None, simulated: bool
@@ -177,10 +180,16 @@ class _Run:
                 yield step
 
     def solve_one(
-        self, counts: Pixels, dark: Pixels | None, uses: Sequence[FrameUse], index: int, simulated: bool
-    ) -> Iterator[Step]:
-        """Yield the steps of the picture of one frame, the one with this index; `uses` says why no other is used."""
-        for step in self._owner.single.steps(counts, dark, simulated=simulated, deadline=self._deadline):
+        self, counts: Pixels, dark: Pixels | None, uses: Sequence[FrameUse], index: int, simulated: bool,
+        refraction: RefractionTask | None,
+    ) -> Iterator[Step]:  # fmt: skip
+        """Yield the steps of the picture of one frame, the one with this index; `uses` says why no other is used.
+
+        `refraction`: its task, if it has begun.
+        """
+        for step in self._owner.single.steps(
+            counts, dark, simulated=simulated, deadline=self._deadline, refraction=refraction
+        ):
             if isinstance(step, Reconstruction):
                 yield self._reported(step, only(index, uses))
             elif isinstance(step, RoundDone) or step.last:

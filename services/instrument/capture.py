@@ -75,7 +75,7 @@ class Press:
 class ExposedCapture:
     """Exposed capture: the lit frames and the dark frame of a press, before reconstruction.
 
-    `dark`: None if the press was interrupted before it. `expose_s`: duration of all exposures. `light`: dose report.
+    `dark`: None if its file was not on the disk. `expose_s`: duration of all exposures. `light`: dose report.
     `verdict`: first verdict, on `frame`. `unusable`: reason of each frame that must not enter the picture, by its
     index. `colours`: one frame in each other colour of light; `missing`: reason of each that was not taken. `written`
     waits for the frames that are being written to the disk, and returns their files by the number of the frame.
@@ -109,7 +109,7 @@ def split_notes(split: ExposureSplit) -> tuple[str, ...]:
     if split.parts == 1:
         return ()
     return (
-        f"each exposure was split into {split.parts} frames with the same light: the eye moved by "
+        f"each exposure was split into {split.parts} frames without more light: the eye moved by "
         f"{split.motion_deg:.2f} degrees during one (predicted gain {split.gain_db:.1f} dB)",
     )
 

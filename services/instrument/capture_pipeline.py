@@ -1,7 +1,8 @@
-"""Steps of one capture: lit and dark exposure, verdict, reconstruction in steps, record; and live pictures.
+"""Steps of one capture: dark and lit exposures, verdict, reconstruction in steps, record; and live pictures.
 
-The pipeline publishes nothing, knows no state of the exam and calls nothing back: the exam loop decides what happens
-between two steps. One thread, the one that owns the head, calls it.
+The pipeline publishes nothing and knows no state of the exam: the exam loop decides what happens between two steps. One
+thread, the one that owns the head, calls it. `taken` and `looked` are called during the exposures, `looked` in the
+thread of the preparation.
 """
 
 import logging
@@ -206,9 +207,9 @@ class CapturePipeline:
         """Return a dark frame, up to `count` lit ones and one in each of `colours`, as the function `expose`.
 
         A pipeline of bursts prepares each lit frame while the next one is exposed. `looked` is called in the thread of
-        the preparation, with the quick look of the first frame. While the eye moves the exposures of the lit frames are
-        split, as `choose_split` decides from the speed of the eye in the aiming stream and the light of the last good
-        frame.
+        the preparation, with the quick look of the first useful frame. While the eye moves the exposures of the lit
+        frames are split, as `choose_split` decides from the speed of the eye in the aiming stream and the light of the
+        last good frame.
         """
         count, split = (count, self._split(count)) if self.bursts is not None else (1, WHOLE)
         unable = self._unable(colours)
@@ -296,7 +297,7 @@ class CapturePipeline:
 
     def _steps(self, shot: ExposedCapture, deadline: Deadline) -> Iterator[Step]:
         dark, simulated = counts_of(shot.dark), shot.frame.simulated
-        if self.bursts is None or len(shot.frames) == 1:
+        if self.bursts is None:
             green = self.reconstructor.steps(shot.frame.counts, dark, simulated=simulated, deadline=deadline)
         else:
             counts = [frame.counts for frame in shot.frames]

@@ -19,7 +19,10 @@ log = logging.getLogger(__name__)
 
 
 class ExamEvents:
-    """Publisher of the exam. Not thread-safe: the thread `head` calls it, without a lock."""
+    """Publisher of the exam. Not thread-safe: the thread `head` calls it, without a lock.
+
+    The thread of the preparation calls `quick_look` with `is_exposing`, while `head` exposes and publishes nothing.
+    """
 
     def __init__(self, event_bus: EventBus, watchdog: Watchdog, progress: Progress, requests: ExamRequests) -> None:
         self._event_bus, self._watchdog, self._progress, self._requests = event_bus, watchdog, progress, requests
@@ -28,7 +31,7 @@ class ExamEvents:
 
     @property
     def output(self) -> ExamOutput:
-        """What other threads see; only this thread changes it."""
+        """What other threads see; only the publisher changes it."""
         return self._requests.snapshot.output
 
     def state(self) -> None:
@@ -54,7 +57,9 @@ class ExamEvents:
         With `is_exposing` it remains in its stage: the next frames are being exposed. The thread of the preparation
         calls this then, while the thread `head` publishes nothing.
         """
-        jpeg, url = picture_files.to_jpeg(look, QUICK_PX, simulated), f"/api/captures/{id}/quick.jpg"
+        jpeg, before = picture_files.to_jpeg(look, QUICK_PX, simulated), self.output.quick_looks.get(id)
+        # Where the first frame is not the reference the page has the look of another frame: a new URL replaces it.
+        url = f"/api/captures/{id}/quick.jpg" + ("" if before in (None, jpeg) else "?reference")
         self._show_quick_looks({**self.output.quick_looks, id: jpeg})
         if is_exposing:
             self._event_bus.publish("stage", **stage_event(press, id, self._progress.estimate(id), url))
@@ -75,8 +80,9 @@ class ExamEvents:
         self._event_bus.publish("kept", id=id)
 
     def failed(self, id: str, error: DiffuscopeError) -> None:
-        """Publish that a capture has failed, and end its progress."""
+        """Publish that a capture has failed, end its progress, and remove its quick look."""
         self._progress.finish(id, kept=False)
+        self.forget_quick_look(id)
         log.warning("capture failed: %s", error, extra={"code": error.code})
         self._event_bus.publish("failed", id=id, code=error.code, message=error.message, remedy=error.remedy)
 

@@ -111,7 +111,7 @@ class ExamLoop:
         return presses
 
     def _expose_pending(self) -> None:
-        """Expose the waiting press, lit and dark, publish its first verdict and queue the exposure for reconstruction.
+        """Expose the waiting press, dark and lit, publish its first verdict and queue the exposure for reconstruction.
 
         Consent and space are checked and a journal entry is written before the light; an error fails the press.
         """

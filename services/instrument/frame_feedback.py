@@ -19,7 +19,10 @@ FAILED_VERDICT = Verdict("again", "make.failed", {})
 
 
 class FrameAssessor:
-    """Assessment of frames: aiming hints, verdicts and laterality. Not thread-safe: head thread only."""
+    """Assessment of frames: aiming hints, verdicts and laterality. Not thread-safe.
+
+    The head thread calls it, and that of the preparation while the former exposes.
+    """
 
     def __init__(
         self, calibration: Calibration, shape: tuple[int, int], planner: Planner, index: int, camera: CameraSpec

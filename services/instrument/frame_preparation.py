@@ -13,7 +13,7 @@ from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.model.kernels import Pixels
 from device.values import Colour, Counts, Frame, Image
 
-Looked = Callable[[Image, bool], None]  # with the quick look of the first frame, and whether it is simulated
+Looked = Callable[[Image, bool], None]  # with the quick look of the first useful frame, and whether it is simulated
 
 
 def ignore_look(_: Image, simulated: bool) -> None:
@@ -49,7 +49,7 @@ class FramePreparation:
     uses: the thread of the preparation does. Only frames in the light of the burst, `colour`, are prepared. `begin_s`:
     begin of the press (clock seconds). `looked` is called once, with the quick look of the first useful frame.
 
-    A prepared frame holds 8 bytes per pixel: 16 frames of 2 MP take 270 MB.
+    A prepared frame holds 8 bytes per pixel: 8 frames of 2 MP, the most of a press, take 135 MB.
     """
 
     def __init__(self, assessor: Assessor, preparer: Preparer, colour: Colour, begin_s: float, looked: Looked) -> None:

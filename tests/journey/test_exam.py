@@ -24,6 +24,7 @@ from services.instrument.capture_pipeline import CapturePipeline, crop_to_field,
 from services.instrument.events import EventBus
 from services.records.capture_report import report_as_json
 from tests.journey.asking import live_picture
+from tests.journey.conftest import until
 
 RAWS = ("raw.tiff", "raw-1.tiff", "raw-2.tiff", "raw-3.tiff")
 FILES = {*RAWS, "raw-red.tiff", "dark.tiff", "picture.png", "colour.png", "quick.jpg", "report.json"}
@@ -187,6 +188,37 @@ class Blinking:
         return frame
 
 
+class FailsInTheThirdFrame:
+    """Camera that stalls in its third lit frame, after `is_ready`."""
+
+    def __init__(self, camera: Any, is_ready: Callable[[], bool]) -> None:
+        self._camera, self._is_ready, self._lit = camera, is_ready, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def expose(self, shot: ExposureSettings) -> Frame:
+        self._lit += self._camera.world.illumination is not None
+        if self._lit == 3:
+            until(self._is_ready)
+            raise CameraStalled("no frame came")
+        frame: Frame = self._camera.expose(shot)
+        return frame
+
+
+def test_the_quick_look_of_a_press_that_fails_is_forgotten(make_rig: Any) -> None:
+    rigs: list[Any] = []
+
+    def is_shown() -> bool:
+        return bool(rigs[0].exam.snapshot.output.quick_looks)
+
+    rigs.append(make_rig(camera=lambda camera: FailsInTheThirdFrame(camera, is_shown)))
+    with pytest.raises(CameraStalled):
+        rigs[0].exam.press("OD").result(30)
+    until(lambda: not is_shown())
+    assert rigs[0].world.illumination is None
+
+
 @pytest.mark.parametrize("closed", [{0}, {2}, {0, 1, 2}], ids=str)
 def test_closed_frames_of_a_burst_are_left_out_of_the_picture(make_rig: Any, closed: set[int]) -> None:
     rig = make_rig(camera=lambda camera: Blinking(camera, closed))
@@ -197,6 +229,8 @@ def test_closed_frames_of_a_burst_are_left_out_of_the_picture(make_rig: Any, clo
     assert frames[0].used, "the first good frame is the reference"
     assert [one.used for one in frames].count(True) == 4 - len(closed)
     assert all(one.reason for one in frames if not one.used)
+    *_, look = [data["url"] for kind, data in rig.published_events() if kind == "stage" and data["url"]]
+    assert look.endswith("?reference") is (0 in closed), "a new URL for the look of another frame than the first"
     reference = read_raw_tiff(rig.store.read(kept.id, "raw.tiff"))[0].astype(float)
     assert reference.std() > 3 * np.sqrt(reference.mean()), "an open eye has structure beyond its noise"
 

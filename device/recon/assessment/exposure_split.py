@@ -17,7 +17,7 @@ from math import pow
 from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
 
 MOST_FRAMES = 8  # of a press: what the fit rests on
-LEAST_MOTION_DEG = 0.257  # during one exposure: 4 pixels of the paper's sensor
+LEAST_MOTION_DEG = 0.257  # of a split, during one exposure: 4 pixels of the paper's sensor
 LEAST_GAIN_DB = 0.16  # the largest error of the fit
 LEAST_PART_E_PER_UM2 = 1.25 * LEAST_E_PER_UM2  # of one frame, which the frame quality must not call dark
 

@@ -9,7 +9,7 @@ from device.recon.model.kernels import Pixels, Places
 
 
 class RefractionTask:
-    """Estimation of mean sphere and field edge of a frame, then of its cylinder `with_cylinder`; begins at once.
+    """Estimation of mean sphere and field edge of a frame and, `with_cylinder`, of its cylinder; begins at once.
 
     `counts`, `dark` and `defects` as for `RefractionEstimator.find`. Tasks with the same `lock` run one after the
     other: an estimator holds the state of one frame. Any thread may ask for the results.
@@ -40,7 +40,7 @@ class RefractionTask:
         return self._whole.result()
 
     def _find(self, frame: tuple[Pixels, Pixels | None, Places | None]) -> Refraction | NoRefraction:
-        self._lock.acquire()  # until the end of `_finish`, in the same thread
+        self._lock.acquire()  # `_finish` releases it, in the same thread
         begin_s = self._clock.now_s()
         found = self._estimator.find(*frame)
         self.find_s = self._clock.now_s() - begin_s
