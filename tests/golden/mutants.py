@@ -191,7 +191,7 @@ MUTANTS: tuple[Mutant, ...] = (
     ),
     Mutant(REQUESTS, "            self._live_request = wanted\n", "", "tests/journey/test_consent.py"),
     Mutant(
-        PIPELINE, "    head.check()\n    run = _Exposing(", "    run = _Exposing(", scenario("head_lost"),
+        PIPELINE, "    head.check()\n    run, part = _Exposing(", "    run, part = _Exposing(", scenario("head_lost"),
     ),
     Mutant(
         PIPELINE, "head.light.on(Illumination(head.spec.light.preview_colour), eyes",

@@ -13,7 +13,17 @@ NAMED = (  # names are numbered by first appearance, so that equal names stay eq
     ("id", r"\b(?!0{8})[0-9a-f]{16}\b"),
 )
 MEASURED = {"report", "numbers", "verdict", "measured", "found", "placed", "x-aim"}  # floats below them are measured
-COUNTS = {"free_bytes", "size_bytes", "space_left", "people_left", "takes_s", "took_s", "left_s", "spent_s"}
+COUNTS = {
+    "free_bytes",
+    "size_bytes",
+    "undoable_bytes",
+    "space_left",
+    "people_left",
+    "takes_s",
+    "took_s",
+    "left_s",
+    "spent_s",
+}
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
 MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier
 OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer

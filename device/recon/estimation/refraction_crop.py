@@ -35,8 +35,8 @@ FLATTEST = 0.02  # cycles per sample, below which P is constant
 FITTED_RINGS = 10
 MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
 MOST_ITERATIONS = 40  # of conjugate gradients; with 80 the errors are the same
+COVARIANCE_ITERATIONS = 20  # for the covariance: its sds change by 1 % at the most
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
-COVARIANCE_SHARE = 1e-3  # the same for the covariance: its sds change by 0.3 %
 MODEL_SHARE = 0.0022  # of the mean: sd of what the model lacks
 MODEL_SD_DPT = 0.03  # of each component by the model, beside noise: RMS error of the paper's sensor in full light
 MOST_STEPS = 6
@@ -148,7 +148,7 @@ class CropRefinement:
 
     def _covariance(self, derivatives: list[Image]) -> Floats:
         """Return the inverse of D' K^-1 D for the derivatives D of the frame, (3, 3)."""
-        solved = [self._solve(part, None, COVARIANCE_SHARE)[1] for part in derivatives]
+        solved = [self._solve(part, None, COVARIANCE_ITERATIONS)[1] for part in derivatives]
         matrix = np.array([[np.vdot(a, b) for b in derivatives] for a in solved], np.float64)
         return np.asarray(np.linalg.inv((matrix + matrix.T) / 2))
 
@@ -220,7 +220,7 @@ class CropRefinement:
         return np.asarray(self._fft.forward() * self._root, np.complex64)
 
     def _solve(
-        self, frame: Image, start: Spectrum | None, residual_share: float = RESIDUAL_SHARE
+        self, frame: Image, start: Spectrum | None, most: int = MOST_ITERATIONS
     ) -> tuple[Spectrum, Image, Image]:
         """Return the whitened spectrum of a frame's detail, K^-1 times the frame, and the frame of the detail."""
         detail = np.zeros(self._otf.shape, np.complex64) if start is None else start
@@ -229,8 +229,8 @@ class CropRefinement:
         first = self._dot(self._adjoint(self._weighting(frame)), self._preconditioner)
         direction = rest * self._preconditioner
         size = self._dot(rest, self._preconditioner)
-        for _ in range(MOST_ITERATIONS):
-            if size <= residual_share * first:
+        for _ in range(most):
+            if size <= RESIDUAL_SHARE * first:
                 break
             seen = self._blurred(direction)
             moved = self._adjoint(self._weighting(seen)) + direction
