@@ -9,6 +9,9 @@ from tests.golden import compare, reconstructions
 # Of the largest value, and of each figure: the order of sums in an FFT depends on the processor, which moves a few
 # counts of the simulated frame by one. 3e-4 of pictures and 5e-4 of figures were seen between two processors.
 TOLERANCE = 2e-3
+# In dpt, and of the axis: the conjugate gradients of the refinement end before the rounding of single precision has
+# averaged out. 0.0024 dpt and 0.6 degrees were seen with another number of BLAS threads; an sd is 0.035 dpt.
+REFRACTION_TOLERANCE = 1e-2
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +27,7 @@ def test_the_record_holds_every_method(made: dict[str, Reconstruction]) -> None:
 def test_a_picture_and_its_report_are_as_recorded(made: dict[str, Reconstruction], name: str) -> None:
     recorded = reconstructions.picture(name)
     assert float(np.abs(made[name].picture - recorded).max()) <= TOLERANCE * float(np.abs(recorded).max())
-    difference = compare.difference(
-        compare.read("reconstructions")[name], reconstructions.report(made[name]), TOLERANCE
-    )
+    kept, now = compare.read("reconstructions")[name], reconstructions.report(made[name])
+    eyes = kept.pop("refraction_dpt"), now.pop("refraction_dpt")
+    difference = compare.difference(kept, now, TOLERANCE) or compare.difference(*eyes, REFRACTION_TOLERANCE)
     assert not difference, difference
