@@ -35,9 +35,15 @@ class Estimator:
         return found
 
 
-def begin(estimator: Estimator, lock: Lock, sphere_dpt: float, with_cylinder: bool = True) -> RefractionTask:
+def begin(estimator: Any, lock: Lock, sphere_dpt: float, with_cylinder: bool = True) -> RefractionTask:
     frame = np.full((2, 2), sphere_dpt, np.float32), None, None
-    return RefractionTask(estimator, lock, SystemClock(), frame, with_cylinder)  # type: ignore[arg-type]
+    return RefractionTask(estimator, lock, SystemClock(), frame, with_cylinder)
+
+
+def sphere_dpt(task: RefractionTask) -> float:
+    found = task.whole()
+    assert isinstance(found, Refraction)
+    return found.sphere_dpt
 
 
 def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> None:
@@ -45,7 +51,7 @@ def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> 
     tasks = [begin(estimator, lock, dpt) for dpt in (1.0, 2.0, 3.0)]
     assert not any(task.is_done for task in tasks)
     estimator.go.set()
-    assert [task.whole().sphere_dpt for task in tasks] == [1.0, 2.0, 3.0]  # type: ignore[union-attr]
+    assert [sphere_dpt(task) for task in tasks] == [1.0, 2.0, 3.0]
     pairs = [tuple(estimator.calls[k : k + 2]) for k in (0, 2, 4)]
     assert sorted(pairs) == [(("find", dpt), ("cylinder", dpt)) for dpt in (1.0, 2.0, 3.0)]
 
