@@ -26,16 +26,18 @@ def burst(
     *,
     in_visit: bool = False,
     parts: int = 1,
+    whole_s: float | None = None,
     taken: Callable[[Frame], None] = ignore_frame,
 ) -> tuple[Frame, ...]:
     """Return up to `count` frames in one illumination, which stays on from the first to the last of them.
 
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
-    off. With `parts` above 1 each of the `count` exposures is split into so many frames, and `shot` is one of them: the
-    lamp is then on no longer than for the whole exposures, each with the overhead of one frame, so that the last frames
-    may be missing. The dose counts for `eyes`, without a visit up to a lower limit. `taken` is called with each frame
-    after its read-out, while the lamp is on: it must return at once. Raises LightCut if the guard has ended the first
-    exposure; a frame that it ended later is left out. The lamp is dark at every exit.
+    off. With `parts` above 1 each of the `count` exposures of `whole_s` seconds (None: of all its parts) is split into
+    so many frames, and `shot` is one of them: the lamp is then on no longer than for the whole exposures, each with the
+    overhead of one frame, so that the last frames may be missing. The dose counts for `eyes`, without a visit up to a
+    lower limit. `taken` is called with each frame after its read-out, while the lamp is on: it must return at once.
+    Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left out. The lamp is dark
+    at every exit.
     """
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):
@@ -49,8 +51,9 @@ def burst(
             taken(frame)
             longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
             if parts > 1 and len(frames) == 1:
-                whole_s = (parts - 1) * shot.exposure_s + longest_s  # of an exposure, and its overhead
-                most_s = min(most_s, count * whole_s + ROUNDING_S)
+                overhead_s = longest_s - shot.exposure_s
+                exposed_s = parts * shot.exposure_s if whole_s is None else whole_s
+                most_s = min(most_s, count * (exposed_s + overhead_s) + ROUNDING_S)
     return tuple(frames)
 
 

@@ -33,6 +33,7 @@ class GuardedLight:
         self._light, self._clock, self.max_on_s = light, clock, max_on_s
         self.hazard, self.ledger = hazard, ledger
         self.given_j_per_cm2 = 0.0  # dose of the last stretch of light
+        self.total_j_per_cm2 = 0.0  # dose of all stretches of light that are over
         self._timer: Timer | None = None
         self._held: LightContext | None = None
         self._reserved: Reserved | None = None
@@ -140,6 +141,7 @@ class GuardedLight:
             given_s = self._dark_at_s - self._lit_at_s
             self._debt_s += given_s
         self.given_j_per_cm2 = self.hazard.dose_j_per_cm2(self._glow, given_s)
+        self.total_j_per_cm2 += self.given_j_per_cm2
         with suppress(StoreError):  # the whole reservation stays counted, and the next light is refused
             self.ledger.settle(reserved, self.given_j_per_cm2)
 

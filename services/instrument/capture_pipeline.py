@@ -19,7 +19,7 @@ from device.errors import DiffuscopeError, FrameError
 from device.head import Head
 from device.light_safety.burst import burst, require_lit
 from device.recon.assessment.aiming import Aim
-from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, choose_split
+from device.recon.assessment.exposure_split import WHOLE, ExposureSplit, PressLight, choose_split, dark_fits
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.assessment.laterality import Laterality
 from device.recon.burst_reconstructor import BurstReconstructor, PreparedFrame
@@ -138,7 +138,8 @@ class Exposure:
     `dark` is None if an interrupted press has none. `begin_s` (clock seconds) and `duration_s` are those of all
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
     picture, by its index; `missing` the reason of each other colour that was not taken; `split` how the exposures of
-    the lit frames were split; `ready` what was prepared of the frames during the exposure, by their numbers.
+    the lit frames were split; `overhead_s` what a lit frame took longer than its exposure, at most; `ready` what was
+    prepared of the frames during the exposure, by their numbers.
     """
 
     lit: tuple[Frame, ...]
@@ -150,6 +151,7 @@ class Exposure:
     unusable: Mapping[int, str] = field(default_factory=dict)
     missing: Mapping[Colour, str] = field(default_factory=dict)
     split: ExposureSplit = WHOLE
+    overhead_s: float = 0.0
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
 
 
@@ -198,25 +200,24 @@ class CapturePipeline:
     ) -> None:  # fmt: skip
         self.reconstructor, self.live, self.bursts, self.colours = reconstructor, live, bursts, colours
         self._head, self._clock, self._feedback, self._origin = head, clock, feedback, origin
-        self._light_e_per_um2_s: float | None = None  # of the last good frame
+        self._known: PressLight | None = None  # of the last good press
 
     def expose(
-        self, eye: Eye, *, in_visit: bool = False, count: int = 1, colours: Sequence[Colour] = (),
-        field: str | None = None, taken: Taken = ignore_frame, looked: Looked = ignore_look,
+        self, eye: Eye, *, in_visit: bool = False, count: int = 1, split: ExposureSplit = WHOLE,
+        colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
+        looked: Looked = ignore_look,
     ) -> Exposure:  # fmt: skip
         """Return a dark frame, up to `count` lit ones and one in each of `colours`, as the function `expose`.
 
-        A pipeline of bursts prepares each lit frame while the next one is exposed. `looked` is called in the thread of
-        the preparation, with the quick look of the first useful frame. While the eye moves the exposures of the lit
-        frames are split, as `choose_split` decides from the speed of the eye in the aiming stream and the light of the
-        last good frame.
+        A pipeline of bursts prepares each lit frame while the next one is exposed, and splits the exposures as `split`
+        says. `looked` is called in the thread of the preparation, with the quick look of the first useful frame.
         """
-        count, split = (count, self._split(count)) if self.bursts is not None else (1, WHOLE)
+        count, split = (count, split) if self.bursts is not None else (1, WHOLE)
         unable = self._unable(colours)
         able = [] if self.colours is None else [colour for colour in colours if colour not in unable]
         run = partial(
             expose, self._head, (eye,), self._clock, in_visit=in_visit, count=count, colours=able, field=field,
-            parts=split.parts,
+            split=split,
         )  # fmt: skip
         if self.bursts is None:
             exposure = run(taken=taken)
@@ -230,11 +231,17 @@ class CapturePipeline:
 
                 exposure = run(taken=read_out)
                 exposure = replace(exposure, ready=preparation.finish())
-        return replace(exposure, missing={**unable, **exposure.missing}, split=split)
+        return replace(exposure, missing={**unable, **exposure.missing})
 
-    def _split(self, count: int) -> ExposureSplit:
+    def choose_split(self, count: int) -> ExposureSplit:
+        """Return the split of the `count` exposures of the next press while the eye moves, as `choose_split` there.
+
+        From the speed of the eye in the aiming stream, and light and overhead of the last good press.
+        """
+        if self.bursts is None:
+            return WHOLE
         speed_deg_per_s = self._feedback.speed_deg_per_s(self._clock.now_s())
-        return choose_split(count, self._head.spec.camera.exposure_s, speed_deg_per_s, self._light_e_per_um2_s)
+        return choose_split(count, self._head.spec.camera.exposure_s, speed_deg_per_s, self._known)
 
     def resume(self, taken: Exposure, colours: Sequence[Colour]) -> Exposure:
         """Return the frames of an interrupted press, with the reason of each of its `colours` that has none."""
@@ -261,7 +268,7 @@ class CapturePipeline:
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
         light_e_per_um2 = verdicts[best].numbers.get("light_e_per_um2")
         if verdicts[best].word == "good" and light_e_per_um2 is not None:
-            self._light_e_per_um2_s = light_e_per_um2 / exposure.lit[best].exposure_s
+            self._known = PressLight(light_e_per_um2 / exposure.lit[best].exposure_s, exposure.overhead_s)
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
         unusable = {
             place: f"{FRAME_QUALITY}: {verdicts[k].code}"
@@ -307,8 +314,9 @@ class CapturePipeline:
         if self.colours is None or not (shot.colours or shot.missing):
             return green
         colours = {colour: frame.counts for colour, frame in shot.colours.items()}
-        if shot.dark is not None and any(one.exposure_s > 1.5 * shot.dark.exposure_s for one in shot.colours.values()):
-            dark = None  # that of a split exposure has the dark current of a part, at most half of it
+        if shot.dark is not None:
+            dark_s = shot.dark.exposure_s
+            dark = dark if all(dark_fits(one.exposure_s, dark_s) for one in shot.colours.values()) else None
         return self.colours.steps(green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing)
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
@@ -386,12 +394,13 @@ def _best_psf(head: Head, clock: Clock, calibration: Calibration, planner: Plann
 
 def expose(
     head: Head, eyes: tuple[Eye, ...], clock: Clock, *, in_visit: bool = False, count: int = 1,
-    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame, parts: int = 1,
+    colours: Sequence[Colour] = (), field: str | None = None, taken: Taken = ignore_frame,
+    split: ExposureSplit = WHOLE,
 ) -> Exposure:  # fmt: skip
     """Return a dark frame, up to `count` lit ones, and one in each of `colours`; they are exposed in this order.
 
-    With `parts` above 1 each of the `count` exposures is split into so many frames of equal length, in the same light;
-    the dark frame is as long as a part, those in other colours are whole. The dose counts for `eyes`, without a visit
+    With a `split` each of the `count` exposures is split into so many frames of equal length, without more light; the
+    dark frame is as long as a part, those in other colours are whole. The dose counts for `eyes`, without a visit
     up to a lower limit. There are fewer lit frames if the guard permits no light for so long. A colour that cannot be
     taken is missing, with the reason; the lit frames are kept. `field`: field of view of the programme, to which a
     simulated eye turns. `taken` is called with each frame after its read-out and must return at once: the lamp may be
@@ -401,44 +410,62 @@ def expose(
     cannot be on. The lamp is off at every exit.
     """
     head.check()
-    run, part = _Exposing(head, eyes, clock, in_visit, taken), ExposureSettings(head.spec.camera.exposure_s / parts)
+    run, part = _Exposing(head, eyes, clock, in_visit, taken), _part_of(head, split)
     announce_eye(head, eyes, field)
     head.camera.prepare(part)
     try:
         dark = head.camera.expose(part)  # first: a frame can be prepared as soon as it has been read out
         run.report(dark)
-        lit = run.lit(Illumination(head.spec.light.colour), part, count, parts)
-        others, missing = run.colours(colours)
-        return Exposure(lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing)
+        lit = run.lit(Illumination(head.spec.light.colour), part, count, split.parts)
+        overhead_s, (others, missing) = run.overhead_s, run.colours(colours)
+        return Exposure(
+            lit, others, dark, run.begin_s, run.duration_s, run.given_j_per_cm2, missing=missing, split=split,
+            overhead_s=overhead_s,
+        )  # fmt: skip
     finally:
         head.light.off()
 
 
+def _part_of(head: Head, split: ExposureSplit) -> ExposureSettings:
+    return ExposureSettings(head.spec.camera.exposure_s if split.part_s is None else split.part_s)
+
+
 class _Exposing:
-    """Exposures of one press, with their dose until now; begins with its construction."""
+    """Exposures of one press, with their dose until now; begins with its construction.
+
+    `overhead_s`: what a frame of the last light took longer than its exposure, at most.
+    """
 
     def __init__(self, head: Head, eyes: tuple[Eye, ...], clock: Clock, in_visit: bool, taken: Taken) -> None:
         self._head, self._eyes, self._clock, self._in_visit, self._taken = head, eyes, clock, in_visit, taken
-        self.begin_s, self.given_j_per_cm2 = clock.now_s(), 0.0  # of the stretches of light that are over
+        self.begin_s = self._reported_s = clock.now_s()
+        self.overhead_s, self._before_j_per_cm2 = 0.0, head.light.total_j_per_cm2
 
     @property
     def duration_s(self) -> float:
         """Seconds since the begin."""
         return self._clock.now_s() - self.begin_s
 
+    @property
+    def given_j_per_cm2(self) -> float:
+        """Dose of this press until now, with that of a light whose frame failed."""
+        light = self._head.light
+        return light.total_j_per_cm2 - self._before_j_per_cm2 + light.running_j_per_cm2
+
     def report(self, frame: Frame) -> None:
         """Report a frame after its read-out, with the dose until now."""
-        self._taken(frame, self.given_j_per_cm2 + self._head.light.running_j_per_cm2, self.duration_s)
+        now_s = self._clock.now_s()
+        self.overhead_s = max(self.overhead_s, now_s - self._reported_s - frame.exposure_s)
+        self._reported_s = now_s
+        self._taken(frame, self.given_j_per_cm2, self.duration_s)
 
     def lit(self, glow: Illumination, shot: ExposureSettings, count: int = 1, parts: int = 1) -> tuple[Frame, ...]:
         """Return up to `count` exposures in one light, each split into `parts` frames of `shot`."""
-        camera, light = self._head.camera, self._head.light
-        frames = burst(
-            camera, light, glow, shot, count, self._clock, self._eyes, in_visit=self._in_visit, parts=parts,
-            taken=self.report,
+        camera, self.overhead_s, self._reported_s = self._head.camera, 0.0, self._clock.now_s()
+        return burst(
+            camera, self._head.light, glow, shot, count, self._clock, self._eyes, in_visit=self._in_visit, parts=parts,
+            whole_s=self._head.spec.camera.exposure_s, taken=self.report,
         )  # fmt: skip
-        self.given_j_per_cm2 += light.given_j_per_cm2
-        return frames
 
     def colours(self, colours: Sequence[Colour]) -> tuple[dict[Colour, Frame], dict[Colour, str]]:
         """Return one frame in each of `colours`, and the reason of each that could not be taken."""

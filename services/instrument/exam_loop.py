@@ -131,13 +131,16 @@ class ExamLoop:
         target.permit()  # again: the consent may have been withdrawn while the press waited
         self._parts.store.refuse_light_in_vain()
         entry = press.journal_entry(id)
-        writer = self._parts.capture_journal.begin(entry, press.key, target.frames, target.colours)
+        split = self._pipeline.choose_split(target.frames)
+        planned = target.frames * split.parts
+        writer = self._parts.capture_journal.begin(entry, press.key, planned, target.colours)
         shared = RawMetadata(id, press.eye, taken_at, calibration_id=head.calibration.id, head=head.spec.name)
         self._events.stage(press, id, "expose")
         exposure = self._pipeline.expose(
             press.eye,
             in_visit=target.visit is not None,
             count=target.frames,
+            split=split,
             colours=target.colours,
             field=target.field,
             taken=FrameSink(writer, shared, head.spec.light.colour),

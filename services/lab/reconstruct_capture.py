@@ -48,13 +48,14 @@ Box = tuple[slice, slice]
 class CaptureFrames:
     """Raw frames of one capture: the burst `lit`, its reference first, and one frame in each other colour of light.
 
-    `dark`: dark frame of all of them; `light`: colour of the burst, None if it is unknown; `unusable`: reason of each
-    frame of the burst that must not enter the picture, by its index.
+    `dark`: dark frame of the burst and, where it fits them, of the other colours; `light`: colour of the burst, None if
+    it is unknown; `unusable`: reason of each frame of the burst that must not enter the picture, by its index.
     """
 
     lit: tuple[Path, ...]
     colours: Mapping[Colour, Path] = field(default_factory=dict)
     dark: Path | None = None
+    dark_fits_colours: bool = True
     light: Colour | None = None
     unusable: Mapping[int, str] = field(default_factory=dict)
 
@@ -103,7 +104,7 @@ class CaptureReconstructor:
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
         made = plan.solve([without_bad(one.raw) for one in lit], unusable, dark, {
             name: without_bad(one.raw) for name, one in others.items()
-        })  # fmt: skip
+        }, dark if frames.dark_fits_colours else None)  # fmt: skip
         return self._reported(made, plan, [*lit, *others.values()], notes)
 
     def _single(self, frames: CaptureFrames) -> CaptureReconstruction:
@@ -203,8 +204,9 @@ class _Plan:
         self._colours = ColourReconstructor(self.single, solvers) if others else None
 
     def solve(
-        self, lit: Sequence[Pixels], unusable: Mapping[int, str], dark: Image | None, others: Mapping[Colour, Pixels]
-    ) -> Reconstruction:
+        self, lit: Sequence[Pixels], unusable: Mapping[int, str], dark: Image | None,
+        others: Mapping[Colour, Pixels], others_dark: Image | None,
+    ) -> Reconstruction:  # fmt: skip
         """Return the picture, with `colour` if another colour was solved; at least one frame of the burst is usable."""
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
         order = sorted(range(len(lit)), key=lambda k: k in unusable)  # the first one must be usable
@@ -215,7 +217,7 @@ class _Plan:
         if self._colours is not None:
             solved = {name: counts for name, counts in others.items() if name not in self._missing}
             steps = self._colours.steps(
-                steps, solved, dark, simulated=False, deadline=deadline, missing=self._missing
+                steps, solved, others_dark, simulated=False, deadline=deadline, missing=self._missing
             )  # fmt: skip
         (made,) = deque(steps, maxlen=1)
         assert isinstance(made, Reconstruction)

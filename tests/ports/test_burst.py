@@ -67,6 +67,20 @@ def test_split_exposures_have_no_more_light_than_whole_ones(overhead_s, count, p
         assert exposed_s[1] == pytest.approx(exposed_s[0]), "a camera without overhead loses no light"
 
 
+@pytest.mark.parametrize("overhead_s", [0.0, 0.004, 0.02])
+@pytest.mark.parametrize(("count", "parts"), [(1, 4), (4, 2)])
+def test_parts_that_are_shorter_by_the_overhead_are_all_taken(overhead_s, count, parts):
+    rig, whole_s = guarded_rig(), 0.1
+    light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock))
+    camera = SlowCamera(rig.camera, rig.clock, overhead_s)
+    part = ExposureSettings((whole_s + overhead_s) / parts - overhead_s)
+    begin_s = rig.clock.now_s()
+    glow = Illumination("green")
+    frames = burst(camera, light, glow, part, count, rig.clock, parts=parts, whole_s=whole_s)
+    assert len(frames) == count * parts
+    assert rig.clock.now_s() - begin_s <= count * (whole_s + overhead_s) + 1e-5  # rounding
+
+
 class UnpluggedCamera:
     """Camera that is unplugged after its first exposure."""
 

@@ -9,7 +9,9 @@ from device.recon.assessment.exposure_split import (
     LEAST_MOTION_DEG,
     MOST_FRAMES,
     WHOLE,
+    PressLight,
     choose_split,
+    dark_fits,
     loss_db,
 )
 from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
@@ -28,6 +30,7 @@ counts = st.integers(1, 6)
 exposures_s = st.floats(0.005, 0.5)
 speeds_deg_per_s = st.floats(0, 60)
 lights_e_per_um2_s = st.floats(0.01, 1e5)
+overheads_s = st.floats(0, 0.1)
 
 
 @pytest.mark.parametrize(("thousand_e", "motion_px", "psnr_db"), MEASURED)
@@ -38,9 +41,11 @@ def test_the_loss_is_that_of_the_measured_pictures(thousand_e, motion_px, psnr_d
         assert predicted_db == pytest.approx(still_db - found_db, abs=0.16)  # the error of the fit
 
 
-@given(counts, exposures_s, speeds_deg_per_s, lights_e_per_um2_s)
-def test_a_split_adds_no_light_and_is_made_for_a_gain(count, exposure_s, speed_deg_per_s, light_e_per_um2_s) -> None:
-    split = choose_split(count, exposure_s, speed_deg_per_s, light_e_per_um2_s)
+@given(counts, exposures_s, speeds_deg_per_s, lights_e_per_um2_s, overheads_s)
+def test_a_split_adds_no_light_and_is_made_for_a_gain(
+    count, exposure_s, speed_deg_per_s, light_e_per_um2_s, overhead_s
+) -> None:
+    split = choose_split(count, exposure_s, speed_deg_per_s, PressLight(light_e_per_um2_s, overhead_s))
     if split == WHOLE:
         return
     motion_deg, light_e_per_um2 = speed_deg_per_s * exposure_s, light_e_per_um2_s * exposure_s
@@ -48,19 +53,37 @@ def test_a_split_adds_no_light_and_is_made_for_a_gain(count, exposure_s, speed_d
     assert split.parts * count <= MOST_FRAMES
     assert split.motion_deg == pytest.approx(motion_deg)
     assert split.motion_deg > LEAST_MOTION_DEG
-    assert light_e_per_um2 / split.parts > LEAST_E_PER_UM2, "a part would be judged as too dark"
+    assert split.part_s is not None
+    assert light_e_per_um2_s * split.part_s > LEAST_E_PER_UM2, "a part would be judged as too dark"
+    assert split.parts * (split.part_s + overhead_s) == pytest.approx(exposure_s + overhead_s), (
+        "the lamp is on for longer"
+    )
     whole_db, parts_db = (
         loss_db(frames, count * motion_deg, count * light_e_per_um2) for frames in (count, count * split.parts)
     )
-    assert split.gain_db == pytest.approx(whole_db - parts_db)
+    assert split.gain_db <= whole_db - parts_db + 1e-9, "shorter light is no gain"  # rounding
     assert split.gain_db >= LEAST_GAIN_DB
 
 
 @given(counts, exposures_s, lights_e_per_um2_s)
 def test_an_eye_that_stands_still_or_is_not_seen_has_whole_exposures(count, exposure_s, light_e_per_um2_s) -> None:
     for speed_deg_per_s in (None, 0.0, LEAST_MOTION_DEG / exposure_s * 0.999):
-        assert choose_split(count, exposure_s, speed_deg_per_s, light_e_per_um2_s) == WHOLE
+        assert choose_split(count, exposure_s, speed_deg_per_s, PressLight(light_e_per_um2_s, 0.0)) == WHOLE
     assert choose_split(count, exposure_s, 10.0, None) == WHOLE, "the light is not known"
+
+
+def test_an_overhead_of_the_frames_takes_light_from_a_split() -> None:
+    """0.1 s of 200 electrons per um^2, 5 degrees per second: 5 ms of overhead cost little, 40 ms all of the gain."""
+    none, short, long = (choose_split(1, 0.1, 5.0, PressLight(2000.0, overhead_s)) for overhead_s in (0, 0.005, 0.04))
+    assert none.parts * none.part_s == pytest.approx(0.1)
+    assert short.parts * short.part_s < 0.1
+    assert 0.3 < short.gain_db < none.gain_db
+    assert long == WHOLE
+
+
+@pytest.mark.parametrize(("exposure_s", "fits"), [(0.05, True), (0.1, True), (0.2, False), (0.8, False)])
+def test_a_dark_frame_fits_frames_of_its_own_length(exposure_s: float, fits: bool) -> None:
+    assert dark_fits(exposure_s, 0.1) is fits
 
 
 @given(st.floats(0, 3), st.floats(0.1, 1e4), st.integers(1, 8))
@@ -73,7 +96,7 @@ def test_more_light_and_less_motion_of_one_exposure_lose_less(motion_deg, light_
 def test_little_light_needs_more_motion() -> None:
     """A drift of 5 pixels in one exposure: a gain at 20,000 electrons, a loss at 2,000."""
     speed_deg_per_s = 5 * DEG_PER_PX / 0.1
-    bright, dim = (choose_split(1, 0.1, speed_deg_per_s, light * E_PER_UM2 / 0.1) for light in (20, 2))
+    bright, dim = (choose_split(1, 0.1, speed_deg_per_s, PressLight(light * E_PER_UM2 / 0.1, 0.0)) for light in (20, 2))
     assert bright.parts > 1
     assert 0.4 < bright.gain_db < 0.9  # 0.5 dB measured with 4 pixels and 4 frames, 0.8 with 11 and 8
     assert dim == WHOLE

@@ -175,11 +175,13 @@ def test_exposures_are_split_while_the_eye_moves_and_the_report_says_why(bench: 
         bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, MovingEye(), bursts=NoBursts(),
         colours=RedOnly(),
     )  # fmt: skip
-    first = pipeline.expose("OD", count=1, colours=["red"])
+    first = pipeline.expose("OD", count=1, colours=["red"], split=pipeline.choose_split(1))
     assert [len(first.lit), split_notes(first.split)] == [1, ()], "the light of this eye is not known yet"
     pipeline.assess(first)
-    second = pipeline.expose("OD", count=1, colours=["red"])
-    assert len(second.lit) == second.split.parts > 1
+    split = pipeline.choose_split(1)
+    second = pipeline.expose("OD", count=1, colours=["red"], split=split)
+    assert second.split == split
+    assert len(second.lit) == split.parts > 1
     exposure_s = bench.head.spec.camera.exposure_s
     assert sum(frame.exposure_s for frame in second.lit) == pytest.approx(exposure_s)
     assert second.dose_j_per_cm2 == pytest.approx(first.dose_j_per_cm2, rel=1e-6), "the same light"
@@ -194,7 +196,7 @@ class FailsInRed:
     """Camera that stalls while the lamp is red."""
 
     def __init__(self, bench: Bench) -> None:
-        self._camera, self._world = bench.head.camera, bench.world
+        self._camera, self._world, self._clock = bench.head.camera, bench.world, bench.clock
         self.shape = self._camera.shape
 
     def prepare(self, shot: ExposureSettings) -> None:
@@ -203,6 +205,7 @@ class FailsInRed:
     def expose(self, shot: ExposureSettings) -> Frame:
         glow = self._world.illumination
         if glow is not None and glow.colour == "red":
+            self._clock.sleep(1.0)
             raise CameraStalled("no frame came")
         return self._camera.expose(shot)
 
@@ -224,8 +227,11 @@ def test_other_colours_are_taken_after_the_dark_and_the_lit_frames_and_their_dos
 
 
 def test_a_colour_that_fails_leaves_the_lit_frames_and_its_reason(bench: Bench) -> None:
+    before_j_per_cm2 = bench.head.light.ledger.spent_j_per_cm2("OD")
     exposure = expose(replace(bench.head, camera=FailsInRed(bench)), ("OD",), bench.clock, count=3, colours=["red"])
     assert (len(exposure.lit), dict(exposure.colours)) == (3, {})
+    spent_j_per_cm2 = bench.head.light.ledger.spent_j_per_cm2("OD") - before_j_per_cm2
+    assert exposure.dose_j_per_cm2 == pytest.approx(spent_j_per_cm2), "the red light was given, too"
     assert exposure.missing == {"red": "no frame came"}
     assert exposure.dark.illumination is None
     assert bench.world.illumination is None

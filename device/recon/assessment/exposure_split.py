@@ -8,11 +8,13 @@ Loss of a picture against one exposure of a still eye, in dB, for m frames that 
 The first term is the motion blur of one frame, the second the displacement between the frames, the third read noise and
 registration. D: motion of the eye over the light of the press, degrees; L: light of the press, mean electrons per um^2
 of the sensor. Fitted to twelve pictures of one photograph (one exposure, 4 and 8 frames; none to 12 pixels of 0.064
-degrees; 22 and 220 electrons per um^2), at most 0.16 dB off. NUMERICS.md 9.3.
+degrees; 22 and 220 electrons per um^2), at most 0.16 dB off. The lamp stays on during the overhead of a frame (its
+read-out, the wait for its begin), and a press must not have more light than without a split: the parts are shorter by
+this overhead. Lost light counts at 0.7 dB per halving. NUMERICS.md 9.3.
 """
 
 from dataclasses import dataclass
-from math import pow
+from math import log2, pow
 
 from device.recon.assessment.frame_quality import LEAST_E_PER_UM2
 
@@ -24,46 +26,69 @@ LEAST_PART_E_PER_UM2 = 1.25 * LEAST_E_PER_UM2  # of one frame, which the frame q
 REFERENCE_E_PER_UM2, BLUR_DEG, BLUR_DB, BLUR_POWER = 220.0, 0.372, 2.0, 0.34
 DISPLACED_DB, MOST_DISPLACED_DB = 0.2, 0.55
 FRAME_DB, FRAME_POWER = 0.0106, 0.7
+MOST_DARK_RATIO = 1.5  # a frame of twice the exposure has twice the dark current
+HALVING_DB = 0.7  # of half the light, measured with one and two frames of six photographs
 
 
 @dataclass(frozen=True)
 class ExposureSplit:
-    """Split of each exposure of a press into `parts` of equal length, 1 for none, with its predicted gain.
+    """Split of each exposure of a press into `parts` of `part_s` seconds each, with its predicted gain.
 
-    `motion_deg`: motion of the eye during one whole exposure. `gain_db`: against exposures that are not split.
+    `parts` is 1 and `part_s` None without a split. `motion_deg`: motion of the eye during one whole exposure.
+    `gain_db`: against exposures that are not split, less what the shorter light loses.
     """
 
     parts: int = 1
     motion_deg: float = 0.0
     gain_db: float = 0.0
+    part_s: float | None = None
 
 
 WHOLE = ExposureSplit()
 
 
+@dataclass(frozen=True)
+class PressLight:
+    """What is known of the exposures of the next press from those before.
+
+    `light_e_per_um2_s`: mean light on the sensor per second of exposure; `overhead_s`: what a frame takes longer than
+    its exposure, seconds.
+    """
+
+    light_e_per_um2_s: float
+    overhead_s: float
+
+
 def choose_split(
-    count: int, exposure_s: float, speed_deg_per_s: float | None, light_e_per_um2_s: float | None
+    count: int, exposure_s: float, speed_deg_per_s: float | None, known: PressLight | None
 ) -> ExposureSplit:
     """Return how to split each of the `count` exposures of a press, `exposure_s` seconds each.
 
-    `speed_deg_per_s`: of the eye in the aiming stream; `light_e_per_um2_s`: mean light on the sensor per second of
-    exposure; None if unknown: then nothing is split. A split has at most MOST_FRAMES frames in all, each with enough
-    light of its own, and is chosen for the largest predicted gain, at least LEAST_GAIN_DB, if the eye moves by more
-    than LEAST_MOTION_DEG during one exposure. The sum of the parts is the exposure: no light is added.
+    `speed_deg_per_s`: of the eye in the aiming stream; None, or nothing `known` of the light: then nothing is split. A
+    split has at most MOST_FRAMES frames in all, each with enough light of its own, and is chosen for the largest
+    predicted gain, at least LEAST_GAIN_DB, if the eye moves by more than LEAST_MOTION_DEG during one exposure. The lamp
+    is on for as long as for the whole exposures: parts and overheads fill the time of an exposure and one overhead.
     """
-    if speed_deg_per_s is None or light_e_per_um2_s is None or light_e_per_um2_s <= 0:
+    if speed_deg_per_s is None or known is None or known.light_e_per_um2_s <= 0:
         return WHOLE
-    motion_deg, light_e_per_um2 = speed_deg_per_s * exposure_s, light_e_per_um2_s * exposure_s
+    motion_deg = speed_deg_per_s * exposure_s
     if motion_deg <= LEAST_MOTION_DEG:
         return WHOLE
-    whole_db = loss_db(count, count * motion_deg, count * light_e_per_um2)
-    allowed = [parts for parts in range(2, MOST_FRAMES // count + 1) if light_e_per_um2 / parts >= LEAST_PART_E_PER_UM2]
-    splits = [
-        ExposureSplit(parts, motion_deg, whole_db - loss_db(count * parts, count * motion_deg, count * light_e_per_um2))
-        for parts in allowed
-    ]
-    best = max(splits, key=lambda one: one.gain_db, default=WHOLE)
+    possible = [_split(count, parts, exposure_s, motion_deg, known) for parts in range(2, MOST_FRAMES // count + 1)]
+    best = max((one for one in possible if one is not None), key=lambda one: one.gain_db, default=WHOLE)
     return best if best.gain_db >= LEAST_GAIN_DB else WHOLE
+
+
+def _split(count: int, parts: int, exposure_s: float, motion_deg: float, known: PressLight) -> ExposureSplit | None:
+    """Return the split into so many parts; None if a part would have too little light."""
+    part_s = (exposure_s + known.overhead_s) / parts - known.overhead_s
+    if known.light_e_per_um2_s * part_s < LEAST_PART_E_PER_UM2:
+        return None
+    light_e_per_um2 = count * known.light_e_per_um2_s * exposure_s
+    whole_db = loss_db(count, count * motion_deg, light_e_per_um2)
+    parts_db = loss_db(count * parts, count * motion_deg, light_e_per_um2)
+    lost_db = HALVING_DB * log2(exposure_s / (parts * part_s))
+    return ExposureSplit(parts, motion_deg, whole_db - parts_db - lost_db, part_s)
 
 
 def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
@@ -76,3 +101,11 @@ def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
     blur_db = BLUR_DB * moved**2 / (moved**2 + frames**2)
     displaced_db = min(DISPLACED_DB * ((frames - 1) / frames * moved) ** 2, MOST_DISPLACED_DB)
     return blur_db + displaced_db + FRAME_DB * (frames - 1) * pow(relative, FRAME_POWER)
+
+
+def dark_fits(exposure_s: float, dark_s: float) -> bool:
+    """Return True if a dark frame of `dark_s` seconds holds the dark current of a frame of `exposure_s` seconds.
+
+    That of a split exposure is as long as a part: at most half of a whole exposure in another colour.
+    """
+    return exposure_s <= MOST_DARK_RATIO * dark_s

@@ -17,6 +17,7 @@ import tifffile
 from device.clock import Clock, SystemClock
 from device.config.image_files import only_frame, read_image_file
 from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError
+from device.recon.assessment.exposure_split import dark_fits
 from device.recon.model.fft_plans import Planner
 from device.values import Colour, Image
 from services.imaging.picture_files import read_raw_tiff
@@ -191,7 +192,17 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
-    return CaptureFrames(tuple(lit), colours, dark, unusable=unusable)
+    dark_s, *others_s = (
+        _exposure_s(one) for one in (lit[0], *colours.values())
+    )  # the dark frame is as long as a lit one
+    fits = dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
+    return CaptureFrames(tuple(lit), colours, dark, fits, unusable=unusable)
+
+
+def _exposure_s(raw: Path) -> float | None:
+    """Return the exposure that a raw frame states, seconds; None if it states none."""
+    stated = _stated(raw)
+    return None if stated is None else stated.exposure_s
 
 
 def _copied(path: str, digest: str, folder: Path) -> Path:
