@@ -1,8 +1,8 @@
 """`make bench`: speed and accuracy on this machine, with limits that a change must keep.
 
 Absolute times hold for one machine on one day; a ratio within one run shows the overhead of the code. One part alone:
-`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`, `scaling` or
-`viewer`.
+`python -m tests.bench speed`, `camera`, `deadline`, `peers`, `simulator`, `calibration`, `fitness`, `scaling`,
+`preview` or `viewer`.
 """
 
 import os
@@ -14,11 +14,11 @@ from pathlib import Path
 from device.config.head_file import load_head
 from device.recon.model.fft_plans import Planner, processor_name
 from device.sim.scene_files import simulate_exposure
-from tests.bench import calibration, camera, deadline, fitness, peers, scaling, simulator, speed, viewer
+from tests.bench import calibration, camera, deadline, fitness, peers, preview, scaling, simulator, speed, viewer
 
 PLANS = Path.home() / ".cache" / "diffuscope"
 SCENE = Path("device/sim/scenes/diabetic.toml")
-PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling", "viewer")
+PARTS = ("speed", "camera", "deadline", "peers", "simulator", "calibration", "fitness", "scaling", "preview", "viewer")
 
 
 def main(parts: list[str]) -> None:
@@ -39,6 +39,8 @@ def main(parts: list[str]) -> None:
             part(planner)
     if "scaling" in wanted:
         scaling.scaling(PLANS)
+    if "preview" in wanted:
+        preview.preview()
     if "viewer" in wanted:
         viewer.viewer()
     print(f"\npeak memory of this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
