@@ -9,7 +9,6 @@ and the figures: N frames gain nearly what N times the light in one frame does.
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from math import isfinite
 
 import numpy as np
@@ -18,7 +17,8 @@ from scipy import ndimage
 from device.clock import Clock
 from device.errors import FrameError
 from device.recon.assessment.image_quality import NO_SIGNAL
-from device.recon.estimation.registration import Detail, Registrar, Registration, Shift
+from device.recon.estimation.group_registration import register_group
+from device.recon.estimation.registration import Registrar
 from device.recon.model import kernels
 from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
@@ -37,10 +37,6 @@ from device.recon.reconstructor import (
 from device.values import Calibration, FrameUse, Image
 
 SMOOTH_PX = 14.0  # sigma of the smooth picture: below it the retina, above it field and shading
-LEAST_SD = 6.0  # a match by chance: the highest of 10,000 independent values lies at about 4 sd
-LEAST_OF_TYPICAL = (
-    0.75  # of the median correlation of the matching frames; a frame half covered by the lid reaches 0.5 of it
-)
 LEAST_WEIGHT = 0.34  # share of the weights that must have seen a pixel; with fewer it is missing
 MOST_FRAMES = 64
 LEAST_COARSE = 200  # samples of a quick look along its shorter side, to be registered
@@ -136,7 +132,7 @@ class BurstJoiner:
         field = self._field([one.picture for one in seen.values()])
         registrar = Registrar(field[grid.shown], grid.n)
         flats = {k: registrar.flat(one.picture[grid.shown]) for k, one in seen.items()}
-        shifts, left_out = register_group(registrar, flats)
+        shifts, left_out = register_group(registrar, flats, {k: one.mean_dn for k, one in seen.items()})
         reasons |= left_out
         uses = [FrameUse(k, k not in reasons, shifts.get(k), 0.0, reasons.get(k)) for k in range(len(frames))]
         yield self._join(seen, field, uses)
@@ -206,61 +202,3 @@ def joined_calibration(calibration: Calibration, light: float, count: int) -> Ca
         read_noise_e=None if read_e is None else read_e * count**0.5,
     )
     return replace(linear, sensor=joined)
-
-
-def register_group(registrar: Registrar, flats: dict[int, Image]) -> tuple[dict[int, Shift], dict[int, str]]:
-    """Return the shift of each matching frame from the first of them, and the reason of each other frame.
-
-    `flats` are flat pictures (`Registrar.flat`) by index. The centre is the frame that correlates best with all others;
-    a frame matches if its correlation with the centre is near that of most frames. Where no two frames match, nothing
-    says which of them shows the retina, and the first one is kept.
-    """
-    indices = list(flats)
-    found = _pairs(registrar, {k: registrar.detail(flat) for k, flat in flats.items()})
-    centre = max(indices, key=lambda i: sum(found[i, k].correlation for k in indices if k != i))
-    level = {k: found[centre, k].correlation for k in indices if k != centre}
-    least = _least_correlation([found[centre, k] for k in level])
-    used = [k for k in indices if k == centre or level[k] >= least]
-    if len(used) == 1:
-        return {indices[0]: (0.0, 0.0)}, dict.fromkeys(indices[1:], "no two frames show the same retina")
-    shifts = {k: (0.0, 0.0) if k == centre else found[centre, k].shift_px for k in used}
-    shifts = _refined(registrar, {k: flats[k] for k in used}, shifts)
-    first = shifts[used[0]]
-    reasons = {
-        k: f"does not show what the other frames show (correlation {level[k]:.2f}, at least {least:.2f})"
-        for k in indices
-        if k not in used
-    }
-    return {k: (shift[0] - first[0], shift[1] - first[1]) for k, shift in shifts.items()}, reasons
-
-
-def _pairs(registrar: Registrar, details: dict[int, Detail]) -> dict[tuple[int, int], Registration]:
-    """Return the registration of each picture (second index) to each other one (first index)."""
-    found = {}
-    for i, k in combinations(details, 2):
-        found[i, k] = one = registrar.register(details[i], details[k])
-        found[k, i] = replace(one, shift_px=(-one.shift_px[0], -one.shift_px[1]))
-    return found
-
-
-def _least_correlation(found: Sequence[Registration]) -> float:
-    """Return the least correlation of a matching frame: above chance, and near the median of the better half."""
-    if not found:
-        return 0.0
-    sd = float(np.median([one.sd for one in found]))
-    better = sorted(one.correlation for one in found)[len(found) // 2 :]
-    return max(LEAST_SD * sd, LEAST_OF_TYPICAL * float(np.median(better)) - 2 * sd)
-
-
-def _refined(registrar: Registrar, flats: dict[int, Image], shifts: dict[int, Shift]) -> dict[int, Shift]:
-    """Return the shifts after registering each picture, moved back, to the mean of the others.
-
-    The mean has less noise than one picture, and moved pictures are windowed on the same part of the retina: the window
-    does not pull the shift towards 0.
-    """
-    details = {k: registrar.detail(flat, shifts[k]) for k, flat in flats.items()}
-    refined = {}
-    for k, detail in details.items():
-        rest = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail).shift_px
-        refined[k] = shifts[k][0] + rest[0], shifts[k][1] + rest[1]
-    return refined

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from device.clock import SystemClock
+from device.recon.assessment.exposure_split import loss_db
 from device.recon.assessment.metrics import PictureScorer
 from device.recon.burst import BurstJoiner, JoinedFrame
 from device.recon.model.fft_plans import Planner
@@ -17,6 +18,7 @@ from tests.bench.moving_eye import (
     BLACK_DN,
     FIELDS,
     IMX296,
+    OPTICS,
     PAPER,
     SensorCase,
     calibrated,
@@ -31,6 +33,7 @@ from tests.bench.moving_eye import (
 PEAK_E, DRIFT_PX, MOST = 15000.0, 2.5, 8
 COUNTS = (2, 4, 8)
 DIM_E, FAR_PX = 500.0, (0, 8, 15, 30)
+SPLIT, SPLIT_CASES = (1, 4, 8), ((20000.0, 4.0), (20000.0, 11.0), (2000.0, 4.0), (2000.0, 12.0))
 SIX = ("06_dr a", "07_h b", "09_g a", "cc0 a", "01L", "05R")
 PLANNER, CLOCK = Planner(Path.home() / ".cache" / "diffuscope"), SystemClock()
 Places = list[tuple[float, float]]
@@ -162,3 +165,39 @@ def registration_error(joined: JoinedFrame, places: Places) -> float:
         np.subtract(one.shift_px, places[one.index]) for one in joined.frames if one.shift_px is not None
     ])  # fmt: skip
     return float(np.sqrt(((errors - errors.mean(axis=0)) ** 2).mean()))
+
+
+def splits(folder: Path, names: Sequence[str] = SIX[:4]) -> None:
+    """Print the loss in dB of one exposure of a moving eye, and of its light in 4 and 8 frames, beside the formula."""
+    calibration, psf = calibrated(PAPER, "green"), wave_psf(PAPER, "green")
+    joiner = BurstJoiner(calibration, PAPER.shape, PLANNER, CLOCK)
+    columns = [f"{n} {kind}" for n in SPLIT for kind in ("loss", "formula")]
+    timing.head("one exposure in 1, 4, 8 frames: ke-, motion px", *columns)
+    for peak_e, motion_px in SPLIT_CASES:
+        lost_db = np.zeros(len(SPLIT))
+        mean_e = 0.0
+        for k, name in enumerate(names):
+            file, place = FIELDS[name]
+            plane = photograph(folder / file, place, PAPER)[..., 1]
+            still = exposed(retina(plane, PAPER), psf)
+            scale, score = np.float32(peak_e / still.max()), scorer(retina(plane, PAPER))
+            mean_e += float(still.mean() * scale) / len(names)
+            still_db = score(solved(counted(still * scale, PAPER, 900 + k), calibration)).psnr_db
+            for column, n in enumerate(SPLIT):
+                shots = _parts(plane, psf, n, motion_px, scale, 900 + 100 * k)
+                joined = joiner(shots)
+                picture = solved(joined.counts, joined.calibration) if n > 1 else solved(shots[0], calibration)
+                lost_db[column] += (still_db - score(picture).psnr_db) / len(names)
+        motion_deg, light = motion_px / OPTICS.geometry(PAPER.pitch_um).px_per_deg, mean_e / PAPER.pitch_um**2
+        cells = [cell for n, db in zip(SPLIT, lost_db, strict=True) for cell in (db, loss_db(n, motion_deg, light))]
+        timing.row(f"{peak_e / 1000:g} ke-, {motion_px:g} px, {light:.0f} e-/um2", *cells)
+
+
+def _parts(plane: Image, psf: Image, n: int, motion_px: float, scale: np.float32, seed: int) -> list[Counts]:
+    """Return n frames of a steady motion, each as the mean of places one pixel apart; the first is centred on 0."""
+    steps, shots = max(int(np.ceil(motion_px / n)), 1), []
+    for part in range(n):
+        ways_px = motion_px / n * (part - 0.5 + (np.arange(steps) + 0.5) / steps)
+        lights = [exposed(retina(plane, PAPER, (0.6 * way_px, 0.8 * way_px)), psf) for way_px in ways_px]
+        shots.append(counted(np.asarray(np.mean(lights, axis=0) * scale / n, np.float32), PAPER, seed + part))
+    return shots

@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
-from tests.bench.bursts import bursts, dim_bursts, displaced
+from tests.bench.bursts import bursts, dim_bursts, displaced, splits
 from tests.bench.colours import colours
 
-PARTS = {"bursts": bursts, "dim": dim_bursts, "displaced": displaced, "colours": colours}
+PARTS = {"bursts": bursts, "dim": dim_bursts, "displaced": displaced, "splits": splits, "colours": colours}
 
 
 def main(words: list[str]) -> None:

@@ -69,6 +69,23 @@ def test_frames_of_another_retina_and_of_a_closed_lid_are_left_out_with_a_reason
     assert all("what the other frames show" in (uses[k].reason or "") and uses[k].shift_px is None for k in (0, 4))
 
 
+def test_a_frame_that_is_blurred_by_motion_is_left_out_and_costs_nothing(join: BurstJoiner) -> None:
+    good = [frame(seen(RETINA, moved), 5000, k) for k, moved in enumerate(DRIFT_PX[:3])]
+    places = np.linspace((0.0, -16.0), (0.0, 16.0), 17)  # a motion of 32 pixels during the exposure
+    saccade = np.mean([seen(RETINA, (down, right)) for down, right in places], axis=0, dtype=np.float32)
+    joined, alone = join([*good[:2], frame(saccade, 5000, 7), good[2]]), join(good)
+    assert [use.used for use in joined.frames] == [True, True, False, True]
+    assert "blurred by motion" in (joined.frames[2].reason or "")
+    assert np.nanmax(np.abs(joined.counts - alone.counts)) < 0.02 * np.nanmax(alone.counts)  # shifts within 0.01 pixels
+
+
+@pytest.mark.parametrize("peaks_e", [(5000, 5000, 5000, 1200), (600, 600, 150, 600), (200, 200, 200, 200)])
+def test_noise_is_not_taken_for_motion_blur(join: BurstJoiner, peaks_e: tuple[float, ...]) -> None:
+    """A frame of less light than the others correlates less with them, and keeps its place."""
+    frames = [frame(seen(RETINA, moved), peaks_e[k], 20 + k) for k, moved in enumerate(DRIFT_PX)]
+    assert not [use.reason for use in join(frames).frames if "blurred" in (use.reason or "")]
+
+
 def test_a_burst_with_one_usable_frame_is_that_frame(calibration: Calibration, join: BurstJoiner) -> None:
     one, blank = frame(seen(RETINA, (0, 0)), 5000, 1), np.full(SHAPE, 4095, np.uint16)
     joined = join([blank, one])
