@@ -14,7 +14,7 @@ import pytest
 
 HERE = Path(__file__).parent
 MARGINS, README = HERE / "margins.json", HERE / "README.md"
-FILES = ("test_bounds.py", "test_stability.py")
+FILES = ("test_bounds.py", "test_stability.py", "test_bursts.py")
 RECORDER = "margins-recorder"
 BEGIN, END = "<!-- margins: made by python -m tests.hard.figures -->", "<!-- end of margins -->"
 Margins = Mapping[str, list[list[float]]]

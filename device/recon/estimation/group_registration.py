@@ -96,10 +96,12 @@ def _least_correlation(found: Sequence[Registration]) -> float:
 def _refined(registrar: Registrar, flats: Mapping[int, Image], shifts: Mapping[int, Shift]) -> dict[int, Registration]:
     """Return shift and correlation of each picture after its registration, moved back, to the mean of the others.
 
-    The mean has less noise than one picture, and moved pictures are windowed on the same part of the retina: the window
-    does not pull the shift towards 0.
+    The mean has less noise than one picture. All are windowed to the part of the retina that is on each of them: the
+    window does not pull the shift towards 0, and the correlations can be compared.
     """
-    details = {k: registrar.detail(flat, shifts[k]) for k, flat in flats.items()}
+    moved = {k: registrar.moved_back(flat, shifts[k]) for k, flat in flats.items()}
+    common = np.min([window for _, window in moved.values()], axis=0)
+    details = {k: registrar.windowed(one, common) for k, (one, _) in moved.items()}
     refined = {}
     for k, detail in details.items():
         found = registrar.register(registrar.mean([details[i] for i in details if i != k]), detail)

@@ -82,11 +82,19 @@ class Registrar:
 
     def detail(self, flat: Image, shift_px: Shift = (0.0, 0.0)) -> Detail:
         """Return the detail of a flat picture, moved back by `shift_px` and windowed to what both fields hold."""
-        window = self._window
-        if shift_px != (0.0, 0.0):
-            back = [-one / self._n for one in shift_px]
-            flat = ndimage.shift(flat, back, order=3, mode="constant")
-            window = np.minimum(window, ndimage.shift(window, back, order=1, mode="constant"))
+        moved, window = self.moved_back(flat, shift_px)
+        return self.windowed(moved, window)
+
+    def moved_back(self, flat: Image, shift_px: Shift) -> tuple[Image, Image]:
+        """Return a flat picture moved back by `shift_px`, and the window of what it and the reference hold."""
+        if shift_px == (0.0, 0.0):
+            return flat, self._window
+        back = [-one / self._n for one in shift_px]
+        window = np.minimum(self._window, ndimage.shift(self._window, back, order=1, mode="constant"))
+        return ndimage.shift(flat, back, order=3, mode="constant"), window
+
+    def windowed(self, flat: Image, window: Image) -> Detail:
+        """Return the detail of a flat picture within a window, (rows, cols) in 0..1."""
         return Detail(self._unit(fft.rfft2(flat * window, self._shape) * self._band))
 
     def mean(self, details: Sequence[Detail]) -> Detail:
