@@ -32,6 +32,7 @@ from device.light_safety.burst import burst
 from device.light_safety.dose_ledger import DoseLedgerState, Ledger, MemoryLedger, Reserved
 from device.light_safety.guard import AFTERGLOW_S, GuardedLight
 from device.light_safety.hazard import Beam, Hazard, light_limits
+from device.recon.assessment.exposure_split import WHOLE, ExposureSplit
 from device.values import EYES, Calibration, Colour, ExposureSettings, Eye, Frame, Illumination, Psf, Sensor
 from services.instrument.capture_pipeline import expose, expose_live
 from services.records import schema
@@ -315,19 +316,29 @@ class Eyes(RuleBasedStateMachine):
     @rule(
         eye=st.sampled_from(EYES), count=st.integers(1, 16), colours=st.lists(st.sampled_from(COLOURS), unique=True),
         exposure_s=st.floats(0.01, 3), slow=st.floats(1, 3), in_visit=st.booleans(),
+        parts=st.integers(1, 8), overhead_share=st.floats(0, 0.5),
         kill_at=st.one_of(st.none(), st.integers(0, 18)), afterglow_s=st.floats(0, AFTERGLOW_S),
     )  # fmt: skip
     def press(
         self, eye: Eye, count: int, colours: list[Colour], exposure_s: float, slow: float, in_visit: bool,
-        kill_at: int | None, afterglow_s: float,
+        parts: int, overhead_share: float, kill_at: int | None, afterglow_s: float,
     ) -> None:  # fmt: skip
-        """Expose as a press does: a burst in green, other colours, a dark frame; a kill may come in any of them."""
+        """Expose as a press does: a dark frame, a burst in green, other colours; a kill may come in any of them.
+
+        Exposures are split as for an overhead of `overhead_share` of a part, which is not that of the camera.
+        """
+        split = WHOLE
+        if parts > 1:
+            part_s = exposure_s / (parts + (parts - 1) * overhead_share)
+            split = ExposureSplit(parts, part_s=part_s)
         self.exposed_eyes, self.in_visit = (eye,), in_visit
         head = self.head(TimedCamera(self, slow, kill_at), exposure_s)
         try:
             with self.lamp_is_off_after_a_refusal():
-                made = expose(head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours)
+                made = expose(head, (eye,), self.times, in_visit=in_visit, count=count, colours=colours, split=split)
                 assert not self.disk.full, "light without a record"
+                assert sum(one.exposure_s for one in made.lit) <= count * exposure_s * (1 + 1e-9)
+                self.tally["split press"] += parts > 1
                 self.tally[f"press of {len(made.lit)} frames and {len(made.colours)} colours"] += 1
         except Killed:
             self.crash(0.0, afterglow_s, None)
