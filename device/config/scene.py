@@ -13,6 +13,8 @@ from device import plugins
 from device.config.toml_file import Table, check_table
 
 WIDEST_GAZE_DEG = 30.0
+STEEPEST_RETINA_DEG = 30.0
+FARTHEST_RETINA_UM = 3000.0
 MOST_PEAK_E = 1e7
 T = TypeVar("T", bound=Table)
 
@@ -80,7 +82,7 @@ class EyeSpec(Table):
     `shown_by`: `screen` is self-luminous; `print` is paper lit by the ring; `model eye` and `human eye` have a lit
     fundus. Refraction (M, J0, J45) as wavefront: positive M is myopia. A `flat` surface is the paper's screen, a
     `curved` one follows the eye's focus. `axial_um` is the distance of the pupil from the relay's focus, `decentred_um`
-    its distance from the axis.
+    its distance from the axis. Oblique astigmatism, accommodation, tilted retina and tear film: OPTICS.md 3.10.
     """
 
     shown_by: Literal["screen", "print", "model eye", "human eye"] = "model eye"
@@ -95,6 +97,17 @@ class EyeSpec(Table):
     walks: bool = False  # beam walk over the iris at wide angles, as the paper measured (OPTICS.md 1.4)
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # right, down
     drift_deg_per_s: float = Field(default=0.0, ge=0, le=200)
+    oblique_dpt: float = Field(default=0.0, ge=0, le=10)  # tangential minus sagittal power, 30 degrees off the axis
+    accommodation_slope: float = Field(default=0.0, ge=0, le=1.2)  # of the response over the demand; 0: cycloplegia
+    accommodation_lead_dpt: float = Field(default=0.0, ge=0, le=3)  # response without demand
+    accommodation_amplitude_dpt: float = Field(default=10.0, ge=0, le=15)  # largest response
+    fixation_dpt: float = Field(default=0.0, ge=0, le=10)  # nearness of the fixation target, 1 / distance
+    retina_tilt_deg: tuple[float, float] = (0.0, 0.0)  # positive: deeper to the right, and below
+    retina_decentred_um: tuple[float, float] = (0.0, 0.0)  # centre of curvature, to the right and down
+    tear_film_per_s: float = Field(default=0.0, ge=0, le=0.2)  # share of the light scattered, per second of break-up
+    tear_film_deg: float = Field(default=0.3, ge=0.05, le=2)  # sigma of the scattered light at the eye
+    breakup_s: float = Field(default=10.0, ge=0, le=60)  # from a blink to the break-up of the tear film
+    since_blink_s: float = Field(default=0.0, ge=0, le=60)  # from the last blink to the exposure
 
     @field_validator("gaze_deg")
     @classmethod
@@ -103,6 +116,17 @@ class EyeSpec(Table):
         if hypot(*gaze_deg) > WIDEST_GAZE_DEG:
             raise ValueError(f"a gaze of {gaze_deg} is {hypot(*gaze_deg):.1f} deg off; allowed: {WIDEST_GAZE_DEG:g}")
         return gaze_deg
+
+    @field_validator("retina_tilt_deg", "retina_decentred_um")
+    @classmethod
+    def _check_retina(cls, value: tuple[float, float], info: ValidationInfo) -> tuple[float, float]:
+        """Return a tilt of at most 30 degrees, or a decentration of at most 3 mm, unchanged; ValueError for more."""
+        most, unit = (
+            (STEEPEST_RETINA_DEG, "deg") if info.field_name == "retina_tilt_deg" else (FARTHEST_RETINA_UM, "um")
+        )
+        if not hypot(*value) <= most:
+            raise ValueError(f"{value} is {hypot(*value):g} {unit}; allowed: {most:g}")
+        return value
 
 
 class LightFlaws(Table):

@@ -73,7 +73,7 @@ class RenderedEyes:
         """Return the optical setup of an eye in one colour with its selected effects, built once for each turn."""
         key = eye, colour, self.turn_deg
         if key not in self._setups:
-            scene = Scene(self.scene.spec, colour, eye)
+            scene = Scene(self.scene.spec, colour, eye, self.turn_deg)
             self._setups[key] = build_setup(scene, self.retina(eye), self._chosen(scene))
         return self._setups[key]
 
@@ -105,4 +105,5 @@ class RenderedEyes:
         return self._rates[key]
 
     def _chosen(self, scene: Scene) -> tuple[Decision, ...]:
-        return self.plan if scene.colour == self.scene.spec.light.colour else self._choose(scene)
+        planned = scene.colour == self.scene.spec.light.colour and scene.turn_deg == STRAIGHT
+        return self.plan if planned else self._choose(scene)

@@ -38,11 +38,15 @@ Place = tuple[float, float]  # on the retina, in the eye's view: degrees to the 
 
 @dataclass(frozen=True)
 class Scene:
-    """Head with its tables [optics] and [sim], in one colour of light; SpecError if one of the tables is missing."""
+    """Head with its tables [optics] and [sim], in one colour of light; SpecError if one of the tables is missing.
+
+    `turn_deg` is the eye's turn to a fixation target, in addition to its gaze, degrees right and down in the picture.
+    """
 
     spec: InstrumentSpec
     colour: Colour
     eye: Eye = "OD"
+    turn_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.spec.optics is None or self.spec.sim is None:
@@ -113,6 +117,12 @@ class Scene:
         """
         light = self.peak_e / TABLE_E * (TABLE_PITCH_UM / self.spec.camera.pitch_um) ** 2
         return float(light ** (0.5 if light > 1 else 0.15))
+
+    @property
+    def axis_deg(self) -> Place:
+        """Place of the eye's own axis in the picture: its gaze and its turn, degrees right and down."""
+        gaze = self.sim.eye.gaze_deg
+        return gaze[0] + self.turn_deg[0], gaze[1] + self.turn_deg[1]
 
     @property
     def refraction(self) -> Refraction:

@@ -161,6 +161,10 @@ NEAR = {  # keys that give an effect a size of 0.05 to 0.6, most of them near 0.
     "dark": {"sensor": {"dark_e_per_s": 100.0}},
     "nonlinearity": {"sensor": {"nonlinearity": 2e-3}},
     "source": {"calibration": {"source_um": 60.0}},
+    "accommodation": {"eye": {"accommodation_slope": 0.9, "fixation_dpt": 0.04}},
+    "oblique": {"eye": {"oblique_dpt": 0.3}},
+    "tilt": {"eye": {"retina_tilt_deg": (0.3, 0.2)}},
+    "tear_film": {"eye": {"tear_film_per_s": 0.005, "since_blink_s": 20.0}},
 }
 
 

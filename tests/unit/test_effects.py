@@ -39,6 +39,14 @@ KEYS = [  # effect, table, key, growing values, further keys of the scene
     ("refraction", "eye", "m_dpt", (0.0, -0.1, -5.0), {}),
     ("refraction", "eye", "j45_dpt", (0.0, 0.5, 1.0), {}),
     ("curvature", "eye", "surface", ("curved", "flat"), {}),
+    ("accommodation", "eye", "accommodation_slope", (0.0, 0.5, 0.9), {"eye": {"m_dpt": -2.0}}),
+    ("accommodation", "eye", "accommodation_lead_dpt", (0.0, 0.3, 1.0), {}),
+    ("accommodation", "eye", "fixation_dpt", (0.0, 0.5, 3.0), {"eye": {"accommodation_slope": 0.9}}),
+    ("oblique", "eye", "oblique_dpt", (0.0, 0.5, 3.0), {}),
+    ("tilt", "eye", "retina_tilt_deg", ((0.0, 0.0), (1.0, 0.0), (-3.0, 4.0)), {}),
+    ("tilt", "eye", "retina_decentred_um", ((0.0, 0.0), (0.0, 200.0), (-500.0, 0.0)), {}),
+    ("tear_film", "eye", "tear_film_per_s", (0.0, 1e-3, 1e-2), {"eye": {"since_blink_s": 15.0}}),
+    ("tear_film", "eye", "since_blink_s", (0.0, 12.0, 20.0), {"eye": {"tear_film_per_s": 0.01}}),
     ("pupil", "eye", "decentred_um", (0.0, 3000.0, 4000.0), {}),
     ("pupil", "eye", "axial_um", (0.0, -10000.0, -20000.0), {"eye": {"pupil_um": 5000.0}}),
     ("motion", "eye", "drift_deg_per_s", (0.0, 0.5, 5.0), {}),
@@ -189,6 +197,78 @@ def test_flat_surface_is_myopic_at_its_edge() -> None:
     right, down = (setup.aberrations["curvature"](place) for place in ((16.0, 0.0), (0.0, 16.0)))
     assert right == pytest.approx(Refraction(down.m_dpt, -down.j0_dpt, 0.0), abs=1e-9)
     assert right.j0_dpt > 0, "the tangential meridian is the stronger one, and lies along the radius"
+
+
+def test_oblique_astigmatism_is_radial_and_grows_with_the_square_of_the_angle() -> None:
+    here = scene(with_keys(PLAIN, eye={"oblique_dpt": 3.0, "gaze_deg": (5.0, 0.0)}))
+    setup = OpticalSetup(here, world(PLAIN).retina, world(PLAIN).sensor)
+    effect_named("oblique").apply(setup)
+    cylinder = setup.aberrations["oblique"]
+    assert cylinder((5.0, 0.0)) == pytest.approx((0, 0, 0)), "the gaze moves the eye's axis"
+    assert cylinder((35.0, 0.0)) == pytest.approx((0, 1.5, 0)), "half the difference of the meridians at 30 degrees"
+    assert cylinder((5.0, 15.0)) == pytest.approx((0, -1.5 / 4, 0))
+    assert cylinder((5.0 + 15 / np.sqrt(2), 15 / np.sqrt(2))) == pytest.approx((0, 0, 1.5 / 4))
+
+
+def test_a_turn_to_a_fixation_target_moves_the_axis_of_the_eye() -> None:
+    eyes = world(with_keys(PLAIN, eye={"oblique_dpt": 3.0}))
+    straight = eyes.setup("green").aberrations["oblique"]((0.0, 0.0))
+    eyes.present_eye("OD", "nerve")
+    setup = eyes.setup("green")
+    assert straight == pytest.approx((0, 0, 0))
+    assert setup.aberrations["oblique"](setup.scene.axis_deg) == pytest.approx((0, 0, 0))
+    off_deg = np.hypot(*setup.scene.axis_deg)
+    turned = setup.aberrations["oblique"]((0.0, 0.0))
+    assert np.hypot(turned.j0_dpt, turned.j45_dpt) == pytest.approx(1.5 * (off_deg / 30) ** 2)
+    assert off_deg > 5
+
+
+@pytest.mark.parametrize(
+    ("keys", "edge_dpt"),
+    [
+        ({"retina_decentred_um": (500.0, 0.0)}, (0.560, 0.0)),  # OPTICS.md 3.10
+        ({"retina_tilt_deg": (0.0, 5.0)}, (0.0, 1.176)),  # tan 5 deg tan 16.7 deg / (1.336 * 16.7 mm)
+    ],
+)
+def test_a_tilted_retina_is_myopic_on_its_deeper_side(keys: dict[str, object], edge_dpt: tuple[float, float]) -> None:
+    eye = {"shown_by": "human eye", "focal_length_um": 16700.0} | keys
+    setup = OpticalSetup(scene(with_keys(PLAIN, eye=eye)), world(PLAIN).retina, world(PLAIN).sensor)
+    effect_named("tilt").apply(setup)
+    sphere = setup.aberrations["tilt"]
+    assert (sphere((16.7, 0.0)).m_dpt, sphere((0.0, 16.7)).m_dpt) == pytest.approx(edge_dpt, abs=1e-3)
+    assert sphere((-16.7, -16.7)).m_dpt == pytest.approx(-sphere((16.7, 16.7)).m_dpt)
+    assert sphere((16.7, 0.0))[1:] == (0.0, 0.0), "a tilt is no cylinder"
+
+
+@pytest.mark.parametrize(
+    ("m_dpt", "target_dpt", "slope", "lead_dpt", "seen_dpt"),
+    [
+        (0.0, 3.0, 0.88, 0.0, 2.64),  # lag of 0.36 dpt
+        (0.0, 0.0, 0.88, 0.3, 0.3),  # lead of a far target
+        (-2.0, 0.0, 1.0, 0.0, 0.0),  # latent: the eye accommodates its whole refractive error
+        (-2.0, 0.0, 0.0, 0.0, -2.0),  # cycloplegia
+        (3.0, 1.0, 0.88, 0.3, 3.0),  # the target lies beyond the far point
+        (0.0, 8.0, 0.88, 0.0, 5.0),  # no more than the amplitude
+    ],
+)
+def test_accommodation_adds_its_response_to_the_mean_sphere(m_dpt, target_dpt, slope, lead_dpt, seen_dpt) -> None:
+    eye = {
+        "m_dpt": m_dpt, "j0_dpt": 0.5, "fixation_dpt": target_dpt, "accommodation_slope": slope,
+        "accommodation_lead_dpt": lead_dpt, "accommodation_amplitude_dpt": 5.0,
+    }  # fmt: skip
+    found = alone(with_keys(PLAIN, eye=eye), "refraction", "accommodation").setup("green").refraction
+    assert found == pytest.approx((seen_dpt, 0.5, 0.0))
+
+
+def test_a_broken_tear_film_lowers_contrast_and_conserves_light() -> None:
+    spec = with_keys(PLAIN, eye={"tear_film_per_s": 0.02, "since_blink_s": 20.0, "tear_film_deg": 0.5})
+    clear, broken = (alone(spec, name).setup("green") for name in ("shot", "tear_film"))
+    assert broken.object.sum(dtype=np.float64) == pytest.approx(clear.object.sum(dtype=np.float64), rel=1e-5)
+    still, blurred = (dot(spec, name)[1] for name in ("shot", "tear_film"))
+    sigma_px = 0.5 * scene(spec).geometry.px_per_deg
+    wider = np.subtract(spread(blurred), spread(still))
+    assert wider == pytest.approx((0.2 * sigma_px**2,) * 2, rel=0.02), "a fifth of the light, after 10 s of break-up"
+    assert effect_named("tear_film").size(scene(with_keys(spec, eye={"since_blink_s": 9.0}))).eta == 0, "not yet broken"
 
 
 @pytest.mark.parametrize(("ring_um", "angle_deg"), [(4533.3, 8.5), (5973.3, 16.7)])

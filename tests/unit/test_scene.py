@@ -32,6 +32,15 @@ BAD = {  # text added to a scene, and the required words of the error
         ("sim.eye.decentred_um = 4000", "2000 um", "below 2200"),
     ),
     "a wide gaze": ("[sim.eye]\ngaze_deg = [40, 3]", ("sim.eye.gaze_deg", "(40.0, 3.0)", "allowed: 30")),
+    "a steep retina": (
+        "[sim.eye]\nretina_tilt_deg = [0, -31]",
+        ("sim.eye.retina_tilt_deg", "31 deg", "allowed: 30"),
+    ),
+    "a far retina": (
+        "[sim.eye]\nretina_decentred_um = [3000, 4000]",
+        ("sim.eye.retina_decentred_um", "5000 um", "allowed: 3000"),
+    ),
+    "a strong oblique astigmatism": ("[sim.eye]\noblique_dpt = -1", ("sim.eye.oblique_dpt", "-1", "at least 0")),
     "an unknown light": ('[sim.eye]\nshown_by = "torch"', ("sim.eye.shown_by", "'torch'", "'human eye'")),
     "a wild pixel": ("[sim.sensor]\nprnu = 3", ("sim.sensor.prnu", "3", "at least 0", "at most 0.2")),
 }

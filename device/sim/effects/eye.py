@@ -1,8 +1,9 @@
-"""Effects of the eye: spectral reflectance, corneal reflex, refraction, field curvature, motion during the exposure."""
+"""Effects of the eye: reflectance, corneal reflex, refraction in the field, accommodation, tear film, motion."""
 
-from math import cos, exp, hypot, pi, radians, sin
+from math import ceil, cos, exp, hypot, pi, radians, sin, sqrt, tan
 
 import numpy as np
+from scipy import ndimage
 
 from device.optics import eye
 from device.optics.diffuser import Refraction
@@ -19,6 +20,13 @@ _TISSUE_R = 0.0141  # of the perifovea in green, to which the share refers
 _REFLEX_WIDTH = 0.25  # of the iris: the sigma of a blob that fills it
 _REFLEX_ETA_PER_SHARE = 55.0  # a smooth blob outside the fitted basis, by its brightest place
 _MOTION_ETA_PER_DEG2 = 2.25
+_LOCAL_ETA_PER_DPT = 2.5  # of the root mean square over the field, of a refraction that is zero in its middle
+_TEAR_FILM_ETA_PER_SHARE_DEG = 6.0  # for a width of one degree; smaller angles remove less detail
+_HUMAN_INDEX = 1.336  # of aqueous and vitreous humour
+_RETINA_RADIUS_UM = 12000.0  # OPTICS.md 3.4
+_WIDEST_DEG = 60.0  # of the local effects: farther out, their values at this angle
+_OBLIQUE_AT_DEG = 30.0
+_MOST_SCATTERED = 0.9  # of the light, by a tear film that is broken everywhere
 
 
 class Tint:
@@ -171,6 +179,145 @@ class FieldCurvature:
 def curvature_dpt(scene: Scene, angle_deg: float) -> tuple[float, float]:
     """Return sagittal and tangential defocus of a flat surface at an angle from the axis, dioptres: OPTICS.md 6.4."""
     return eye.flat_screen_dpt(angle_deg, scene.sim.eye.focal_length_um / 1000)
+
+
+class Accommodation:
+    """Accommodation to the fixation target with lead and lag: added to the eye's mean sphere M; OPTICS.md 3.10.
+
+    R = lead + slope D, from 0 to the amplitude, with the demand D = target - M: a long-sighted eye needs more, and the
+    part of its refractive error that it accommodates is not measured without cycloplegia.
+    """
+
+    name = "accommodation"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the response; 0 for slope and lead 0, a relaxed eye."""
+        response_dpt = accommodation_dpt(scene)
+        if response_dpt == 0:
+            return Size(0.0, "the eye is relaxed")
+        demand_dpt = scene.sim.eye.fixation_dpt - scene.sim.eye.m_dpt
+        why = f"{response_dpt:.2f} dpt for a demand of {demand_dpt:.2f} dpt"
+        return Size(_REFRACTION_ETA_PER_DPT * response_dpt * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Add the response to the mean sphere of the setup's refraction."""
+        m, j0, j45 = setup.refraction
+        setup.refraction = Refraction(m + accommodation_dpt(setup.scene), j0, j45)
+
+
+def accommodation_dpt(scene: Scene) -> float:
+    """Return the accommodative response of the scene's eye, dioptres, 0 to its amplitude."""
+    eye = scene.sim.eye
+    response_dpt = eye.accommodation_lead_dpt + eye.accommodation_slope * (eye.fixation_dpt - eye.m_dpt)
+    return min(max(response_dpt, 0.0), eye.accommodation_amplitude_dpt)
+
+
+class ObliqueAstigmatism:
+    """Peripheral astigmatism of the eye: the tangential meridian is the stronger one, by theta^2; OPTICS.md 3.10.
+
+    theta is the angle from the eye's own axis, so a turned eye is astigmatic in the middle of the field.
+    """
+
+    name = "oblique"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the root mean square of the cylinder component over the field."""
+        if scene.sim.eye.oblique_dpt == 0:
+            return Size(0.0, "the meridians of the eye agree over the field")
+        half_deg, off_deg = scene.half_field_deg, hypot(*scene.axis_deg)
+        rms_deg2 = sqrt(half_deg**4 / 3 + 2 * half_deg**2 * off_deg**2 + off_deg**4)
+        rms_dpt = scene.sim.eye.oblique_dpt / 2 * rms_deg2 / _OBLIQUE_AT_DEG**2
+        edge_dpt = scene.sim.eye.oblique_dpt * ((half_deg + off_deg) / _OBLIQUE_AT_DEG) ** 2
+        return Size(_LOCAL_ETA_PER_DPT * rms_dpt * scene.weight, f"up to {edge_dpt:.2f} dpt between the meridians")
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Register the cylinder of each place, with its axis along the radius from the eye's axis, if there is one."""
+        right_deg, down_deg = setup.scene.axis_deg
+        at_30_dpt = setup.scene.sim.eye.oblique_dpt
+
+        def aberration(place: Place) -> Refraction:
+            turn, angle_deg = azimuth_and_angle((place[0] - right_deg, place[1] - down_deg))
+            component = at_30_dpt / 2 * (min(angle_deg, _WIDEST_DEG) / _OBLIQUE_AT_DEG) ** 2
+            return Refraction(0.0, component * cos(2 * turn), component * sin(2 * turn))
+
+        if at_30_dpt:
+            setup.aberrations[self.name] = aberration
+
+
+class RetinaTilt:
+    """Tilted or decentred retina: the mean sphere changes linearly over the field; OPTICS.md 3.10.
+
+    dM = (tan tilt + decentration / radius) tan theta / (n f), with n = 1.336 in a human eye and 1 in a model eye.
+    """
+
+    name = "tilt"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the root mean square of the change of M over the field."""
+        slope_dpt = hypot(*tilt_dpt(scene))
+        if slope_dpt == 0:
+            return Size(0.0, "the retina is neither tilted nor decentred")
+        rms_deg = sqrt(scene.half_field_deg**2 / 4 + hypot(*scene.axis_deg) ** 2)
+        edge_dpt = slope_dpt * tan(radians(min(scene.half_field_deg + hypot(*scene.axis_deg), _WIDEST_DEG)))
+        eta = _LOCAL_ETA_PER_DPT * slope_dpt * tan(radians(min(rms_deg, _WIDEST_DEG))) * scene.weight
+        return Size(eta, f"M changes by up to {edge_dpt:.2f} dpt from the axis to the edge")
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Register the mean sphere of each place, zero on the eye's axis; nothing for a retina without tilt."""
+        right_deg, down_deg = setup.scene.axis_deg
+        per_right, per_down = tilt_dpt(setup.scene)
+
+        def aberration(place: Place) -> Refraction:
+            turn, angle_deg = azimuth_and_angle((place[0] - right_deg, place[1] - down_deg))
+            tangent = tan(radians(min(angle_deg, _WIDEST_DEG)))
+            return Refraction(tangent * (per_right * cos(turn) + per_down * sin(turn)), 0.0, 0.0)
+
+        if per_right or per_down:
+            setup.aberrations[self.name] = aberration
+
+
+def tilt_dpt(scene: Scene) -> tuple[float, float]:
+    """Return the change of M to the right and down, dioptres per unit of tan theta; positive: myopic there."""
+    eye = scene.sim.eye
+    per_slope_dpt = 1e6 / (eye.focal_length_um * (_HUMAN_INDEX if eye.shown_by == "human eye" else 1.0))
+    right, down = (
+        per_slope_dpt * (tan(radians(tilt_deg)) + decentred_um / _RETINA_RADIUS_UM)
+        for tilt_deg, decentred_um in zip(eye.retina_tilt_deg, eye.retina_decentred_um, strict=True)
+    )
+    return right, down
+
+
+class TearFilm:
+    """Break-up of the tear film: a share of the light is scattered by small angles; OPTICS.md 3.10.
+
+    The share grows linearly with the time from the break-up; the rest of the light is not disturbed.
+    """
+
+    name = "tear_film"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the scattered share; 0 before the break-up."""
+        share = scattered_share(scene)
+        if share == 0:
+            return Size(0.0, "the tear film is whole")
+        why = f"{share:.2%} of the light is scattered by {scene.sim.eye.tear_film_deg:g} deg"
+        return Size(_TEAR_FILM_ETA_PER_SHARE_DEG * share * scene.sim.eye.tear_film_deg * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Blur the scattered share of the object, which then reaches beyond the field's edge; its sum is kept."""
+        share = np.float32(scattered_share(setup.scene))
+        if share == 0:
+            return
+        sigma_px = setup.scene.sim.eye.tear_film_deg * setup.scene.geometry.px_per_deg
+        clear = np.pad(setup.object, ceil(4 * sigma_px))
+        scattered = ndimage.gaussian_filter(clear, sigma_px, mode="constant")
+        setup.object = (1 - share) * clear + share * scattered
+
+
+def scattered_share(scene: Scene) -> float:
+    """Return the share of the light that the tear film scatters, 0 to 0.9."""
+    eye = scene.sim.eye
+    return min(eye.tear_film_per_s * max(eye.since_blink_s - eye.breakup_s, 0.0), _MOST_SCATTERED)
 
 
 class Motion:
