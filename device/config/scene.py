@@ -22,19 +22,22 @@ T = TypeVar("T", bound=Table)
 class ObjectSpec(Table):
     """Object of a scene. Lengths on a screen or print are measured on its surface, at the eye's focal length.
 
-    `retina` is drawn from the scene's seed with these numbers of lesions; `image` is a photograph; `dots` are a lattice
-    of discs; `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark on bright (negative); `point` is
-    one disc of `dot_um`; `chart` is the printed retina of the model eye (device/optics/retina_chart.py), which the
-    field crops. All are moved by `at_deg` (right, down). `size_deg` is the width of a drawn retina or
-    photograph; None: as wide as the field needs. `cut_deg` (right, down) cuts a retina or photograph to a rectangle in
-    the middle of the field, as a photograph whose disc is cut at top and bottom; a photograph then keeps its shape and
-    has the rectangle's width, else its central square fills the field.
+    `retina` is drawn from the scene's seed with these numbers of lesions and these pigments (OPTICS.md 4.8); `image` is
+    a photograph; `dots` are a lattice of discs; `ruler` has a tick every `ticks_um`, bright on dark (positive) or dark
+    on bright (negative); `point` is one disc of `dot_um`; `chart` is the printed retina of the model eye
+    (device/optics/retina_chart.py), which the field crops. All are moved by `at_deg` (right, down). `size_deg` is the
+    width of a drawn retina or photograph; None: as wide as the field needs. `cut_deg` (right, down) cuts a retina or
+    photograph to a rectangle in the middle of the field, as a photograph whose disc is cut at top and bottom; a
+    photograph then keeps its shape and has the rectangle's width, else its central square fills the field.
     """
 
     kind: Literal["retina", "image", "dots", "ruler", "point", "chart"] = "retina"
     haemorrhages: int = Field(default=0, ge=0, le=1000)
     microaneurysms: int = Field(default=0, ge=0, le=1000)
     exudates: int = Field(default=0, ge=0, le=1000)
+    melanin: float = Field(default=0.0, ge=-3, le=3)  # standard deviations of a population above its mean
+    macular_pigment: float = Field(default=1.0, ge=0, le=3)  # relative to the mean eye
+    haemoglobin: float = Field(default=1.0, ge=0, le=3)  # of the blood, relative to the mean eye
     image: Path | None = None
     dot_um: float = Field(default=275.0, gt=0, le=5000)
     dots_apart_um: float = Field(default=2000.0, gt=0, le=20000)
@@ -97,6 +100,8 @@ class EyeSpec(Table):
     walks: bool = False  # beam walk over the iris at wide angles, as the paper measured (OPTICS.md 1.4)
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # right, down
     drift_deg_per_s: float = Field(default=0.0, ge=0, le=200)
+    torsion_deg_per_s: float = Field(default=0.0, ge=-100, le=100)  # counter-clockwise in the picture
+    blinks_per_min: float = Field(default=0.0, ge=0, le=120)
     oblique_dpt: float = Field(default=0.0, ge=0, le=10)  # tangential minus sagittal power, 30 degrees off the axis
     accommodation_slope: float = Field(default=0.0, ge=0, le=1.2)  # of the response over the demand; 0: cycloplegia
     accommodation_lead_dpt: float = Field(default=0.0, ge=0, le=3)  # response without demand

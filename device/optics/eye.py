@@ -15,6 +15,8 @@ TRACED_TO_DEG = 31.0
 WALK_MM = {3: 5.2596, 5: 0.5667, 7: 0.0947}
 SAGITTAL_DPT = {2: 6.4251, 4: -0.0886, 6: -0.0070}  # of a flat screen behind the model eye's lens
 TANGENTIAL_DPT = {2: 11.6529, 4: 1.8813, 6: 0.5779}
+# Chromatic eye: Rx = p - q / (lambda - c), dioptres and nm (Thibos et al., Applied Optics 31, 3594, 1992).
+CHROMATIC_Q, CHROMATIC_C_NM = 633.46, 214.102
 MODEL_EYE_MM = 25.2  # traced focal length of that lens at 0.55 um
 
 
@@ -180,3 +182,11 @@ def reflex_deg(ring_radius_mm: float, half_field_deg: float) -> float:
 def strongest_dpt(m_dpt: float, j0_dpt: float, j45_dpt: float) -> float:
     """Return the absolute refraction of the strongest meridian, dpt: |M| + hypot(J0, J45)."""
     return abs(m_dpt) + hypot(j0_dpt, j45_dpt)
+
+
+def chromatic_difference_dpt(wavelength_um: float, reference_um: float) -> float:
+    """Return by how much the eye is more myopic at a wavelength than at the reference, dioptres: the chromatic eye.
+
+    0.400 to 0.700 um. Source: Thibos et al., Applied Optics 31, 3594 (1992); -0.50 from 522 to 622 nm.
+    """
+    return CHROMATIC_Q / (1000 * wavelength_um - CHROMATIC_C_NM) - CHROMATIC_Q / (1000 * reference_um - CHROMATIC_C_NM)

@@ -88,10 +88,26 @@ class RenderedEyes:
         step_px = step_deg * self.scene.geometry.px_per_deg
         return step_px if STEPS * step_px >= LEAST_DRIFT_PX else 0.0
 
+    @cached_property
+    def torsion_deg(self) -> float:
+        """Turn of the eye about its line of sight from one frame of a burst to the next, degrees; 0 if too small.
+
+        It is simulated if it moves the edge of the field by LEAST_DRIFT_PX over a burst.
+        """
+        step_deg = self.scene.sim.eye.torsion_deg_per_s * self.scene.spec.camera.exposure_s
+        edge_px = np.radians(STEPS * abs(step_deg)) * self.scene.half_field_deg * self.scene.geometry.px_per_deg
+        return step_deg if edge_px >= LEAST_DRIFT_PX else 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Whether the retina moves between the frames of a burst."""
+        return self.drift_px != 0 or self.torsion_deg != 0
+
     def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
-        `step`, 0 to STEPS, is the number of frames for which the eye has drifted. Computed once for each combination.
+        `step`, 0 to STEPS, is the number of frames for which the eye has drifted and turned. Computed once for each
+        combination.
         """
         key = eye, colour, step, self.turn_deg
         if key not in self._rates:
@@ -99,7 +115,8 @@ class RenderedEyes:
             if step > 0:
                 scene = setup.scene
                 radius_px = scene.geometry.px_per_deg * scene.half_field_deg
-                moved = moved_behind_field(self.retina(eye), (0.0, step * self.drift_px), radius_px)
+                away_px, turn_deg = (0.0, step * self.drift_px), step * self.torsion_deg
+                moved = moved_behind_field(self.retina(eye), away_px, radius_px, turn_deg)
                 setup = build_setup(scene, moved, self._chosen(scene))
             self._rates[key] = electrons_per_s(setup)
         return self._rates[key]

@@ -16,6 +16,7 @@ from scipy import ndimage
 from scipy.special import expit
 
 from device.sim.lesions import Lesions, scatter
+from device.sim.pigments import Pigments
 from device.sim.strokes import draw
 from device.sim.vessels import DISC, Vessel, grow
 from device.values import Colour, Eye, Image, Mask
@@ -30,6 +31,7 @@ EXUDATE: dict[Colour, float] = {"red": 0.25, "green": 0.6, "blue": 0.35}
 CUP: dict[Colour, float] = {"red": 0.08, "green": 0.26, "blue": 0.34}
 CHOROID: dict[Colour, float] = {"red": 0.10, "green": 0.05, "blue": 0.02}
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
+MEAN_EYE = Pigments()
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ def fundus(
     microaneurysms: int = 0,
     exudates: int = 0,
     beyond_deg: float = 0.0,
+    pigments: Pigments = MEAN_EYE,
 ) -> Fundus:
     """Return one retina drawn in the middle of `shape` (rows, cols), reproducible by its arguments.
 
@@ -138,7 +141,7 @@ def fundus(
     lesions = scatter(
         canvas.x, canvas.y, lesion_rng, field_deg / 2, FIELD_CENTRE_DEG, haemorrhages, microaneurysms, exudates
     )
-    planes, mask = _paint(canvas, vessels, lesions, rng)
+    planes, mask = _paint(canvas, vessels, lesions, rng, pigments)
     edge = np.clip(radius_px + 0.5 - _radius(size), 0, 1)
     for colour in COLOURS:
         planes[colour] = _placed(planes[colour] * edge, shape, eye)
@@ -148,24 +151,24 @@ def fundus(
 
 
 def _paint(
-    canvas: Canvas, vessels: list[Vessel], lesions: Lesions, rng: np.random.Generator
+    canvas: Canvas, vessels: list[Vessel], lesions: Lesions, rng: np.random.Generator, pigments: Pigments
 ) -> tuple[dict[Colour, Image], Mask]:
     """Return the reflectances on the canvas, not yet cropped by the round field, and the mask of the vessels."""
     veins = draw([v for v in vessels if v.kind == "vein"], canvas.shape, canvas.px_per_deg, canvas.at)
     arteries = draw([v for v in vessels if v.kind == "artery"], canvas.shape, canvas.px_per_deg, canvas.at, reflex=0.4)
-    ground = _ground(canvas, rng)
+    ground = _ground(canvas, rng, pigments)
     disc, cup = _disc(canvas, rng)
     planes: dict[Colour, Image] = {}
     for colour in COLOURS:
         tissue = ground[colour] * (1 + (DISC_GAIN[colour] - 1) * disc) * (1 + CUP[colour] * cup)
         tissue *= 1 + EXUDATE[colour] * lesions.bright * (1 - disc)
-        blood = BLOOD[colour] * (1 - 0.25 * disc)
+        blood = pigments.blood(BLOOD[colour]) * (1 - 0.25 * disc)
         through = (1 - blood * veins.blood) * (1 - ARTERY * blood * arteries.blood) * (1 - blood * lesions.dark)
-        planes[colour] = np.float32(LEVEL[colour]) * tissue * through
+        planes[colour] = np.float32(pigments.level(colour, LEVEL[colour])) * tissue * through
     return planes, veins.mask | arteries.mask
 
 
-def _ground(canvas: Canvas, rng: np.random.Generator) -> dict[Colour, Image]:
+def _ground(canvas: Canvas, rng: np.random.Generator, pigments: Pigments) -> dict[Colour, Image]:
     """Return the relative brightness of the tissue per colour, about 1, without retinal vessels and optic disc."""
     fovea = canvas.distance(0, 0)
     shade = 1 + 0.04 * canvas.noise(rng, 4.5) - 0.0006 * canvas.distance(*FIELD_CENTRE_DEG) ** 2
@@ -174,10 +177,10 @@ def _ground(canvas: Canvas, rng: np.random.Generator) -> dict[Colour, Image]:
     nerve = 0.16 * np.exp(-((canvas.distance(DISC[0] - 0.5, DISC[1]) / 5.5) ** 2))
     planes: dict[Colour, Image] = {}
     for colour in COLOURS:
-        depth = MACULA[colour]
+        depth, choroid = pigments.macula(colour, MACULA[colour]), pigments.choroid(colour, CHOROID[colour])
         macula = 1 - depth * np.exp(-((fovea / 2.7) ** 2)) - 0.45 * depth * np.exp(-((fovea / 0.8) ** 2))
         fibres = 1 + (0.3 if colour == "red" else 1.0) * nerve
-        planes[colour] = shade * macula * fibres * (1 + CHOROID[colour] * web + 0.018 * grain)
+        planes[colour] = shade * macula * fibres * (1 + choroid * web + 0.018 * grain)
     return planes
 
 

@@ -10,6 +10,7 @@ but for the retina chart; pixels on an edge have the value of their covered area
 from collections.abc import Callable
 from functools import partial
 from math import atan, ceil, degrees, floor, hypot
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from device.errors import SpecError
 from device.optics import retina_chart
 from device.sim.fundus import COLOURS, Fundus, field_mask, fundus
 from device.sim.photo import photograph
+from device.sim.pigments import Pigments
 from device.values import Eye, Image
 
 Pair = tuple[float, float]
@@ -101,26 +103,44 @@ def _moved_picture(
     return _crop_to_field(found, shape, px_per_deg, optics.field_deg / 2, move_px, turn_px)
 
 
-def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float) -> Fundus:
+def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float, turn_deg: float = 0.0) -> Fundus:
     """Return an object moved by `move_px` (down, right) behind a round field that stands still.
 
-    What comes in from beyond the field repeats the nearest pixels at its edge.
+    Before, it is turned by `turn_deg` about the middle, counter-clockwise as displayed. What comes in from beyond the
+    field repeats the nearest pixels at its edge.
     """
     edge = _soft_field(found.field.shape, radius_px)
     nearest = ndimage.distance_transform_edt(edge < 1, return_distances=False, return_indices=True)
 
+    middle = (np.array(found.field.shape) - 1) / 2
+    back = _rotation(-turn_deg)
+
+    def shifted(plane: Image, order: Literal[1, 3], mode: Literal["nearest", "constant"]) -> Image:
+        if turn_deg == 0:
+            return np.asarray(ndimage.shift(plane, move_px, order=order, mode=mode))
+        offset = middle - back @ (middle + np.array(move_px))
+        return np.asarray(ndimage.affine_transform(plane, back, offset, order=order, mode=mode))
+
     def moved(plane: Image) -> Image:
-        shifted = ndimage.shift(plane[tuple(nearest)], move_px, order=3, mode="nearest")
-        return np.asarray(np.maximum(shifted, 0) * edge, np.float32)
+        return np.asarray(np.maximum(shifted(plane[tuple(nearest)], 3, "nearest"), 0) * edge, np.float32)
 
     def place(position: Pair | None) -> Pair | None:
-        return None if position is None else (position[0] + move_px[0], position[1] + move_px[1])
+        if position is None:
+            return None
+        row, col = back.T @ (np.array(position) - middle) + middle + np.array(move_px)
+        return float(row), float(col)
 
     vessels = found.vessels
     if vessels is not None:
-        vessels = (ndimage.shift(vessels.astype(np.float32), move_px, order=1) > 0.5) & found.field
+        vessels = (shifted(vessels.astype(np.float32), 1, "constant") > 0.5) & found.field
     planes = {colour: moved(plane) for colour, plane in found.reflectance.items()}
     return Fundus(planes, found.field, vessels, place(found.disc), place(found.fovea))
+
+
+def _rotation(turn_deg: float) -> NDArray[np.float64]:
+    """Return the matrix of a counter-clockwise turn as displayed, for (row, col)."""
+    turn = np.radians(turn_deg)
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
 
 def _picture(
@@ -136,7 +156,7 @@ def _picture(
     return fundus(
         shape, px_per_deg, wide_deg, scene.seed % 2**32, eye=eye, haemorrhages=what.haemorrhages,
         microaneurysms=what.microaneurysms, exudates=what.exudates,
-        beyond_deg=beyond_deg,
+        beyond_deg=beyond_deg, pigments=Pigments(what.melanin, what.macular_pigment, what.haemoglobin),
     )  # fmt: skip
 
 

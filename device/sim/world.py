@@ -8,6 +8,7 @@ import numpy as np
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
+from device.sim.blinks import lid_share
 from device.sim.eyes import STEPS, EffectSelector, RenderedEyes
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene
@@ -80,7 +81,7 @@ class World:
         self.eyes = self.eyes.turned_to(self.eye, field)
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
-        for step in range(1, STEPS + 1) if self.eyes.drift_px else ():
+        for step in range(1, STEPS + 1) if self.eyes.moves else ():
             self.eyes.electrons_per_s(self.eye, self.spec.light.colour, step)
 
     @property
@@ -144,10 +145,13 @@ class World:
         glow = self.illumination  # read once: the guard's thread may turn the lamp off at any time
         if glow is None:
             return np.broadcast_to(unlit_e, self.shape)
-        step = self.lit_frames % (STEPS + 1) if self.eyes.drift_px and glow.colour == self.spec.light.colour else 0
+        step = self.lit_frames % (STEPS + 1) if self.eyes.moves and glow.colour == self.spec.light.colour else 0
         returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step)
-        if self.has_fault("eye.closed"):
-            returned = np.full(self.shape, np.mean(returned), np.float32)
+        begin_s = self.clock.now_s() - exposure_s
+        closed = 1.0 if self.has_fault("eye.closed") else lid_share(self.scene, max(begin_s, 0.0), exposure_s)
+        if closed > 0:
+            lid = np.full(self.shape, np.mean(returned), np.float32)
+            returned = lid if closed == 1 else np.float32(closed) * lid + np.float32(1 - closed) * returned
         return returned * np.float32(glow.level * exposure_s) + unlit_e
 
     @property

@@ -85,7 +85,8 @@ def test_displaced_frames_leave_no_gap_where_most_of_them_see_the_retina(
     assert {0} <= {use.index for use in used}
     for use in used:
         assert use.shift_px is not None
-        within(float(np.abs(np.subtract(use.shift_px, places[use.index])).max()), 0.5)  # a sixteenth of the finest period of the band, 1 / 0.12 px
+        # A sixteenth of the finest period of the band of registration, 1 / 0.12 px.
+        within(float(np.abs(np.subtract(use.shift_px, places[use.index])).max()), 0.5)
     missing = ~np.isfinite(joined.counts)
     reach = int(far_px) + 6  # the taps of the sinc
     assert not missing[reach:-reach, reach:-reach].any(), "each pixel away from the border is on every frame"

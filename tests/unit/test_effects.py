@@ -260,6 +260,24 @@ def test_accommodation_adds_its_response_to_the_mean_sphere(m_dpt, target_dpt, s
     assert found == pytest.approx((seen_dpt, 0.5, 0.0))
 
 
+def test_another_colour_of_light_meets_another_focus_of_a_human_eye_only() -> None:
+    person = with_keys(PLAIN, eye={"shown_by": "human eye", "m_dpt": -1.0, "j45_dpt": 0.5})
+    chromatic = effect_named("chromatic")
+    found = {}
+    for colour in ("red", "green", "amber", "blue"):
+        setup = OpticalSetup(Scene(person, colour), world(PLAIN).retina, world(PLAIN).sensor)
+        effect_named("refraction").apply(setup)
+        chromatic.apply(setup)
+        found[colour] = setup.refraction.m_dpt
+        assert setup.refraction[1:] == (0.0, 0.5)
+    assert found["green"] == -1.0
+    assert found["red"] == pytest.approx(-1.504, abs=0.001), "Thibos et al. 1992: less myopic in red"
+    assert found["red"] < found["amber"] < found["green"] < found["blue"]
+    assert chromatic.size(Scene(person, "green")).eta == 0
+    assert chromatic.size(Scene(person, "red")).eta > 0.05
+    assert chromatic.size(Scene(PLAIN, "red")).eta == 0, "a model eye is described at its own wavelength"
+
+
 def test_a_broken_tear_film_lowers_contrast_and_conserves_light() -> None:
     spec = with_keys(PLAIN, eye={"tear_film_per_s": 0.02, "since_blink_s": 20.0, "tear_film_deg": 0.5})
     clear, broken = (alone(spec, name).setup("green") for name in ("shot", "tear_film"))

@@ -12,6 +12,7 @@ from device.clock import VirtualClock
 from device.config.head_file import load_head
 from device.config.scene import EyeSpec, ObjectSpec
 from device.errors import CameraMissing, CameraStalled, LightFault, SettingError, SpecError
+from device.sim.blinks import lid_share
 from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.objects import moved_behind_field
@@ -270,6 +271,47 @@ def test_a_drifting_retina_moves_from_frame_to_frame_behind_a_field_that_stands_
     expected = ndimage.shift(retina, (0.0, step_px), order=3)
     assert np.abs(moved.reflectance["green"] - expected)[inner].max() < 0.01
     assert not moved.reflectance["green"][~ndimage.binary_dilation(field, iterations=2)].any()
+
+
+def test_torsion_turns_the_retina_about_the_middle_of_the_field_from_frame_to_frame():
+    turning = World(small_head(eye=EyeSpec(torsion_deg_per_s=30.0)), VirtualClock())
+    assert turning.eyes.torsion_deg == pytest.approx(3.0)
+    radius_px = turning.geometry.px_per_deg * turning.scene.half_field_deg
+    moved = moved_behind_field(turning.retina, (0.0, 0.0), radius_px, 3.0)
+    away = np.subtract(turning.retina.disc, (np.array(turning.retina.field.shape) - 1) / 2)
+    turned = np.subtract(moved.disc, (np.array(turning.retina.field.shape) - 1) / 2)
+    assert np.hypot(*turned) == pytest.approx(np.hypot(*away))
+    angle_deg = np.degrees(np.arctan2(-turned[0], turned[1]) - np.arctan2(-away[0], away[1]))
+    assert angle_deg == pytest.approx(3.0), "counter-clockwise as displayed"
+    still, inner = turning.retina.reflectance["green"], ndimage.binary_erosion(turning.retina.field, iterations=6)
+    expected = ndimage.rotate(still, 3.0, reshape=False, order=3)
+    assert np.abs(moved.reflectance["green"] - expected)[inner].max() < 0.01
+    assert not World(small_head(eye=EyeSpec(torsion_deg_per_s=0.05)), VirtualClock()).eyes.moves, "not seen"
+
+
+def test_blinks_close_the_lid_for_a_share_of_the_exposures_as_often_as_the_scene_says():
+    scene = World(small_head(eye=EyeSpec(blinks_per_min=15)), VirtualClock()).scene
+    shares = [lid_share(scene, 0.1 * k, 0.1) for k in range(3000)]
+    per_s = 15 / 60
+    # 75 +- 9 blinks of 0.25 s in five minutes, few of which overlap.
+    assert np.mean(shares) == pytest.approx(1 - np.exp(-0.25 * per_s), rel=0.35)
+    assert {0.0, 1.0} <= {round(share, 9) for share in shares}, "frames of an open eye and of a closed lid"
+    assert any(0.01 < share < 0.99 for share in shares), "frames during which the lid closes"
+    seldom = World(small_head(eye=EyeSpec(blinks_per_min=1)), VirtualClock()).scene
+    assert not any(lid_share(seldom, 0.1 * k, 0.1) for k in range(3000)), "a chance below one per cent"
+
+
+def test_a_closed_lid_shows_even_light():
+    clock = VirtualClock()
+    blinking = World(small_head(eye=EyeSpec(blinks_per_min=120)), clock)
+    blinking.illumination = Illumination("green")
+    frames = []
+    for _ in range(40):
+        clock.sleep(0.1)
+        frames.append(blinking.electrons(0.1))
+    contrasts = [float(frame.std() / frame.mean()) for frame in frames]
+    assert min(contrasts) < 0.05 * max(contrasts)
+    assert [float(frame.mean()) for frame in frames] == pytest.approx([frames[0].mean()] * 40, rel=1e-4)
 
 
 def test_a_still_eye_gives_equal_frames():

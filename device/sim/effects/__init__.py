@@ -12,6 +12,7 @@ EFFECTS: tuple[Effect, ...] = (
     illumination.Ambient(),
     eye.RefractiveError(),
     eye.Accommodation(),
+    eye.ChromaticFocus(),
     eye.FieldCurvature(),
     eye.ObliqueAstigmatism(),
     eye.RetinaTilt(),

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from device.optics import eye
 from device.optics.diffuser import Refraction
-from device.optics.illumination import LEDS
+from device.optics.illumination import LEDS, PEAK_UM
 from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
 from device.sim.render import azimuth_and_angle
 from device.values import Image
@@ -210,6 +210,36 @@ def accommodation_dpt(scene: Scene) -> float:
     eye = scene.sim.eye
     response_dpt = eye.accommodation_lead_dpt + eye.accommodation_slope * (eye.fixation_dpt - eye.m_dpt)
     return min(max(response_dpt, 0.0), eye.accommodation_amplitude_dpt)
+
+
+class ChromaticFocus:
+    """Chromatic difference of focus of a human eye: in another colour than green M is another; OPTICS.md 3.10.
+
+    The eye's `m_dpt` holds for the green LED.
+    """
+
+    name = "chromatic"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the size eta, proportional to the difference; 0 in green, and where no human eye is in front."""
+        difference_dpt = chromatic_dpt(scene)
+        if difference_dpt == 0:
+            why = "the eye's refraction is that in green" if scene.colour == "green" else "there is no human eye"
+            return Size(0.0, why)
+        eta = _REFRACTION_ETA_PER_DPT * abs(difference_dpt) * scene.weight
+        return Size(eta, f"{difference_dpt:+.2f} dpt in {scene.colour} from green")
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Add the difference to the mean sphere of the setup's refraction."""
+        m, j0, j45 = setup.refraction
+        setup.refraction = Refraction(m + chromatic_dpt(setup.scene), j0, j45)
+
+
+def chromatic_dpt(scene: Scene) -> float:
+    """Return the difference of M from green to the scene's colour, dioptres; positive: more myopic."""
+    if scene.sim.eye.shown_by != "human eye" or scene.colour == "green":
+        return 0.0
+    return eye.chromatic_difference_dpt(PEAK_UM[scene.colour], PEAK_UM["green"])
 
 
 class ObliqueAstigmatism:
