@@ -59,9 +59,9 @@ def scored(sensor: SensorCase = PAPER) -> Mask:
     return disc(sensor.shape, centre, field_px(sensor) / 2 - 24) > 0.5
 
 
-def scorer(truth: Image, sensor: SensorCase = PAPER) -> PictureScorer:
+def scorer(truth: Image, sensor: SensorCase = PAPER, vessels: Mask | None = None) -> PictureScorer:
     """Return the scorer within the field that all frames share."""
-    return PictureScorer(truth, scored(sensor), 32.0)
+    return PictureScorer(truth, scored(sensor), 32.0, vessels)
 
 
 def frames(
@@ -103,24 +103,49 @@ def bursts(folder: Path, names: Sequence[str] = SIX) -> list[list[float]]:
 
 
 def dim_bursts(folder: Path, names: Sequence[str] = SIX) -> None:
-    """Print PCC of 1, 8 and 16 frames of a brightest pixel of DIM_E electrons on a cropped sensor (IMX296)."""
+    """Print PCC, and vessel contrast over the truth's, of frames of DIM_E electrons on a cropped sensor (IMX296)."""
     calibration, psf = calibrated(IMX296, "green"), wave_psf(IMX296, "green")
     joiner = BurstJoiner(calibration, IMX296.shape, PLANNER, CLOCK)
-    timing.head(f"IMX296, {DIM_E:g} e- a frame, {DRIFT_PX} px", "1 PCC", "8 PCC", "16 PCC", "px rms", "used")
+    timing.head(
+        f"IMX296, {DIM_E:g} e- a frame, {DRIFT_PX} px",
+        "1 PCC",
+        "8 PCC",
+        "16 PCC",
+        "1 vess",
+        "8 vess",
+        "16 vess",
+        "px rms",
+        "used",
+    )
     found = []
     for k, name in enumerate(names):
         file, place = FIELDS[name]
         plane = photograph(folder / file, place, IMX296)[..., 1]
         places = drift(60 + k, 16)
         shots, _ = frames(plane, places, psf, 100 * k, IMX296, DIM_E)
-        score = scorer(retina(plane, IMX296), IMX296)
-        cells = [score(solved(shots[0], calibration)).pcc]
+        score = scorer(retina(plane, IMX296), IMX296, _vessels(folder / file, place))
+        scores = [score(solved(shots[0], calibration))]
         for n in (8, 16):
             joined = joiner(shots[:n])
-            cells.append(score(solved(joined.counts, joined.calibration)).pcc)
+            scores.append(score(solved(joined.counts, joined.calibration)))
+        true = score.truth_contrast
+        shares = [
+            np.nan if true is None or one.vessel_contrast is None else one.vessel_contrast / true for one in scores
+        ]
+        cells = [*(one.pcc for one in scores), *shares]
         found.append(cells)
         timing.row(name, *cells, registration_error(joined, places), str(sum(one.used for one in joined.frames)))
-    timing.row("mean", *np.mean(found, axis=0))
+    timing.row("mean", *np.nanmean(found, axis=0))
+
+
+def _vessels(file: Path, place: tuple[float, float, float]) -> Mask | None:
+    """Return the vessels of a photograph on the cropped sensor as a reader drew them; None where none did."""
+    drawn = {
+        "hrf": file.parents[1] / "manual1" / f"{file.stem}.tif",
+        "chase": file.with_name(f"{file.stem}_1stHO.png"),
+    }  # fmt: skip
+    path = next((one for name, one in drawn.items() if name in file.parts), None)
+    return None if path is None else retina(photograph(path, place, IMX296)[..., 1], IMX296) > 0.5
 
 
 def displaced(folder: Path, names: Sequence[str] = SIX) -> None:
