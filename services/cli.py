@@ -271,11 +271,10 @@ def take_frame(
     exposure_s: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Exposure; else the head file's.")] = None,
 ) -> None:
     """Take one raw frame with the lamp dark, in the light that is there: of a scene, a point source or a cap."""
-    from services.lab.take_frames import take_frames
+    from services.lab.take_frames import summary, take_frames
 
-    frame = take_frames(head, output, count, exposure_s, SystemClock())
-    low, high = int(frame.counts.min()), int(frame.counts.max())
-    typer.echo(f"{output}: {frame.counts.shape[0]} x {frame.counts.shape[1]}, counts {low} to {high}")
+    counts = take_frames(head, output, count, exposure_s, SystemClock())
+    typer.echo(f"{output}: {summary(counts)}")
 
 
 @app.command("light")

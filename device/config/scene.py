@@ -101,7 +101,7 @@ class EyeSpec(Table):
     gaze_deg: tuple[float, float] = (0.0, 0.0)  # right, down
     drift_deg_per_s: float = Field(default=0.0, ge=0, le=200)
     torsion_deg_per_s: float = Field(default=0.0, ge=-100, le=100)  # counter-clockwise in the picture
-    blinks_per_min: float = Field(default=0.0, ge=0, le=120)
+    blinks_per_min: float = Field(default=0.0, ge=0, le=120)  # of 0.25 s each
     oblique_dpt: float = Field(default=0.0, ge=0, le=10)  # tangential minus sagittal power, 30 degrees off the axis
     accommodation_slope: float = Field(default=0.0, ge=0, le=1.2)  # of the response over the demand; 0: cycloplegia
     accommodation_lead_dpt: float = Field(default=0.0, ge=0, le=3)  # response without demand

@@ -185,7 +185,7 @@ def strongest_dpt(m_dpt: float, j0_dpt: float, j45_dpt: float) -> float:
 
 
 def chromatic_difference_dpt(wavelength_um: float, reference_um: float) -> float:
-    """Return by how much the eye is more myopic at a wavelength than at the reference, dioptres: the chromatic eye.
+    """Return by how much the eye is more myopic at a wavelength than at the reference, dioptres.
 
     0.400 to 0.700 um. Source: Thibos et al., Applied Optics 31, 3594 (1992); -0.50 from 522 to 622 nm.
     """

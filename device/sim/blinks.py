@@ -15,7 +15,7 @@ def lid_share(scene: Scene, begin_s: float, exposure_s: float) -> float:
     """Return the share of an exposure during which the lid is closed, 0 to 1; `begin_s` is any clock's time, 0 or more.
 
     Blinks are a Poisson process of `blinks_per_min`, drawn from the scene's seed, if the chance that one meets an
-    exposure is at least LEAST_CHANCE; else there are none. Of blinks that overlap the later one counts.
+    exposure is at least LEAST_CHANCE; else there are none. The time in which two blinks overlap counts once.
     """
     per_s, end_s = scene.sim.eye.blinks_per_min / 60, begin_s + exposure_s
     if per_s * (exposure_s + BLINK_S) < LEAST_CHANCE:

@@ -28,16 +28,19 @@ class Pigments:
     macular: float = 1.0
     haemoglobin: float = 1.0
 
-    def level(self, colour: Colour, level: float) -> float:
-        """Return the reflectance of the tissue, whose mean over persons is `level`."""
-        return level if self.melanin == 0 else level * exp(-MELANIN[colour] * self.melanin)
+    def level(self, colour: Colour, mean_reflectance: float) -> float:
+        """Return the reflectance of this eye's tissue; `mean_reflectance` is the mean over persons."""
+        return mean_reflectance * exp(-MELANIN[colour] * self.melanin) if self.melanin else mean_reflectance
 
     def choroid(self, colour: Colour, contrast: float) -> float:
         """Return the contrast of the choroidal vessels, which melanin in front of them covers in a double pass."""
         return contrast if self.melanin == 0 else contrast * exp(-MELANIN[colour] * self.melanin)
 
     def macula(self, colour: Colour, depth: float) -> float:
-        """Return the darkening at the fovea, 0 to 1; `depth` is that of the mean eye, melanin of the fovea included."""
+        """Return the darkening at the fovea, 0 to 1; `depth` is that of the mean eye, melanin of the fovea included.
+
+        Negative, a bright fovea, down to -0.5: more than that no quantity of pigment gives.
+        """
         if self.macular == 1:
             return depth
         passes = 10 ** (-2 * MACULAR_PEAK_DENSITY * MACULAR[colour] * (self.macular - 1))

@@ -234,9 +234,10 @@ class CapturePipeline:
         return replace(exposure, missing={**unable, **exposure.missing})
 
     def choose_split(self, count: int) -> ExposureSplit:
-        """Return the split of the `count` exposures of the next press while the eye moves, as `choose_split` there.
+        """Return the split of the `count` exposures of the next press while the eye moves.
 
-        From the speed of the eye in the aiming stream, and light and overhead of the last good press.
+        By `exposure_split.choose_split`, from the speed of the eye in the aiming stream, and light and overhead of the
+        last good press.
         """
         if self.bursts is None:
             return WHOLE

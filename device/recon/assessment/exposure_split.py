@@ -65,7 +65,7 @@ def choose_split(
     """Return how to split each of the `count` exposures of a press, `exposure_s` seconds each.
 
     `speed_deg_per_s`: of the eye in the aiming stream; None, or nothing `known` of the light: then nothing is split. A
-    split has at most MOST_FRAMES frames in all, each with enough light of its own, and is chosen for the largest
+    split press has at most MOST_FRAMES lit frames, each with enough light of its own, and is chosen for the largest
     predicted gain, at least LEAST_GAIN_DB, if the eye moves by more than LEAST_MOTION_DEG during one exposure. The lamp
     is on for as long as for the whole exposures: parts and overheads fill the time of an exposure and one overhead.
     """
@@ -106,6 +106,6 @@ def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
 def dark_fits(exposure_s: float, dark_s: float) -> bool:
     """Return True if a dark frame of `dark_s` seconds holds the dark current of a frame of `exposure_s` seconds.
 
-    That of a split exposure is as long as a part: at most half of a whole exposure in another colour.
+    The dark frame of a split press is as long as one part, at most half of the frames in other colours.
     """
     return exposure_s <= MOST_DARK_RATIO * dark_s

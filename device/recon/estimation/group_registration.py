@@ -57,7 +57,8 @@ def register_group(
 def _blurred(correlation: Mapping[int, float], light: Mapping[int, float]) -> dict[int, str]:
     """Return the reason of each frame that is less sharp than most, by its correlation with the mean of the others.
 
-    The expected correlation c of a frame follows from the median frame by its light: noise goes down as it grows.
+    The expected correlation is sqrt(p / (1 + p)), p being the signal-to-noise ratio of the median frame times the
+    light of this one over the median light. Fewer than FEWEST frames do not show which one is blurred.
     """
     if len(correlation) < FEWEST:
         return {}

@@ -213,7 +213,7 @@ def accommodation_dpt(scene: Scene) -> float:
 
 
 class ChromaticFocus:
-    """Chromatic difference of focus of a human eye: in another colour than green M is another; OPTICS.md 3.10.
+    """Chromatic difference of focus of a human eye: M in another colour differs from M in green; OPTICS.md 3.10.
 
     The eye's `m_dpt` holds for the green LED.
     """

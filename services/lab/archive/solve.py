@@ -5,7 +5,7 @@ Nothing here needs Dask: a bare process computes the same bytes.
 
 import shutil
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -192,11 +192,13 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
-    dark_s, *others_s = (
-        _exposure_s(one) for one in (lit[0], *colours.values())
-    )  # the dark frame is as long as a lit one
-    fits = dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
-    return CaptureFrames(tuple(lit), colours, dark, fits, unusable=unusable)
+    return CaptureFrames(tuple(lit), colours, dark, _dark_fits_colours(lit[0], colours.values()), unusable=unusable)
+
+
+def _dark_fits_colours(lit: Path, others: Iterable[Path]) -> bool:
+    """Return True if the dark frame, which is as long as the lit one, fits the frames in other colours of light."""
+    dark_s, *others_s = (_exposure_s(one) for one in (lit, *others))
+    return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
 
 
 def _exposure_s(raw: Path) -> float | None:
