@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from device.values import Sensor
 
+DITHERING_SD = 0.4  # counts
 LEAST_DN2 = 1e-20  # lower limit against a division by 0 for a black frame; float frames may be tiny
 
 
@@ -17,6 +18,15 @@ class Noise:
     def variance_dn2(self, value_dn: float) -> float:
         """Return the variance in DN^2 of a sample of `value_dn` above dark."""
         return self.per_dn * max(value_dn, 0.0) + self.floor_dn2
+
+    def dithered_dn(self, n: int) -> float:
+        """Return the light in DN from which on a pixel's noise dithers the rounding of its counts, for n x n pixels.
+
+        Rounding shifts the mean of counts with a noise of sd s by up to exp(-2 pi^2 s^2) / pi (Widrow and Kollar 2008):
+        by 0.013 counts where s is DITHERING_SD, and to 0 a light of a tenth of a count where s is small.
+        """
+        pixel, rest_dn2 = n * n, max(self.floor_dn2 * n * n - 1 / 12, 0.0)
+        return max(DITHERING_SD**2 - rest_dn2, 0.0) / (self.per_dn * pixel) if self.per_dn > 0 else 0.0
 
     @classmethod
     def of(cls, sensor: Sensor, n: int, measured_dn2: float, mean_dn: float) -> "Noise":

@@ -2,18 +2,13 @@
 
 The lit field is smaller than the blurred frame, so that the frame holds more samples than the retina has unknowns, and
 the wrong PSF leaves a residual that no retina explains. The spectrum alone (`refraction_likelihood`) does not hold
-this. The model of the frame y (NUMERICS.md 7.7) is
+this. With the model of `refraction_crop_model`, the residual r = y - C h_T * s and the derivatives D of the expected
+frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
-    y = C h_T * (s + a t) + Q c + noise,     t: stationary Gaussian with the spectrum P,   c: free
+    (D' K^-1 D)^-1 (D' K^-1 r - b)
 
-C is the crop by the sensor, h_T the stretched PSF, s the smooth part within its edge, a 1 in the field plus a margin
-and 0 outside, and Q holds the smoothest cosines of the window: stray light, the PSF beyond its support, and an uneven
-flat frame. With the covariance K of y for free c, the residual r = y - C h_T * s and the derivatives D of the expected
-frame with respect to T = (M, J0, J45), a step is
-
-    (D' K^-1 D)^-1 D' K^-1 r
-
-K^-1 is applied by conjugate gradients in the Fourier domain. D is that of the posterior mean s + a t.
+b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
+is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7).
 """
 
 from dataclasses import dataclass
@@ -21,29 +16,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from device.recon.estimation.noise import Noise
-from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.refraction_crop_model import CropModel, Fit
 from device.recon.estimation.refraction_edge import EdgeLikelihood
-from device.recon.model.fft_plans import Planner, RealFft, Spectrum
-from device.recon.model.preprocessing import LEAST_GOOD, Linear
-from device.values import Image
+from device.recon.model.fft_plans import Planner
 
-COSINES = 10  # per axis
-DETAIL_EXPONENT = -2.5  # of the spectrum P; exponents from -2 to -3 give the same eyes
-REFERENCE = 0.1  # cycles per sample, at which the level of P is fitted to the rings
-FLATTEST = 0.02  # cycles per sample, below which P is constant
-FITTED_RINGS = 10
-MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
-MOST_ITERATIONS = 40  # of conjugate gradients; with 80 the errors are the same
-COVARIANCE_ITERATIONS = 20  # for the covariance: its sds change by 1 % at the most
-RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
-MODEL_SHARE = 0.0022  # of the mean: sd of what the model lacks
-MODEL_SD_DPT = 0.03  # of each component by the model, beside noise: RMS error of the paper's sensor in full light
-MOST_STEPS = 6
+MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
+VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the residual; the rest is correlated
+MOST_STEPS = 12  # 2 to 4 are usual
+BIAS_STEPS = 2  # first steps, for which the bias of a noise-free frame is computed
+FULL_STEPS = 3  # first steps; later ones are halved: some frames overshoot by a factor of two
+NOISE_PAIRS = 2  # draws for the bias by noise: their scatter adds 3 % to the sd
 SETTLED_SDS = 0.2
 MOST_MISFIT = 1.2
 LARGEST_STEP_DPT = 0.7
-DERIVATIVE_STEP_DPT = 0.05
 
 Floats = NDArray[np.float64]
 
@@ -68,200 +53,49 @@ class Refined:
     @property
     def sds_dpt(self) -> Floats:
         """Standard deviations of M, J0 and J45, (3,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance) * max(self.misfit, 1.0) + MODEL_SD_DPT**2))
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """Weights of the samples of one frame's window: one over the variance of each, 0 for missing ones.
-
-    The cosines `down` and `across`, (COSINES, rows) and (COSINES, cols), are free: their products are taken out.
-    """
-
-    weights: Image
-    down: Image
-    across: Image
-    inverse_normal: Floats
-
-    @classmethod
-    def of(cls, frame: Linear, noise: Noise) -> "Weighting":
-        """Return the weights for the noise of a sample and for what the model lacks."""
-        model_dn = MODEL_SHARE * frame.mean_dn
-        variance_dn2 = noise.per_dn * np.maximum(frame.y, 0) + noise.floor_dn2 + model_dn**2
-        weights = ((frame.good >= LEAST_GOOD) / variance_dn2).astype(np.float32)
-        down, across = (_cosines(size) for size in frame.y.shape)
-        by_rows = np.einsum("ai,bi,ij->abj", down, down, weights, optimize=True)
-        normal = np.einsum("abj,cj,dj->acbd", by_rows, across, across, optimize=True)
-        flat = normal.reshape(COSINES**2, COSINES**2).astype(np.float64)
-        return cls(weights, down, across, np.asarray(np.linalg.inv(flat)))
-
-    def __call__(self, frame: Image) -> Image:
-        """Return a frame times the weights, without the part that the cosines explain."""
-        weighted = self.weights * frame
-        part = self.inverse_normal @ (self.down @ weighted @ self.across.T).ravel().astype(np.float64)
-        weighted -= self.weights * (self.down.T @ part.reshape(COSINES, COSINES).astype(np.float32) @ self.across)
-        return weighted
+        by_residual = VARIANCE_PER_MISFIT * self.misfit * np.diag(self.covariance)
+        return np.asarray(np.sqrt(by_residual + MODEL_SD_DPT**2))
 
 
 class CropRefinement:
     """Refinement of the eyes that an `EdgeLikelihood` has found, on the same grid, for a PSF with this radius."""
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
-        self._edges, grid = edges, edges.grid
-        self._grid = grid
-        self._psf_samples = psf_radius_px / grid.n
-        self._fft: RealFft = planner.plan(grid.shape)
-        rows, cols = grid.shape
-        self._rows = (np.arange(rows, dtype=np.float32) - np.float32(grid.centre[0]))[:, None]
-        self._cols = (np.arange(cols, dtype=np.float32) - np.float32(grid.centre[1]))[None]
-        frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
-        self._root_shape = (np.maximum(frequency, FLATTEST) / REFERENCE) ** (DETAIL_EXPONENT / 2)
-        self._twice = np.full(cols // 2 + 1, 2.0)
-        self._twice[0] = 1
-        if cols % 2 == 0:
-            self._twice[-1] = 1
-        self._otf = np.zeros(frequency.shape, np.complex64)
+        self._edges, self._model = edges, CropModel(edges, planner, psf_radius_px)
 
     def __call__(self, eye_dpt: Floats) -> Refined:
         """Return the refinement of an eye (M, J0, J45) of the frame that `edges` was started with."""
-        frame, detail = self._edges.frame, None
-        self._weighting = Weighting.of(frame, self._edges.noise)
-        self._set_prior(eye_dpt)
-        covariance = np.zeros((3, 3))
+        light, model, detail = self._edges.frame.y, self._model, None
+        model.start(eye_dpt)
         for done in range(MOST_STEPS):
-            self._edges.fit_smooth(eye_dpt)
-            self._focus(eye_dpt)
-            smooth = self._edges.smooth
-            rest = (frame.y - self._seen(self._spectrum(smooth))).astype(np.float32)
-            detail, weighted, fitted = self._solve(rest, detail)
-            spectrum = self._spectrum(smooth + self._object(detail))
-            derivatives = [self._seen(spectrum, slope) for slope in self._slopes]
+            model.focus(eye_dpt)
+            fit = model.fit(light, detail)
+            detail = fit.detail
+            if done < BIAS_STEPS:
+                without_noise = model.fit(fit.expected, detail).score
             if done == 0:
-                covariance = self._covariance(derivatives)
-            step = covariance @ np.array([np.vdot(part, weighted) for part in derivatives], np.float64)
+                covariance = model.covariance(fit.derivatives)
+                by_noise = self._score_with_noise(fit) - without_noise
+                by_noise[1:] = 0  # J0 and J45 have none by symmetry; what the draws would give them only scatters
+            step = covariance @ (fit.score - without_noise - by_noise)
+            if done >= FULL_STEPS:
+                step = step / 2
             eye_dpt = eye_dpt + np.clip(step, -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
             has_settled = bool((np.abs(step) < SETTLED_SDS * np.sqrt(np.diag(covariance))).all())
             if has_settled:
                 break
-        misfit = float(np.vdot(weighted, rest - fitted)) / np.count_nonzero(self._weighting.weights)
-        return Refined(eye_dpt, covariance, misfit, has_settled)
+        self._edges.fit_smooth(eye_dpt)
+        return Refined(eye_dpt, covariance, model.misfit(light, fit), has_settled)
 
-    def _covariance(self, derivatives: list[Image]) -> Floats:
-        """Return the inverse of D' K^-1 D for the derivatives D of the frame, (3, 3)."""
-        solved = [self._solve(part, None, COVARIANCE_ITERATIONS)[1] for part in derivatives]
-        matrix = np.array([[np.vdot(a, b) for b in derivatives] for a in solved], np.float64)
-        return np.asarray(np.linalg.inv((matrix + matrix.T) / 2))
+    def _score_with_noise(self, fit: Fit) -> Floats:
+        """Return the mean score (3,) of the expected frame of a fit with noise of the sensor.
 
-    def _set_prior(self, eye_dpt: Floats) -> None:
-        """Set the object's reach from the edge, and the level of its detail from the rings of the likelihood."""
-        edges, edge = self._edges, self._edges.edge
-        frequencies, levels = detail_levels(edges, eye_dpt)
-        lit = np.pi * edge.radius_samples**2
-        seen = float(np.prod(self._grid.window)) / (np.pi * (edge.radius_samples + self._psf_samples) ** 2)
-        share = min(seen * float((edges.likelihood.taper**2).mean()), 1.0)
-        logs = np.log(levels) - DETAIL_EXPONENT * np.log(frequencies / REFERENCE)
-        self._root = (self._root_shape * np.exp(logs.mean() / 2) / np.sqrt(lit * share)).astype(np.float32)
-        radius = np.hypot(self._rows - np.float32(edge.down_samples), self._cols - np.float32(edge.right_samples))
-        reach = edge.radius_samples + edge.width_samples / 2 + MARGIN_SAMPLES
-        self._reach = np.clip((np.float32(reach) - radius) / 2, 0, 1).astype(np.float32)
-        self._mean_weight = float(self._weighting.weights.mean()) * min(seen, 1.0)
-
-    def _focus(self, eye_dpt: Floats) -> None:
-        """Set OTF and preconditioner to an eye."""
-        likelihood = self._edges.likelihood
-        stretch = transform(likelihood.geometry, *eye_dpt)
-        likelihood.interpolated_otf.on_grid(self._grid.shape, self._grid.n, stretch, self._otf)
-        power = np.abs(self._otf) ** 2 * self._root**2
-        self._slopes = [self._slope(eye_dpt, axis) for axis in np.eye(3) * DERIVATIVE_STEP_DPT]
-        self._preconditioner = (1 / (1 + self._mean_weight * power)).astype(np.float32)
-
-    def _slope(self, eye_dpt: Floats, step_dpt: Floats) -> Spectrum:
-        """Return the derivative of the OTF with respect to the eye along a small step, per dpt."""
-        likelihood = self._edges.likelihood
-        above, below = (
-            likelihood.interpolated_otf.on_grid(
-                self._grid.shape, self._grid.n, transform(likelihood.geometry, *(eye_dpt + sign * step_dpt))
-            ) for sign in (1, -1)
-        )  # fmt: skip
-        return np.asarray((above - below) / np.float32(2 * DERIVATIVE_STEP_DPT), np.complex64)
-
-    def _spectrum(self, image: Image) -> Spectrum:
-        self._fft.space[:] = image
-        return self._fft.forward().copy()
-
-    def _seen(self, spectrum: Spectrum, otf: Spectrum | None = None) -> Image:
-        """Return the frame of an object's spectrum."""
-        np.multiply(spectrum, self._otf if otf is None else otf, out=self._fft.spectrum)
-        return self._fft.inverse()[self._grid.slices] / np.float32(self._grid.size)
-
-    def _object(self, detail: Spectrum) -> Image:
-        """Return the detail of the object (a view) that a whitened spectrum stands for."""
-        np.multiply(detail, self._root, out=self._fft.spectrum)
-        space = self._fft.inverse()
-        space *= self._reach / np.float32(self._grid.size)
-        return space
-
-    def _blurred(self, detail: Spectrum) -> Image:
-        """Return the frame of a whitened spectrum."""
-        self._object(detail)
-        spectrum = self._fft.forward()
-        spectrum *= self._otf
-        return self._fft.inverse()[self._grid.slices] / np.float32(self._grid.size)
-
-    def _adjoint(self, frame: Image) -> Spectrum:
-        """Return the adjoint of `_blurred`, a new array."""
-        space = self._fft.space
-        space[:] = 0
-        space[self._grid.slices] = frame
-        spectrum = self._fft.forward()
-        np.multiply(spectrum, self._otf.conj(), out=spectrum)
-        space = self._fft.inverse()
-        space *= self._reach / np.float32(self._grid.size)
-        return np.asarray(self._fft.forward() * self._root, np.complex64)
-
-    def _solve(
-        self, frame: Image, start: Spectrum | None, most: int = MOST_ITERATIONS
-    ) -> tuple[Spectrum, Image, Image]:
-        """Return the whitened spectrum of a frame's detail, K^-1 times the frame, and the frame of the detail."""
-        detail = np.zeros(self._otf.shape, np.complex64) if start is None else start
-        fitted = np.zeros(self._grid.window, np.float32) if start is None else self._blurred(detail)
-        rest = self._adjoint(self._weighting(frame - fitted)) - detail
-        first = self._dot(self._adjoint(self._weighting(frame)), self._preconditioner)
-        direction = rest * self._preconditioner
-        size = self._dot(rest, self._preconditioner)
-        for _ in range(most):
-            if size <= RESIDUAL_SHARE * first:
-                break
-            seen = self._blurred(direction)
-            moved = self._adjoint(self._weighting(seen)) + direction
-            length = np.float32(size / self._dot(direction, 1, moved))
-            detail = detail + length * direction
-            fitted += length * seen
-            rest -= length * moved
-            before, size = size, self._dot(rest, self._preconditioner)
-            direction *= np.float32(size / before)
-            direction += rest * self._preconditioner
-        return detail, self._weighting(frame - fitted), fitted
-
-    def _dot(self, a: Spectrum, weight: Image | int, b: Spectrum | None = None) -> float:
-        """Return the inner product of two images with these spectra, weighted per frequency, times their size."""
-        product = a.real * (a if b is None else b).real + a.imag * (a if b is None else b).imag
-        return float((product * weight).sum(axis=0, dtype=np.float64) @ self._twice)
-
-
-def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:
-    """Return mean frequency (cycles per sample) and level of the retina's detail of each ring that has a level."""
-    edges(eye_dpt)
-    band, count = edges.band, edges.levels.size
-    sums = np.bincount(band.ring, np.hypot(band.rows, band.cols), count).astype(np.float64)
-    frequency = sums / np.maximum(np.bincount(band.ring, minlength=count), 1)
-    is_known = edges.levels[:FITTED_RINGS] > 0
-    return frequency[:FITTED_RINGS][is_known], edges.levels[:FITTED_RINGS][is_known]
-
-
-def _cosines(size: int) -> Image:
-    """Return the first COSINES functions of the discrete cosine transform, (COSINES, size), with unit norm."""
-    place = (np.arange(size) + 0.5) / size
-    functions = np.cos(np.pi * np.arange(COSINES)[:, None] * place)
-    unit: Image = (functions / np.linalg.norm(functions, axis=1, keepdims=True)).astype(np.float32)
-    return unit
+        Each noise is used with both signs, so that the parts of odd order cancel.
+        """
+        noise, random, total = self._edges.noise, np.random.default_rng(0), np.zeros(3)
+        sd_dn = np.sqrt(noise.per_dn * np.maximum(fit.expected, 0) + noise.floor_dn2).astype(np.float32)
+        for _ in range(NOISE_PAIRS):
+            noise_dn = random.standard_normal(sd_dn.shape, np.float32) * sd_dn
+            for light in (fit.expected + noise_dn, fit.expected - noise_dn):
+                total += self._model.fit(light, fit.detail).score
+        return total / (2 * NOISE_PAIRS)

@@ -62,9 +62,10 @@ class EdgeLikelihood:
     """Negative log likelihood of an eye with an unknown field edge, for one calibration and one sensor shape.
 
     An eye is an array of M, or of M, J0 and J45, in dpt. With `edge_is_known` the calibrated edge is kept. It holds the
-    state of the `frame` of the last `start`: the edge, the `noise` of a sample, and the `smooth` part of the last
-    `fit_smooth`. `band` holds the frequencies, `levels` the level of the retina's detail of each ring in the last
-    likelihood.
+    state of the `frame` of the last `start`: the edge, the `noise` of a sample, the light `dithered_dn` from which on
+    it dithers the rounding of the counts (0 for a frame that is not rounded), and the smooth part of the last
+    `fit_smooth`. `field` fits the smooth part of any frame on these samples, `band` holds the frequencies, `levels` the
+    level of the retina's detail of each ring in the last likelihood.
     """
 
     def __init__(
@@ -79,16 +80,18 @@ class EdgeLikelihood:
         self.band: Band = self.likelihood.bands.whole
         self.prior = EdgePrior(calibration.field_deg, geometry.px_per_deg / self.grid.n)
         self.edge = self.prior.calibrated
-        self._field = LitField(self.grid, self.edge, self.prior.largest_samples)
+        self.field = LitField(self.grid, self.edge, self.prior.largest_samples)
         self._moved_objects: list[Spectrum] = []
         self._flat_places = np.arange(self.band.where.size)
         self.levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
         self.noise = Noise(0.0, 1.0)
+        self._is_integer, self.dithered_dn = False, 0.0
         self._noise_dn2 = 1.0
 
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
         self.frame = self.likelihood.frame(counts, dark, defects)
+        self._is_integer = counts.dtype.kind == "u"
         self.edge = self.prior.calibrated
         return self.frame
 
@@ -97,13 +100,13 @@ class EdgeLikelihood:
         self.likelihood.residual_of(self.frame, transform(self.likelihood.geometry, *eye_dpt))
         self.noise = self.likelihood.noise(self.frame)
         self._noise_dn2 = noise_power(self.noise, self.frame, self.likelihood.sample_weights)
+        self.dithered_dn = self.noise.dithered_dn(self.grid.n) if self._is_integer else 0.0
 
     def fit_smooth(self, eye_dpt: Floats) -> float:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
         stretch = transform(self.likelihood.geometry, *eye_dpt)
         otf = self.likelihood.interpolated_otf.on_grid(self.grid.shape, self.grid.n, stretch)
-        smooth = self._field.fit(self.frame, otf, self.edge)
-        self.smooth = smooth.image
+        smooth = self.field.fit(self.frame, otf, self.edge)
         self.likelihood.set_smooth(self.frame, smooth.image, smooth.stray_dn, otf)
         self._moved_objects = [self.likelihood.object_spectrum(image) for image in smooth.derivatives]
         return smooth.level_dn
