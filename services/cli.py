@@ -330,20 +330,53 @@ def calibrate_head(
     mishap: Annotated[
         list[str] | None, typer.Option(help="Let a step of a simulated head go wrong, such as point=moving.")
     ] = None,
+    trial_lenses: Annotated[
+        bool, typer.Option("--trial-lenses", help="Only show lenses before a trainer eye: offset of the refraction.")
+    ] = False,
+    vertex_mm: Annotated[
+        float | None, typer.Option(min=0, max=30, help="With --trial-lenses: from lens to pupil; 12 if not given.")
+    ] = None,
+    eye_dpt: Annotated[
+        float | None, typer.Option(min=-10, max=10, help="With --trial-lenses: correction of the trainer eye; else 0.")
+    ] = None,
 ) -> None:
-    """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
+    """Measure a head with a cap, an even screen and a point source, and put its calibration in force.
+
+    With --trial-lenses the calibration in force gets the offset of the refraction instead, or the head is refused.
+    """
     from services.instrument.calibration_request import CalibrationRequest
     from services.lab.calibrate_head import calibrate, measured_values
 
-    def ask_operator(prompt: str) -> None:
-        typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
-
+    if trial_lenses:
+        if serial or source_deg or dioptres or eye_mm or colours or keep_raw or leds or mishap:
+            raise typer.BadParameter("--trial-lenses goes with --head, --archive, --vertex-mm and --eye-dpt only")
+        _calibrate_with_lenses(head, archive, vertex_mm, eye_dpt)
+        return
+    if vertex_mm is not None or eye_dpt is not None:
+        raise typer.BadParameter("--vertex-mm and --eye-dpt go with --trial-lenses")
     mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
     options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
     request = CalibrationRequest(archive, serial, by, *options)
-    calibrated = calibrate(load_head(head), request, SystemClock(), ask_operator, typer.echo)
+    calibrated = calibrate(load_head(head), request, SystemClock(), _ask_operator, typer.echo)
     for line in (*measured_values(calibrated), f"{calibrated.calibration.id} is in force in {archive}"):
         typer.echo(line)
+
+
+def _ask_operator(prompt: str) -> None:
+    typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
+
+
+def _calibrate_with_lenses(head: Path, archive: Path, vertex_mm: float | None, eye_dpt: float | None) -> None:
+    """Show the trial lenses, print their table, and put the calibration with the offset in force."""
+    from device.optics.trial_lens import PowerVector
+    from services.lab.check_head import with_archive
+    from services.lab.trial_lens_check import VERTEX_MM, LensBench, calibrate_with_lenses
+
+    _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
+    bench = LensBench(VERTEX_MM if vertex_mm is None else vertex_mm, PowerVector(eye_dpt or 0.0))
+    spec = with_archive(load_head(head), archive)
+    done = calibrate_with_lenses(spec, bench, SystemClock(), _ask_operator, typer.echo)
+    typer.echo(f"{done.stored.calibration.id} is in force in {archive}; it takes the offset from every refraction")
 
 
 def _colours(words: str) -> tuple[Colour, ...]:
