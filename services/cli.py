@@ -330,30 +330,11 @@ def calibrate_head(
     mishap: Annotated[
         list[str] | None, typer.Option(help="Let a step of a simulated head go wrong, such as point=moving.")
     ] = None,
-    trial_lenses: Annotated[
-        bool, typer.Option("--trial-lenses", help="Only show lenses before a trainer eye: offset of the refraction.")
-    ] = False,
-    vertex_mm: Annotated[
-        float | None, typer.Option(min=0, max=30, help="With --trial-lenses: from lens to pupil; 12 if not given.")
-    ] = None,
-    eye_dpt: Annotated[
-        float | None, typer.Option(min=-10, max=10, help="With --trial-lenses: correction of the trainer eye; else 0.")
-    ] = None,
 ) -> None:
-    """Measure a head with a cap, an even screen and a point source, and put its calibration in force.
-
-    With --trial-lenses the calibration in force gets the offset of the refraction instead, or the head is refused.
-    """
+    """Measure a head with a cap, an even screen and a point source, and put its calibration in force."""
     from services.instrument.calibration_request import CalibrationRequest
     from services.lab.calibrate_head import calibrate, measured_values
 
-    if trial_lenses:
-        if serial or source_deg or dioptres or eye_mm or colours or keep_raw or leds or mishap:
-            raise typer.BadParameter("--trial-lenses goes with --head, --archive, --vertex-mm and --eye-dpt only")
-        _calibrate_with_lenses(head, archive, vertex_mm, eye_dpt)
-        return
-    if vertex_mm is not None or eye_dpt is not None:
-        raise typer.BadParameter("--vertex-mm and --eye-dpt go with --trial-lenses")
     mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
     options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
     request = CalibrationRequest(archive, serial, by, *options)
@@ -366,17 +347,25 @@ def _ask_operator(prompt: str) -> None:
     typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
 
 
-def _calibrate_with_lenses(head: Path, archive: Path, vertex_mm: float | None, eye_dpt: float | None) -> None:
-    """Show the trial lenses, print their table, and put the calibration with the offset in force."""
+@app.command("trial-lenses")
+def show_trial_lenses(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
+    vertex_mm: Annotated[float, typer.Option(min=0, max=30, help="From the lens to the trainer eye's pupil.")] = 12.0,
+    eye_dpt: Annotated[float, typer.Option(min=-10, max=10, help="Correction that the trainer eye alone needs.")] = 0.0,
+) -> None:
+    """Show lenses before a trainer eye: the offset of the refraction goes into the calibration in force.
+
+    A head whose offset, slope or cylinder is outside its limits is refused, and its calibration stays as it is.
+    """
     from device.optics.trial_lens import PowerVector
     from services.lab.check_head import with_archive
-    from services.lab.trial_lens_check import VERTEX_MM, LensBench, calibrate_with_lenses
+    from services.lab.trial_lens_check import LensBench, calibrate_with_lenses
 
     _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
-    bench = LensBench(VERTEX_MM if vertex_mm is None else vertex_mm, PowerVector(eye_dpt or 0.0))
-    spec = with_archive(load_head(head), archive)
+    spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))
     done = calibrate_with_lenses(spec, bench, SystemClock(), _ask_operator, typer.echo)
-    typer.echo(f"{done.stored.calibration.id} is in force in {archive}; it takes the offset from every refraction")
+    typer.echo(f"{done.stored.calibration.id} is in force; reports subtract its offset")
 
 
 def _colours(words: str) -> tuple[Colour, ...]:

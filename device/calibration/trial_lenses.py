@@ -47,7 +47,8 @@ WORDS = {
 Floats = NDArray[np.float64]
 
 
-class LensReading(NamedTuple):
+@dataclass(frozen=True)
+class LensReading:
     """Refraction measured with a trial lens before the eye, without offset, and its standard deviations, dpt."""
 
     lens: TrialLens

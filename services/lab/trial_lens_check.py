@@ -1,4 +1,4 @@
-"""`diffuscope calibrate --trial-lenses`: offset and check of the refraction with lenses before a trainer eye.
+"""`diffuscope trial-lenses`: offset and check of the refraction with lenses before a trainer eye.
 
     calibrate_with_lenses   shows each lens, measures its refraction, judges the head, and stores the offset
     keep_offset             judges readings and stores their offset
