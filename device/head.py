@@ -36,6 +36,7 @@ from device.light_safety.dose_ledger import Ledger
 from device.light_safety.guard import GuardedLight
 from device.light_safety.hazard import NO_LIGHT, Hazard, light_limits, radiometry
 from device.optics.matrix import chain_of, lamps_of
+from device.optics.trial_lens import TrialLens
 from device.ports import NO_CHIPS, Button, Camera, Chips, HeadMemory, Light
 from device.sim import calibration_targets, fault_injection
 from device.sim.camera import SimCamera
@@ -58,7 +59,8 @@ class Head:
     """Opened head: specification, camera, guarded light, chips and calibration.
 
     `provenance` describes the origin of an archived calibration; None without an archive. `present_eye` is called with
-    the next eye while the lamp is dark; a simulated head then shows that eye.
+    the next eye while the lamp is dark; a simulated head then shows that eye. `place_trial_lens` puts a trial lens
+    before it, at a distance from its pupil in mm; None with a real camera, whose operator does.
     """
 
     spec: InstrumentSpec
@@ -70,6 +72,7 @@ class Head:
     resources: ExitStack = field(default_factory=ExitStack)  # closes the opened parts in reverse order
     provenance: Provenance | None = None
     present_eye: Callable[[Eye, str | None], None] = no_repositioning
+    place_trial_lens: Callable[[TrialLens, float], None] | None = None
 
     @property
     def kind(self) -> str:
@@ -314,6 +317,17 @@ class Bench:
         self.resources.close()
 
 
+def trial_lens_placer(world: World) -> Callable[[TrialLens, float], None]:
+    """Return a function that puts a trial lens before the eye of a simulated head, in place of the lens before."""
+    bare = world.eyes
+
+    def place(lens: TrialLens, vertex_mm: float) -> None:
+        world.eyes = bare.behind_lens(lens, vertex_mm)
+        world.present_eye(world.eye)
+
+    return place
+
+
 def target_placer(world: World) -> Callable[[CalibrationTarget], None]:
     """Return a function that places calibration targets before a simulated head, as bright as one exposure needs."""
     e_per_s = TARGET_FILL_SHARE * world.spec.camera.full_well_e / world.spec.camera.exposure_s
@@ -387,14 +401,18 @@ def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
     spec, calibration = opening.spec, opening.calibration()
     facing: Callable[[Eye, str | None], None] = no_repositioning
+    lens_placer = None
     if spec.camera.backend == "sim":
-        facing = opening.world.present_eye
+        facing, lens_placer = opening.world.present_eye, trial_lens_placer(opening.world)
         facing("OD", None)  # traces the light now, not while a lamp is on
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
     chips, button = opening.chips(), opening.button()
-    return Head(spec, camera, light, calibration, chips, button, provenance=known, present_eye=facing)
+    return Head(
+        spec, camera, light, calibration, chips, button,
+        provenance=known, present_eye=facing, place_trial_lens=lens_placer,
+    )  # fmt: skip
 
 
 def refuse_mismatched_head(head: Head) -> None:

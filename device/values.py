@@ -178,12 +178,28 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class RefractionOffset:
+    """Refraction that the head reports of an eye without any, as correcting lens, with standard deviations, dpt.
+
+    Measured with trial lenses (`calibration/trial_lenses.py`); subtracted from every reported refraction.
+    """
+
+    m_dpt: float
+    j0_dpt: float
+    j45_dpt: float
+    m_sd_dpt: float
+    j0_sd_dpt: float
+    j45_sd_dpt: float
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Measured or simulated calibration of one head.
 
     `psfs` has one entry or a stack over depth, for all colours or for each (`for_colour`); `dark_dn` (dark frame) and
     `flat` (flat frame) are (rows, cols) or None; `bad` marks defective pixels; `field_deg` is the diameter of the
-    illuminated disc around the centre (None: not known). PsfError without PSFs or for PSFs of different shapes.
+    illuminated disc around the centre (None: not known); `refraction_offset` is None if no trial lenses were shown.
+    PsfError without PSFs or for PSFs of different shapes.
     """
 
     psfs: tuple[Psf, ...]
@@ -194,6 +210,7 @@ class Calibration:
     flat: Image | None = None
     bad: Mask | None = None
     simulated: bool = False
+    refraction_offset: RefractionOffset | None = None
 
     def __post_init__(self) -> None:
         if not self.psfs:
@@ -219,6 +236,8 @@ class Calibration:
         digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        if self.refraction_offset is not None:  # so that a calibration without one keeps its identity
+            digest.update(repr(self.refraction_offset).encode())
         return digest.hexdigest()[:16]
 
 

@@ -334,15 +334,37 @@ def calibrate_head(
     from services.instrument.calibration_request import CalibrationRequest
     from services.lab.calibrate_head import calibrate, measured_values
 
-    def ask_operator(prompt: str) -> None:
-        typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
-
     mishaps = {stand: name for stand, _, name in (pair.partition("=") for pair in mishap or ())}
     options = source_deg, eye_mm, dioptres, _colours(colours), keep_raw, leds, mishaps
     request = CalibrationRequest(archive, serial, by, *options)
-    calibrated = calibrate(load_head(head), request, SystemClock(), ask_operator, typer.echo)
+    calibrated = calibrate(load_head(head), request, SystemClock(), _ask_operator, typer.echo)
     for line in (*measured_values(calibrated), f"{calibrated.calibration.id} is in force in {archive}"):
         typer.echo(line)
+
+
+def _ask_operator(prompt: str) -> None:
+    typer.prompt(f"{prompt} Then press Enter", default="", show_default=False)
+
+
+@app.command("trial-lenses")
+def show_trial_lenses(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
+    vertex_mm: Annotated[float, typer.Option(min=0, max=30, help="From the lens to the trainer eye's pupil.")] = 12.0,
+    eye_dpt: Annotated[float, typer.Option(min=-10, max=10, help="Correction that the trainer eye alone needs.")] = 0.0,
+) -> None:
+    """Show lenses before a trainer eye: the offset of the refraction goes into the calibration in force.
+
+    A head whose offset, slope or cylinder is outside its limits is refused, and its calibration stays as it is.
+    """
+    from device.optics.trial_lens import PowerVector
+    from services.lab.check_head import with_archive
+    from services.lab.trial_lens_check import LensBench, calibrate_with_lenses
+
+    _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
+    spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))
+    done = calibrate_with_lenses(spec, bench, SystemClock(), _ask_operator, typer.echo)
+    typer.echo(f"{done.stored.calibration.id} is in force; reports subtract its offset")
 
 
 def _colours(words: str) -> tuple[Colour, ...]:

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from math import isfinite
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,11 +35,11 @@ from device.errors import (
     StoreError,
     StoreFull,
 )
-from device.values import Calibration, Colour, Geometry, Psf, Sensor
+from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, Sensor
 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
-FORMAT = 1
+FORMAT, OFFSET_FORMAT = 1, 2  # the second has a refraction offset, which earlier releases cannot read
 ID, NAME = re.compile("[0-9a-f]{16}"), re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
 
 
@@ -209,11 +210,13 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     table = asdict(provenance) | {"made_at": provenance.made_at.isoformat(), "figures": None}
     table["unknown"] = list(provenance.unknown)
     return {
-        "format": FORMAT, "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
+        "format": FORMAT if calibration.refraction_offset is None else OFFSET_FORMAT,
+        "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
         "psf_colours": [psf.colour or "every" for psf in calibration.psfs],
         "sensor": asdict(calibration.sensor),
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
+        "refraction_offset": asdict(calibration.refraction_offset) if calibration.refraction_offset else None,
         "provenance": table, "figures": dict(provenance.figures),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in arrays.items()},
     }  # fmt: skip
@@ -228,8 +231,9 @@ def _read_files(place: Path) -> dict[str, bytes]:
 
 def _parse_manifest(files: Mapping[str, bytes]) -> dict[str, Any]:
     manifest = tomllib.loads(unsealed(_required_file(files, MANIFEST)))
-    if manifest["format"] != FORMAT:
-        raise CalibrationFormat(f"this calibration was kept in format {manifest['format']}; known here is {FORMAT}")
+    if manifest["format"] not in (FORMAT, OFFSET_FORMAT):
+        known = f"{FORMAT} and {OFFSET_FORMAT}"
+        raise CalibrationFormat(f"this calibration was kept in format {manifest['format']}; known here are {known}")
     return manifest
 
 
@@ -252,6 +256,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
             geometry=Geometry(**_numbers(manifest["geometry"])) if "geometry" in manifest else None,
             field_deg=_numbers({"field_deg": manifest.get("field_deg")})["field_deg"],
             simulated=_BOOL.validate_python(manifest["simulated"]),
+            refraction_offset=_offset(manifest.get("refraction_offset")),
             **{name: _checked_map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
         figures = tuple(manifest["figures"].items())
@@ -273,6 +278,16 @@ def _numbers(table: dict[str, Any]) -> dict[str, Any]:
     """Return the table unchanged; ValueError unless all values are numbers or None. Their digits are part of the id."""
     _NUMBERS.validate_python(table, strict=True)
     return table
+
+
+def _offset(table: dict[str, Any] | None) -> RefractionOffset | None:
+    """Return the refraction offset of a manifest; None without one. ValueError unless all values are finite numbers."""
+    if table is None:
+        return None
+    offset = RefractionOffset(**_numbers(table))
+    if not all(isinstance(value, int | float) and isfinite(value) for value in asdict(offset).values()):
+        raise ValueError("the refraction offset holds a value that is no number")
+    return offset
 
 
 def _checked_map(array: np.ndarray | None, name: str) -> np.ndarray | None:

@@ -26,6 +26,7 @@ from device.recon.assessment.image_quality import (
     quality_warnings,
 )
 from device.recon.assessment.psf_consistency import Match, PsfConsistency
+from device.recon.estimation.corrected_refraction import corrected
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.refraction import (
     NoRefraction,
@@ -350,6 +351,8 @@ class Reconstructor:
         explained = not dark and is_explained(quality, match, misfit)
         if eye is not None and not (explained and is_lit(quality)):
             eye = NoRefraction("the forward model does not explain the frame")
+        if isinstance(eye, Refraction):
+            eye = corrected(eye, self.calibration.refraction_offset)
         quality |= {
             key: None for key in PSF_FIGURES if key in quality and not (explained and is_measured(key, quality))
         }

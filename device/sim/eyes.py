@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from device.config.head_file import InstrumentSpec
+from device.optics.trial_lens import PowerVector, TrialLens, correction_behind
 from device.sim.fundus import FIELD_CENTRE_DEG, Fundus
 from device.sim.objects import draw_object, moved_behind_field
 from device.sim.optical_setup import OpticalSetup, Scene
@@ -48,6 +49,19 @@ class RenderedEyes:
         turned = copy(self)
         turned.turn_deg = turn_deg if eye == "OD" else (-turn_deg[0], turn_deg[1])
         return turned
+
+    def behind_lens(self, lens: TrialLens, vertex_mm: float) -> "RenderedEyes":
+        """Return the eyes of this scene, looking straight on, with a trial lens at a distance before their pupils, mm.
+
+        The scene's refraction is a wavefront, y downwards; that of lens and eye a correcting lens, y upwards.
+        """
+        spec, eye = self.scene.spec, self.scene.sim.eye
+        m, j0, j45 = correction_behind(lens, vertex_mm, PowerVector(-eye.m_dpt, -eye.j0_dpt, eye.j45_dpt))
+        behind = eye.model_copy(update={"m_dpt": -m, "j0_dpt": -j0, "j45_dpt": j45})
+        sim = self.scene.sim.model_copy(update={"eye": behind})
+        eyes = RenderedEyes(spec.model_copy(update={"sim": sim}), self.scene.eye, self._choose)
+        eyes._retinas = self._retinas
+        return eyes
 
     @cached_property
     def plan(self) -> tuple[Decision, ...]:

@@ -1,7 +1,7 @@
 """Text of `diffuscope calibrations` for one archived calibration."""
 
 from device.calibration.archive import StoredCalibration
-from device.values import Calibration, Geometry
+from device.values import Calibration, Geometry, RefractionOffset
 
 
 def printable(text: str) -> str:
@@ -28,6 +28,7 @@ def details(kept: StoredCalibration) -> tuple[str, ...]:
         ("geometry", _geometry(found.geometry)),
         ("field", "unknown" if found.field_deg is None else f"{found.field_deg:g} deg"),
         *((name, "unknown" if getattr(found, name) is None else "measured") for name in ("dark_dn", "flat", "bad")),
+        ("refraction offset", _offset(found.refraction_offset)),
         *((f"psf {k}", printable(psf.name)) for k, psf in enumerate(found.psfs)),
         *((printable(name), f"{value:.4g}") for name, value in provenance.figures),
     ]
@@ -35,6 +36,12 @@ def details(kept: StoredCalibration) -> tuple[str, ...]:
         lines.append(("unknown", printable(", ".join(provenance.unknown))))
     wide = max(len(name) for name, _ in lines)
     return tuple(f"  {name:<{wide}}  {value}" for name, value in lines)
+
+
+def _offset(offset: RefractionOffset | None) -> str:
+    if offset is None:
+        return "not measured"
+    return f"M {offset.m_dpt:+.2f} (sd {offset.m_sd_dpt:.2f}), J0 {offset.j0_dpt:+.2f}, J45 {offset.j45_dpt:+.2f} dpt"
 
 
 def _numbers(kept: StoredCalibration) -> str:

@@ -56,6 +56,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "light --head {0}/none.toml --power-mw 1 --waist-mw-per-cm2 1 --peak-nm 525 --meter M", "light",
     "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
     "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
+    "trial-lenses --head {0}/head.toml", "trial-lenses --head {0}/head.toml --archive {0}/a --vertex-mm 40",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2", "archive plan {0}/none -o {0}/plan.toml",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2 --budget-s 1", "archive plan",
     "archive run", "archive run {0}/plan.toml -o {0}/results --workers 0", "archive report",  # with or without Dask

@@ -1,6 +1,7 @@
 """Tests of the calibration archive: atomic writes, and detection of any single wrong byte."""
 
 import random
+import tomllib
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from device.calibration.archive import Archive, Provenance
+from device.calibration.archive import Archive, Provenance, sealed, unsealed
 from device.errors import CalibrationDamaged, CalibrationError, CalibrationMissing, StoreError
-from device.values import Calibration, Geometry, Psf, Sensor
+from device.values import Calibration, Geometry, Psf, RefractionOffset, Sensor
 from tests.scenes import speckle
 
 WHEN = datetime(2026, 11, 21, 9, 30, tzinfo=UTC)
@@ -104,3 +105,26 @@ def test_a_missing_or_truncated_file_raises_calibration_damaged(archive, name):
     path.unlink()
     with pytest.raises(CalibrationError):
         archive.load()
+
+
+OFFSET = RefractionOffset(0.25, -0.1, 0.05, 0.03, 0.02, 0.02)
+
+
+def test_a_refraction_offset_is_stored_and_part_of_the_identity(archive):
+    plain = archive.active_id()
+    with_offset = replace(calibration(), refraction_offset=OFFSET)
+    assert with_offset.id == archive.add_and_activate(with_offset, WHO) != plain
+    assert archive.load().calibration.refraction_offset == OFFSET
+    assert archive.load(plain).calibration.refraction_offset is None
+    formats = [tomllib.loads(archive.files(id)["manifest.toml"].decode())["format"] for id in (plain, with_offset.id)]
+    assert formats == [1, 2], "earlier releases read the calibrations that they know, and refuse others by their format"
+
+
+@pytest.mark.parametrize("value", ["nan", "true", '"0.25"'])
+def test_a_refraction_offset_that_is_no_number_is_refused(archive, value):
+    files = archive.files(archive.add(replace(calibration(), refraction_offset=OFFSET), WHO))
+    text = unsealed(files["manifest.toml"])
+    assert text.count("m_dpt = 0.25") == 1
+    files["manifest.toml"] = sealed(text.replace("m_dpt = 0.25", f"m_dpt = {value}"))
+    with pytest.raises(CalibrationDamaged):
+        archive.add_files(files)
