@@ -139,6 +139,22 @@ def test_the_image_of_a_point_has_no_defects() -> None:
     assert found(counts, replace(CALIBRATION, psfs=(psf,))).sum() <= 8  # of 1800 lit pixels: shot noise on the lines
 
 
+def test_one_pixel_that_stands_out_of_the_psf_hides_no_warm_pixels() -> None:
+    """A hot pixel left in a measured PSF; by the largest excess of the PSF none of the warm pixels was found."""
+    pixels, rng = PSF.pixels.copy(), np.random.default_rng(4)
+    inner = np.zeros(pixels.shape, np.bool_)
+    inner[4:-4, 4:-4] = pixels[4:-4, 4:-4] < 0.5 * pixels.max()
+    flatness = ndimage.maximum_filter(pixels, 5) - ndimage.minimum_filter(pixels, 5)
+    pixels.ravel()[np.where(inner, flatness, np.inf).argmin()] += 0.6 * pixels.max()
+    calibration = replace(CALIBRATION, psfs=(Psf(pixels),))
+    counts = frame(3)
+    at = rng.integers(25, 135, 40), rng.integers(25, 175, 40)
+    bad = counts.copy()
+    bad[at] += np.uint16(500)  # the brightest pixel of the frame has 2077
+    assert found(bad, calibration)[at].all()
+    assert found(counts, calibration).sum() <= 4
+
+
 @given(st.floats(0.02, 1.0), st.floats(1.0, 20.0))
 def test_noise_is_measured_without_a_known_gain(per_dn: float, floor_dn2: float) -> None:
     rng = np.random.default_rng(7)

@@ -97,6 +97,21 @@ def test_banding_is_the_rms_of_the_row_means_beyond_the_noise() -> None:
     assert image_quality.banding(left + bands, noise_dn**2, light_dn) == pytest.approx(0.01 / 2**0.5, rel=0.1)
 
 
+@pytest.mark.parametrize("lit", [1.0, 0.5])
+def test_the_coverage_is_the_lit_share_of_the_field_also_in_noise(lit: float) -> None:
+    """Noise as large as the light; half the field lit is off by the edge of the surroundings: a fortieth of it."""
+    down, right = np.mgrid[-100:100, -100:100]
+    mask = (np.hypot(down, right) < 90).astype(np.float32)
+    light = mask * (right >= 0 if lit < 1 else 1)
+    noisy = np.maximum(light + np.random.default_rng(0).normal(0, 1, light.shape) * light, 0).astype(np.float32)
+    for picture in (light, noisy):
+        assert image_quality.coverage(picture, mask, 0.0) == pytest.approx(lit, abs=0.04)
+
+
+def test_the_coverage_of_a_field_without_samples_is_zero() -> None:
+    assert image_quality.coverage(np.ones((8, 8), np.float32), np.zeros((8, 8), np.float32), 0.0) == 0
+
+
 def test_the_cutoff_is_the_frequency_of_equal_signal_and_noise(model: Model) -> None:
     """NUMERICS.md 8.1: the first ring whose mean of |H|^2 g / s2 is below 1, and its half-period on the retina."""
     prior, law, s2 = PowerLawPrior(model), PowerLaw(3.0, 2.0), 0.02

@@ -5,15 +5,18 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.recon.assessment.psf_consistency import MOST_MISSING, Match
 from device.recon.estimation.power_law_prior import BINS, PowerLaw, PowerLawPrior
-from device.values import Geometry, Image
+from device.values import Geometry, Image, Mask
 
 RETINA_UM_PER_DEG = 296.7  # human eye, 17 mm; OPTICS.md 1.1
 LEAST_THROUGH = 0.5  # eyes have 0.9 and more, an even screen 0.03
 MISMATCH_SD = 3.0  # standard errors
 LEAST_LIT = 0.75  # share of the field
+SQUARES = 64  # across the field, each of which is lit or dark
+NEAR_SQUARES = 5  # side of the surroundings of one: in little light a single square is noise
 MOST_MISFIT = 5.2  # rms over noise: 1 in good frames, 4 to 4.9 behind a lid or in stray light, 5.6 to 23 in flicker
 MOST_BANDING = 0.0013  # clean frames 0.0003, half a lid 0.0008, flicker of 1 % 0.0015 to 0.006, of 10 % 0.02 to 0.07
 NOISE_PARTS = 5  # frames without flicker have up to 3.6, at 250 electrons; 2 % of flicker there 17
@@ -88,15 +91,27 @@ def structure(evidence: PowerLawPrior, seen: Series, levels: Series, noise_dn2: 
 
 
 def coverage(picture: Image, mask: Image, noise_dn: float) -> float:
-    """Return the share of the field brighter than a third of its median and than three times the noise.
+    """Return the share of the field whose surroundings are brighter than a third of their median and 3 x the noise.
 
-    NUMERICS.md 8.1, coverage.
+    The surroundings of each of SQUARES squares across the field are NEAR_SQUARES wide; the median is that of their
+    means. NUMERICS.md 8.1, coverage.
     """
-    inside = picture[mask > 0.5]
-    if not inside.size:
+    inside = mask > 0.5
+    size = np.count_nonzero(inside)
+    if not size:
         return 0.0
-    bright = max(float(np.median(inside)) / 3, 3 * noise_dn)
-    return float((inside > bright).mean())
+    side = max(1, round(2 * (size / np.pi) ** 0.5 / SQUARES))
+    light, area = (_square_sums(image, side) for image in (np.where(inside, picture, 0), inside))
+    near = ndimage.uniform_filter(light, NEAR_SQUARES, mode="constant")
+    near /= np.maximum(ndimage.uniform_filter(area, NEAR_SQUARES, mode="constant"), 1 / NEAR_SQUARES**2)
+    bright = max(float(np.median(near[area >= area.max() / 2])) / 3, 3 * noise_dn)
+    return float(area[near > bright].sum() / size)
+
+
+def _square_sums(image: Image | Mask, side: int) -> Series:
+    """Return the sums over squares of `side` samples; those at the far edges may be cut off."""
+    rows = np.add.reduceat(image, np.arange(0, image.shape[0], side), axis=0, dtype=np.float64)
+    return np.asarray(np.add.reduceat(rows, np.arange(0, image.shape[1], side), axis=1))
 
 
 def banding(left: Image, noise_dn2: float, light_dn: float) -> float:

@@ -10,7 +10,7 @@ the noise is not an image of light: it is a defect.
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
   deviations plus `ring_ranges` of the PSF times the ring's range; none above MOST_OUTLIERS;
 * gaps without light (dead columns, rows, areas) with a sharp border (NARROW_PX, SHADOW, EDGE, EDGE_SHARE);
-* the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_SD).
+* the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_FALL).
 
 A frame without a candidate pixel costs one pass over its pixels.
 """
@@ -45,12 +45,14 @@ EDGE = 0.3  # of the light around it: the step at the border of a gap is larger
 EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light of the fitted field: more is a reflex. Overexposed eyes have at most 0.003
-HALO_BEGINS = 0.05  # of it in the first ring; an eye of 6 dpt with the stored PSF has 0.02
+HALO_BEGINS = 0.05  # of it in the first ring; an eye of 8 dpt with the stored PSF has up to 0.04
+HALO_FALL = 0.01  # of it from the first ring to the second; such an eye has up to 0.006, faint halos 0.02 and more
 HALO_SD = 3.0  # standard errors of a ring's mean excess
 HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo biases the first fit of the field
 HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are measured
 LEAST_AREA = 2  # samples of a saturated area that may have a halo
+RANGE_SHARE = 0.999  # of the PSF's pixels; a frame is a mean of many PSFs, in which no single pixel of one stands out
 PSF_NOISE_SD = 1.0  # subtracted from the PSF's ring excess; the measured noise includes the PSF's own fine lines
 LOW_SHARE = 0.5  # of the black level: the lowest value of a working pixel is so far below it, plus the noise limit
 BLACK_PER_LIMIT = 4  # least black level over the noise limit; with a lower one, values below black are not tested
@@ -353,12 +355,23 @@ def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64]
         return 0
     number = np.bincount(rings)
     mean = np.bincount(rings, excess[near]) / np.maximum(number, 1)
-    limit = np.maximum(HALO, HALO_SD * noise / np.sqrt(np.maximum(number / 4, 1)))
+    sd = noise / np.sqrt(np.maximum(number / 4, 1))
     first = int(np.flatnonzero(number[1:])[0]) + 1
-    if mean[first] < HALO_BEGINS:
+    if mean[first] < HALO_BEGINS and not _falls(mean[first:], sd[first:], number[first:]):
         return 0
+    limit = np.maximum(HALO, HALO_SD * sd)
     below = np.flatnonzero((mean[1:] <= limit[1:]) & (number[1:] > 0))
     return int(below[0]) if below.size else int(rings.max())
+
+
+def _falls(mean: NDArray[np.float64], sd: NDArray[np.float64], number: NDArray[np.int64]) -> bool:
+    """Return whether the excess of the first ring is above that of the second by HALO_FALL and by HALO_SD errors.
+
+    A halo falls from ring to ring, also a faint one; the excess by another PSF changes over the size of that PSF.
+    """
+    if mean.size < 2 or not number[1]:
+        return False
+    return bool(mean[0] - mean[1] > max(HALO_FALL, HALO_SD * float(np.hypot(sd[0], sd[1]))))
 
 
 def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
@@ -377,10 +390,11 @@ def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:
 
 
 def ring_ranges(psf: Psf) -> tuple[float, float]:
-    """Return the largest excess of the PSF over its rings at distance 1 and 2 px, in units of the rings' ranges.
+    """Return the excess of the PSF over its rings at distance 1 and 2 px, in units of the rings' ranges.
 
-    The excess is (|pixel - ring median| - noise) / trimmed ring range, over pixels of at least 10 % of the peak. It is
-    the argument `ranges` of `kernels.outliers`; infinite for a PSF with fewer than 5 rows or columns.
+    The excess of a pixel is (|pixel - ring median| - noise) / trimmed ring range; it is exceeded by 1 - RANGE_SHARE of
+    the pixels of at least 10 % of the peak. It is the argument `ranges` of `kernels.outliers`; infinite for a PSF with
+    fewer than 5 rows or columns, 0 if no pixel off the border is so bright.
     """
     pixels = psf.pixels
     if min(pixels.shape) < 5:
@@ -389,4 +403,6 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
     noise = PixelNoise.measured(pixels, zero_row)
     least, limit = 0.1 * float(pixels.max()), PSF_NOISE_SD**2
     no_mask = np.zeros(pixels.shape, np.bool_)
-    return kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2)
+    excess = kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2)
+    near, far = np.quantile(excess, RANGE_SHARE, axis=0, method="higher") if len(excess) else (0.0, 0.0)
+    return float(near), float(far)

@@ -438,14 +438,18 @@ def outliers(
 @_jit
 def ring_excess(
     image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float
-) -> tuple[float, float]:
-    """Return the smallest pair `ranges` with which `outliers` marks no pixel of at least `least` in this image.
+) -> Series:  # fmt: skip
+    """Return for each pixel of at least `least` the smallest pair `ranges` with which `outliers` does not mark it.
 
-    The two outermost rows and columns are not tested. `zero_row` is a row of zeros, `no_mask` a mask (rows, cols) of
-    False.
+    The result is (pixels, 2). The two outermost rows and columns are left out. `zero_row` is a row of zeros, `no_mask`
+    a mask (rows, cols) of False.
     """
     rows, cols = image.shape
-    ring, worst = np.empty(16, np.float32), np.zeros(2, np.float64)
+    ring, total = np.empty(16, np.float32), 0
+    for i in range(2, rows - 2):
+        for j in range(2, cols - 2):
+            total += image[i, j] >= least
+    found, at = np.zeros((total, 2), np.float64), 0
     for i in range(2, rows - 2):
         for j in range(2, cols - 2):
             if image[i, j] < least:
@@ -457,5 +461,6 @@ def ring_excess(
                 spread = known[n - 2 - k] - known[1 + k]
                 excess = abs(image[i, j] - middle) - np.sqrt(slope_dn * max(middle, np.float32(0)) + floor_dn2)
                 if excess > 0:
-                    worst[k] = max(worst[k], excess / max(spread, np.float32(1e-30)))
-    return worst[0], worst[1]
+                    found[at, k] = excess / max(spread, np.float32(1e-30))
+            at += 1
+    return found
