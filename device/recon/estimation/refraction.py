@@ -167,6 +167,12 @@ class RefractionEstimator:
 
     def add_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
         """Estimate M, J0 and J45 of the frame for which `find` has just returned `found`."""
+        try:
+            return self._with_cylinder(found)
+        except np.linalg.LinAlgError:  # an information matrix without full rank
+            return NoRefraction("the frame does not determine a cylinder")
+
+    def _with_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
         model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
         if model is None:
             return NoRefraction("the likelihood has no clear minimum with a cylinder")
