@@ -15,6 +15,7 @@ from device.calibration.monitoring.head_check import (
     RECENT_CAPTURES,
     CaptureAssessment,
     ExposurePair,
+    ReportedRefraction,
     assess_capture,
     check,
     raise_on_failure,
@@ -53,7 +54,7 @@ class CalibrationMonitor:
         self._witness: PsfMatchTest | None = None
         self._pending: deque[Capture] = deque(maxlen=CHECKED_CAPTURES)
         self._sights: tuple[CaptureAssessment, ...] = ()
-        self._spheres_dpt: tuple[tuple[datetime, float], ...] = ()
+        self._refractions: tuple[ReportedRefraction, ...] = ()
         self._published: tuple[str, ...] = ()
 
     def start(self, refractor: RefractionEstimator | None) -> None:
@@ -71,17 +72,17 @@ class CalibrationMonitor:
         except StoreError as error:  # the first capture reports the error of the store
             log.warning("latest captures cannot be read: %s", error)
             return
-        self._add_spheres(taken)
+        self._add_refractions(taken)
         self._pending.extend(taken[-CHECKED_CAPTURES:])
 
     def add(self, capture: Capture) -> None:
         """Queue a stored capture for its check; no-op for a recording."""
         if self._head.kind != "recording":
-            self._add_spheres([capture])
+            self._add_refractions([capture])
             self._pending.append(capture)
 
-    def _add_spheres(self, captures: Iterable[Capture]) -> None:
-        self._spheres_dpt = (*self._spheres_dpt, *spheres_dpt(captures))[-REFRACTION_CAPTURES:]
+    def _add_refractions(self, captures: Iterable[Capture]) -> None:
+        self._refractions = (*self._refractions, *reported_refractions(captures))[-REFRACTION_CAPTURES:]
 
     @property
     def has_pending(self) -> bool:
@@ -117,7 +118,7 @@ class CalibrationMonitor:
         head = self._head
         if head.kind == "recording":
             return ()
-        return check(head.calibration, head.provenance, self._sights, self._spheres_dpt, self._clock.wall())
+        return check(head.calibration, head.provenance, self._sights, self._refractions, self._clock.wall())
 
     def refusal(self) -> CalibrationError | None:
         """Return CalibrationExpired if the calibration is too old, CalibrationStale if another finding fails, or None.
@@ -132,7 +133,7 @@ class CalibrationMonitor:
 
     def forget_results(self) -> None:
         """Forget the results of all checks; queued captures stay queued."""
-        self._sights, self._spheres_dpt = (), ()
+        self._sights, self._refractions = (), ()
 
     def _publish_changes(self) -> None:
         """Publish the findings when the set of failed ones has changed."""
@@ -158,10 +159,16 @@ def captures_with_calibration(store: CaptureStore, calibration_id: str, since: d
     )
 
 
-def spheres_dpt(captures: Iterable[Capture]) -> list[tuple[datetime, float]]:
-    """Return time and mean sphere of each capture with a reported refraction; dioptres, positive for myopia."""
-    spheres = ((one.taken_at, (one.report.reconstruction.refraction_dpt or {}).get("sphere")) for one in captures)
-    return [(taken_at, -sphere) for taken_at, sphere in spheres if isinstance(sphere, int | float)]
+def reported_refractions(captures: Iterable[Capture]) -> list[ReportedRefraction]:
+    """Return the refraction of each capture whose report has one with numbers."""
+    found = []
+    for one in captures:
+        report = one.report.reconstruction.refraction_dpt or {}
+        sphere, *edge = (report.get(name) for name in ("sphere", "field_deg", "field_deg_sd"))
+        if isinstance(sphere, int | float):
+            diameter_deg, sd_deg = (float(value) if isinstance(value, int | float) else 0.0 for value in edge)
+            found.append(ReportedRefraction(one.taken_at, -float(sphere), diameter_deg, sd_deg))
+    return found
 
 
 def exposures(store: CaptureStore, capture: Capture, between: Callable[[], None] = lambda: None) -> ExposurePair:

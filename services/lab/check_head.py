@@ -24,7 +24,7 @@ from services.instrument.calibration_monitor import (
     captures_with_calibration,
     exposures,
     in_force_since,
-    spheres_dpt,
+    reported_refractions,
 )
 from services.records.capture import Capture
 from services.records.capture_store import CaptureStore
@@ -61,7 +61,7 @@ def check_calibration(spec: InstrumentSpec, data: Path, clock: Clock, progress: 
         progress("no captures with this calibration yet: taking dark frames now")
         sights = _sights_of_darks(spec, kept, clock)
     known = kept.calibration, kept.provenance
-    findings = check(*known, sights, spheres_dpt(captures), clock.wall())
+    findings = check(*known, sights, reported_refractions(captures), clock.wall())
     return CheckResult(kept, findings, len(captures), 0 if captures else len(sights))
 
 

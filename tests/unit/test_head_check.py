@@ -12,7 +12,12 @@ from device.calibration import calibration_validity
 from device.calibration.archive import Provenance
 from device.calibration.monitoring import head_check
 from device.calibration.monitoring.finding import Finding
-from device.calibration.monitoring.head_check import CaptureAssessment, ExposurePair, assess_capture
+from device.calibration.monitoring.head_check import (
+    CaptureAssessment,
+    ExposurePair,
+    ReportedRefraction,
+    assess_capture,
+)
 from device.clock import VirtualClock
 from device.config.head_file import CameraSpec, load_head
 from device.errors import CalibrationExpired, CalibrationModeMismatch, CalibrationStale
@@ -216,8 +221,11 @@ def test_room_light_raises_hints_and_no_failure() -> None:
 
 def test_the_scale_check_needs_many_patients() -> None:
     def scale(spheres_dpt: np.ndarray, minutes: int) -> Finding | None:
-        spheres = [(NOW + timedelta(minutes=minutes * n), float(one)) for n, one in enumerate(spheres_dpt)]
-        found = head_check.check(calibrated(), KNOWN, (), spheres, NOW)
+        refractions = [
+            ReportedRefraction(NOW + timedelta(minutes=minutes * n), float(one), 0.0, 0.0)
+            for n, one in enumerate(spheres_dpt)
+        ]
+        found = head_check.check(calibrated(), KNOWN, (), refractions, NOW)
         return next((one for one in found if one.name == "scale"), None)
 
     spheres_dpt = np.random.default_rng(1).normal(-0.5, 2.5, 40)
@@ -226,6 +234,46 @@ def test_the_scale_check_needs_many_patients() -> None:
     assert moved is not None
     assert moved.hint
     assert scale(spheres_dpt + 4, 1) is None  # one sitting: one patient, whose refraction may be large
+
+
+# Field edge over several patients
+
+
+def edge(off_deg: float, sd_deg: float, eyes: int, minutes: int = 60) -> Finding | None:
+    """Return the finding on the edge after `eyes` captures with a field off by `off_deg` and a scatter of 0.1 deg."""
+    field_deg = calibrated().field_deg
+    assert field_deg is not None
+    found_deg = field_deg + off_deg + np.random.default_rng(2).normal(0, 0.1, eyes)
+    refractions = [
+        ReportedRefraction(NOW + timedelta(minutes=minutes * n), 0.0, float(one), sd_deg)
+        for n, one in enumerate(found_deg)
+    ]
+    findings = head_check.check(calibrated(), KNOWN, (), refractions, NOW)
+    return next((one for one in findings if one.name == "edge"), None)
+
+
+@pytest.mark.parametrize("off_deg", [-1.0, 1.0])
+def test_an_edge_that_is_off_in_several_eyes_is_a_hint(off_deg: float) -> None:
+    moved = edge(off_deg, 0.1, 5)
+    assert moved is not None
+    assert moved.hint
+    assert not moved.fails
+    assert moved.value == pytest.approx(1, abs=0.2)  # a scatter of 0.1 deg in five eyes
+    assert "calibrate the head" in moved.remedy
+
+
+def test_an_edge_within_its_uncertainty_is_no_hint() -> None:
+    for off_deg, sd_deg in ((0.3, 0.1), (1.0, 1.0)):
+        found = edge(off_deg, sd_deg, 5)
+        assert found is not None
+        assert found.ok
+        assert not found.remedy
+
+
+def test_the_edge_check_needs_several_eyes_with_an_estimated_edge() -> None:
+    assert edge(1.0, 0.1, 4) is None
+    assert edge(1.0, 0.1, 20, minutes=1) is None  # one sitting
+    assert edge(1.0, 0.0, 20) is None  # the edge was given, not estimated
 
 
 # Age and mode

@@ -40,6 +40,8 @@ MAX_NOISE_RATIO = 1.5  # ratio to the calibration
 
 SITTING_GAP = timedelta(minutes=10)
 MIN_SITTINGS = 8
+MIN_EDGE_SITTINGS = 5
+EDGE_SLACK_DEG = 0.4  # textbook frames of a sensor overfilled by a soft field are up to 0.35 off in the median
 POPULATION_SD_DPT, SLACK_DPT = 2.5, 1.0  # sd of the mean sphere in a population, and tolerance of the relay
 
 CALIBRATE_REMEDY = CalibrationStale.default_remedy
@@ -65,6 +67,19 @@ class ExposurePair:
     exposure_s: float
 
 
+@dataclass(frozen=True)
+class ReportedRefraction:
+    """Reported refraction of one capture: mean sphere in dpt (positive: myopia), and diameter of the lit field.
+
+    `field_deg` and its sd are in degrees, as found with the refraction; the sd is 0 for a field that was not estimated.
+    """
+
+    taken_at: datetime
+    sphere_dpt: float
+    field_deg: float
+    field_deg_sd: float
+
+
 def assess_capture(
     calibration: Calibration, provenance: Provenance | None, witness: PsfMatchTest | None, exposures: ExposurePair,
     between: Callable[[], None] = lambda: None,
@@ -82,7 +97,7 @@ def assess_capture(
 
 def check(
     calibration: Calibration, provenance: Provenance | None, assessments: Sequence[CaptureAssessment],
-    spheres_dpt: Sequence[tuple[datetime, float]], now: datetime,
+    refractions: Sequence[ReportedRefraction], now: datetime,
 ) -> tuple[Finding, ...]:  # fmt: skip
     """Return the findings on age, PSF, field, refraction and darks for which the data suffice; input in any order."""
     recent = sorted(assessments, key=lambda one: one.taken_at)
@@ -93,8 +108,12 @@ def check(
         found.append(_psf_finding(statements[-RECENT_CAPTURES:]))
     if fitting:
         found += _field_findings(fitting)
-    if (persons := _sitting_spheres_dpt(spheres_dpt)) and len(persons) >= MIN_SITTINGS:
-        found.append(_scale_finding(persons))
+    sittings = _sittings(refractions)
+    if len(sittings) >= MIN_SITTINGS:
+        found.append(_scale_finding([median(one.sphere_dpt for one in sitting) for sitting in sittings]))
+    measured = [one for one in refractions if one.field_deg_sd > 0]
+    if calibration.field_deg is not None and len(eyes := _sittings(measured)) >= MIN_EDGE_SITTINGS:
+        found.append(_edge_finding(calibration.field_deg, eyes))
     if recent:
         found += _dark_findings(calibration, [one.dark for one in recent[-RECENT_CAPTURES:]])
     return tuple(found)
@@ -155,16 +174,29 @@ def _scale_finding(persons: Sequence[float]) -> Finding:
     )  # fmt: skip
 
 
-def _sitting_spheres_dpt(spheres_dpt: Sequence[tuple[datetime, float]]) -> list[float]:
-    """Return the median sphere, dpt, of each sitting: captures at most 10 minutes apart count as one patient."""
-    sittings: list[list[float]] = []
-    last: datetime | None = None
-    for taken_at, sphere_dpt in sorted(spheres_dpt):
-        if last is None or taken_at - last > SITTING_GAP:
+def _edge_finding(calibrated_deg: float, sittings: Sequence[Sequence[ReportedRefraction]]) -> Finding:
+    """Return the finding on the diameter of the lit field, the median over many patients, against the calibrated one.
+
+    The sd of the median comes from the reported ones.
+    """
+    found_deg = [median(one.field_deg for one in sitting) for sitting in sittings]
+    variance_deg2 = float(np.mean([median(one.field_deg_sd for one in sitting) ** 2 for sitting in sittings]))
+    limit_deg = EDGE_SLACK_DEG + 2 * 1.25 * (variance_deg2 / len(sittings)) ** 0.5
+    return _hint(
+        "edge", abs(median(found_deg) - calibrated_deg), limit_deg, "deg",
+        "The lit field has another diameter than the calibration in several eyes: see whether the stop or the lamp was "
+        "changed or moved, and calibrate the head.",
+    )  # fmt: skip
+
+
+def _sittings(refractions: Sequence[ReportedRefraction]) -> list[list[ReportedRefraction]]:
+    """Return the refractions of each sitting: captures at most 10 minutes apart count as one patient."""
+    sittings: list[list[ReportedRefraction]] = []
+    for one in sorted(refractions, key=lambda one: one.taken_at):
+        if not sittings or one.taken_at - sittings[-1][-1].taken_at > SITTING_GAP:
             sittings.append([])
-        sittings[-1].append(sphere_dpt)
-        last = taken_at
-    return [median(one) for one in sittings]
+        sittings[-1].append(one)
+    return sittings
 
 
 def _dark_findings(calibration: Calibration, darks: Sequence[DarkFrameAssessment]) -> list[Finding]:

@@ -46,6 +46,7 @@ SETTLED_SAMPLES, SETTLED_DPT = 0.15, 0.03  # changes of edge and M that end the 
 MOVING_SAMPLES = 0.6  # change of the edge that needs more than ROUNDS; after MOST_ROUNDS the edge was not found
 CURVATURE_STEP_DPT = 0.25
 MOST_SD_DPT = 1.5
+MOST_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
 Floats = NDArray[np.float64]
@@ -179,17 +180,19 @@ class RefractionEstimator:
         sds_dpt = np.hypot(model.sds(self._spread), (found.missing_sd_dpt, 0, 0))
         if sds_dpt.max() > MOST_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
-        refined = self._refinement(model.minimum)
-        if not refined.is_valid:
-            return NoRefraction("no retina explains the frame with this PSF")
-        distance = np.abs(refined.eye_dpt - model.minimum) / np.hypot(sds_dpt, refined.sds_dpt)
-        if distance.max() > MOST_DISTANCE_SDS:
-            return NoRefraction("the frame and its spectrum give different refractions")
-        sds_dpt = np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
-        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = refined.eye_dpt.tolist(), sds_dpt.tolist()
+        eye_dpt = model.minimum
+        if self._edges.grid.n * self.geometry.pitch_um <= MOST_SAMPLE_UM:
+            refined = self._refinement(eye_dpt)
+            if not refined.is_valid:
+                return NoRefraction("no retina explains the frame with this PSF")
+            distance = np.abs(refined.eye_dpt - eye_dpt) / np.hypot(sds_dpt, refined.sds_dpt)
+            if distance.max() > MOST_DISTANCE_SDS:
+                return NoRefraction("the frame and its spectrum give different refractions")
+            eye_dpt, sds_dpt = refined.eye_dpt, np.hypot(refined.sds_dpt, (found.missing_sd_dpt, 0, 0))
+        (m_dpt, j0_dpt, j45_dpt), (sd_dpt, j0_sd_dpt, j45_sd_dpt) = eye_dpt.tolist(), sds_dpt.tolist()
         return replace(
             found, sphere_dpt=m_dpt, sd_dpt=sd_dpt, psf_scale=self.scale(m_dpt),
-            edge=self._edges.field_edge(self._edges.edge_model(refined.eye_dpt)),
+            edge=self._edges.field_edge(self._edges.edge_model(eye_dpt)),
             cylinder=Cylinder(j0_dpt, j0_sd_dpt, j45_dpt, j45_sd_dpt),
         )  # fmt: skip
 
