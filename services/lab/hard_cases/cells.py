@@ -6,12 +6,11 @@ plans on every call.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from device.clock import Deadline
 from device.config.image_files import Raw, as_raw, read_image
 from device.errors import DiffuscopeError
 from device.recon.assessment.metrics import pcc
@@ -26,7 +25,7 @@ from services.lab.reconstruct_inputs import ReconstructOptions, load_calibration
 
 DEFAULT_SCHEDULE = "ladder"  # the default schedule: quick look, refraction, iterations
 COLUMNS = (DEFAULT_SCHEDULE, *METHODS)
-LONG_DEADLINE_S = 600.0  # a deadline that stops no solver
+LONG_DEADLINE_S = 600.0  # of the command: it stops no solver, so the grid has none
 CRASHES = (ArithmeticError, ValueError, LookupError, TypeError)  # program errors, reported as `Cell.crashed`
 CACHE_SIZE = 8  # cached reconstructors; each takes up to about 300 MB at full sensor size
 
@@ -83,13 +82,13 @@ class SolverCache:
         self._kept.move_to_end(key)
         while len(self._kept) > CACHE_SIZE:
             self._kept.popitem(last=False)
-        make = self._kept[key]
-        deadline = None if order.budget_s is None else Deadline.after(make.clock, order.budget_s)
-        return make(raw.pixels, simulated=True, deadline=deadline)
+        return self._kept[key](raw.pixels, simulated=True)
 
     def _planned(self, order: ReconstructOptions, raw: Raw) -> Reconstructor:
-        shape = raw.pixels.shape[0], raw.pixels.shape[1]
-        return plan_reconstructor(order, load_calibration(order, raw), shape, self._planner, 0)
+        """Plan without a deadline: the durations of the steps, measured three times on noise, would not be used."""
+        shape, untimed = (raw.pixels.shape[0], raw.pixels.shape[1]), replace(order, budget_s=None)
+        quick = order.budget_s is not None
+        return plan_reconstructor(untimed, load_calibration(order, raw), shape, self._planner, 0, quick=quick)
 
 
 class CaseRunner:

@@ -42,7 +42,8 @@ section { border-top: 1px solid var(--line); padding: 28px 0 20px; }
 table { border-collapse: collapse; margin: 12px 0 20px; font-size: 15px; }
 th, td { text-align: left; padding: 5px 16px 5px 0; border-bottom: 1px solid var(--line); vertical-align: top; }
 th { color: var(--quiet); font-weight: 500; } .n { text-align: right; font-variant-numeric: tabular-nums; }
-.claims { width: 100%; table-layout: fixed; } .claims th:first-child { width: 30%; }
+.claims { width: 100%; table-layout: fixed; } .claims th { box-sizing: border-box; }
+.claims th:first-child { width: 30%; }
 .claims th:nth-child(2) { width: 8%; } .claims th:nth-child(3) { width: 17%; } .claims th:nth-child(4) { width: 10%; }
 .claims th:nth-child(5) { width: 13%; } .claims small { display: block; color: var(--quiet); font-size: 13px; }
 .claims td b { font-weight: 500; } b.label-put-in { color: var(--quiet); } b.label-not-reproduced { color: var(--open);
@@ -56,9 +57,14 @@ tr.no td, b.no { color: var(--no); font-weight: 600; }
 figure { margin: 0; background: var(--card); border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
 figure img { display: block; width: 100%; } .pictures img { aspect-ratio: 1; object-fit: contain; background: #000; }
 figcaption { padding: 8px 10px; line-height: 1.35; }
-@media print { @page { size: A4; margin: 14mm 12mm; } body { font-size: 11px; } main { padding: 0; max-width: none; }
-  h1 { font-size: 22px; } h2 { font-size: 16px; break-after: avoid; } .lead { font-size: 13px; } .toc { columns: 2; }
-  table { font-size: 10px; } .claims small, .quiet, figcaption { font-size: 9px; } tr, figure { break-inside: avoid; }
-  .pictures { grid-template-columns: repeat(4, 1fr); gap: 8px; } }
 .note { border-left: 3px solid var(--accent); padding-left: 14px; }
+@media print { @page { size: A4; margin: 14mm 12mm; }
+  :root { color-scheme: light; --ground: #fff; --ink: #1d2330; --quiet: #59606d; --line: #dfe1e6; --card: #fff;
+    --yes: #00664d; --no: #b3261e; --open: #8a5300; --accent: #0067a3; }
+  body { font-size: 11px; } main { padding: 0 1px; max-width: none; } h1 { font-size: 22px; } .lead { font-size: 13px; }
+  h2 { font-size: 16px; } h2, h2 + p, .paper { break-after: avoid; } tr, figure, .note { break-inside: avoid; }
+  table { font-size: 10px; } .claims small, .quiet, figcaption { font-size: 9px; } th, td { padding-right: 10px; }
+  .claims th:first-child { width: 24%; } .claims th:nth-child(2) { width: 6%; }
+  .pictures { grid-template-columns: repeat(4, 1fr); gap: 8px; }
+  .plots img { width: auto; max-width: 100%; max-height: 255mm; margin: 0 auto; } }
 """

@@ -85,7 +85,9 @@ def _imaging(relay: TracedRelay, built: Built) -> tuple[Claim, ...]:
         attempted("second pair to iris, mm", relay.iris_at_mm - relay.lamp_surfaces[-1].at_mm, 40, 45, "> 40", 2)
         .because("40.0 without the gap of 1 mm, which is ours, as is the plate's thickness")
         .limit_from("the paper's least"),
-        below("walk at 15 degrees over its margin", relay.walk_mm(15) / margin_mm, 0.25, "without shift", 2),
+        below("walk at 15 degrees over its margin", relay.walk_mm(15) / margin_mm, 0.25, "without shift", 2).adapted(
+            "read as: no shift that the margin of the iris would show"
+        ),
         above("iris lit at 25 degrees", relay.lit_share(25), 0.999, "fully", 4).limit_from("the paper's"),
         above("iris lit at 25.6 degrees, edge of the paper's 51.2", relay.lit_share(25.64), 0.95, "", 3).ours(
             "nothing is lost"
@@ -109,7 +111,7 @@ def _eye(path: LightPath) -> tuple[Claim, ...]:
     strongest = max(abs(curved.sagittal_dpt), abs(curved.tangential_dpt))
     return (
         below("vergence of a beam at 25 degrees, curved retina, dpt", strongest, 4.0, "collimated from any spot",
-              2).limit_from("the 4 dpt that the paper tolerates"),
+              2).adapted("read as: collimated enough").limit_from("the 4 dpt that the paper tolerates"),
         above("the same on a flat screen over the curved one", flat.tangential_dpt / strongest, 2.0,
               "mismatch of a flat screen", 2),
     )  # fmt: skip
