@@ -8,7 +8,8 @@ frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
     (D' K^-1 D)^-1 (D' K^-1 r - b)
 
 b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
-is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7).
+is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7). It is computed, at
+the cost of six more solves, where the sensor crops the blurred field; elsewhere it is small, and b = 0.
 """
 
 from dataclasses import dataclass
@@ -67,14 +68,16 @@ class CropRefinement:
         """Return the refinement of an eye (M, J0, J45) of the frame that `edges` was started with."""
         light, model, detail = self._edges.frame.y, self._model, None
         model.start(eye_dpt)
+        is_cropped, without_noise, by_noise = model.seen_share < 1, np.zeros(3), np.zeros(3)
         for done in range(MOST_STEPS):
             model.focus(eye_dpt)
             fit = model.fit(light, detail)
             detail = fit.detail
-            if done < BIAS_STEPS:
+            if is_cropped and done < BIAS_STEPS:
                 without_noise = model.fit(fit.expected, detail).score
             if done == 0:
                 covariance = model.covariance(fit.derivatives)
+            if is_cropped and done == 0:
                 by_noise = self._score_with_noise(fit) - without_noise
                 by_noise[1:] = 0  # J0 and J45 have none by symmetry; what the draws would give them only scatters
             step = covariance @ (fit.score - without_noise - by_noise)

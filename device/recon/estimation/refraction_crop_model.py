@@ -144,12 +144,18 @@ class CropModel:
         matrix = np.array([[np.vdot(a, b) for b in derivatives] for a in solved], np.float64)
         return np.asarray(np.linalg.inv((matrix + matrix.T) / 2))
 
+    @property
+    def seen_share(self) -> float:
+        """Area of the sensor over that of the blurred field: below 1 the sensor crops the light."""
+        reach_samples = self._edges.edge.radius_samples + self._psf_samples
+        return float(np.prod(self._grid.window)) / (np.pi * reach_samples**2)
+
     def _set_prior(self, eye_dpt: Floats) -> None:
         """Set the object's reach from the edge, and the level of its detail from the rings of the likelihood."""
         edges, edge = self._edges, self._edges.edge
         frequencies, levels = detail_levels(edges, eye_dpt)
         lit = np.pi * edge.radius_samples**2
-        seen = float(np.prod(self._grid.window)) / (np.pi * (edge.radius_samples + self._psf_samples) ** 2)
+        seen = self.seen_share
         share = min(seen * float((edges.likelihood.taper**2).mean()), 1.0)
         logs = np.log(levels) - DETAIL_EXPONENT * np.log(frequencies / REFERENCE)
         self._root = (self._root_shape * np.exp(logs.mean() / 2) / np.sqrt(lit * share)).astype(np.float32)
