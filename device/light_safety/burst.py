@@ -34,10 +34,10 @@ def burst(
     There are fewer if another frame, as long as the longest one so far, might not end before the guard turns the lamp
     off. With `parts` above 1 each of the `count` exposures of `whole_s` seconds (None: of all its parts) is split into
     so many frames, and `shot` is one of them: the lamp is then on no longer than for the whole exposures, each with the
-    overhead of one frame, so that the last frames may be missing. The dose counts for `eyes`, without a visit up to a
-    lower limit. `taken` is called with each frame after its read-out, while the lamp is on: it must return at once.
-    Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left out. The lamp is dark
-    at every exit.
+    overhead of one frame as planned, so that the last frames may be missing. The dose counts for `eyes`, without a
+    visit up to a lower limit. `taken` is called with each frame after its read-out, while the lamp is on: it must
+    return at once. Raises LightCut if the guard has ended the first exposure; a frame that it ended later is left out.
+    The lamp is dark at every exit.
     """
     frames: list[Frame] = []
     with light.on(illumination, eyes, in_visit=in_visit):
@@ -52,8 +52,11 @@ def burst(
             longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
             if parts > 1 and len(frames) == 1:
                 overhead_s = longest_s - shot.exposure_s
-                exposed_s = parts * shot.exposure_s if whole_s is None else whole_s
-                most_s = min(most_s, count * (exposed_s + overhead_s) + ROUNDING_S)
+                if whole_s is None:
+                    whole_s = parts * shot.exposure_s
+                else:  # no more than the overhead for which the parts were made shorter: a stall adds no light
+                    overhead_s = min(overhead_s, (whole_s - parts * shot.exposure_s) / (parts - 1))
+                most_s = min(most_s, count * (whole_s + overhead_s) + ROUNDING_S)
     return tuple(frames)
 
 

@@ -56,6 +56,11 @@ class GuardedLight:
         return self._light.illumination
 
     @property
+    def on_since_s(self) -> float | None:
+        """Return when the running stretch of light began (clock seconds); None while the lamp is dark."""
+        return None if self._held is None else self._lit_at_s
+
+    @property
     def running_j_per_cm2(self) -> float:
         """Return the dose of the running stretch of light until now; 0.0 while the lamp is dark."""
         if self._held is None:

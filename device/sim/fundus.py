@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.special import expit
 
 from device.sim.lesions import Lesions, scatter
-from device.sim.pigments import Pigments
+from device.sim.pigments import AT_FOVEA, Pigments
 from device.sim.strokes import draw
 from device.sim.vessels import DISC, Vessel, grow
 from device.values import Colour, Eye, Image, Mask
@@ -178,7 +178,7 @@ def _ground(canvas: Canvas, rng: np.random.Generator, pigments: Pigments) -> dic
     planes: dict[Colour, Image] = {}
     for colour in COLOURS:
         depth, choroid = pigments.macula(colour, MACULA[colour]), pigments.choroid(colour, CHOROID[colour])
-        macula = 1 - depth * np.exp(-((fovea / 2.7) ** 2)) - 0.45 * depth * np.exp(-((fovea / 0.8) ** 2))
+        macula = 1 - depth * np.exp(-((fovea / 2.7) ** 2)) - (AT_FOVEA - 1) * depth * np.exp(-((fovea / 0.8) ** 2))
         fibres = 1 + (0.3 if colour == "red" else 1.0) * nerve
         planes[colour] = shade * macula * fibres * (1 + choroid * web + 0.018 * grain)
     return planes

@@ -14,6 +14,7 @@ MELANIN: dict[Colour, float] = {"red": 0.41, "green": 0.22, "blue": 0.22}
 # Absorbance of macular pigment at the LED over that at its peak of 460 nm (Bone, Landrum and Cains 1992).
 MACULAR: dict[Colour, float] = {"red": 0.0, "green": 0.15, "blue": 0.95}
 MACULAR_PEAK_DENSITY = 0.35  # optical density of the mean eye at 460 nm, at the fovea, single pass
+AT_FOVEA = 1.45  # darkening at the fovea over `depth`, the broader of two Gaussians (fundus.py)
 
 
 @dataclass(frozen=True)
@@ -37,14 +38,15 @@ class Pigments:
         return contrast if self.melanin == 0 else contrast * exp(-MELANIN[colour] * self.melanin)
 
     def macula(self, colour: Colour, depth: float) -> float:
-        """Return the darkening at the fovea, 0 to 1; `depth` is that of the mean eye, melanin of the fovea included.
+        """Return the darkening around the fovea; `depth` is that of the mean eye, melanin of the fovea included.
 
-        Negative, a bright fovea, down to -0.5: more than that no quantity of pigment gives.
+        At the fovea itself the reflectance is 1 - AT_FOVEA times this, to which the law applies; a negative value is a
+        bright fovea.
         """
         if self.macular == 1:
             return depth
         passes = 10 ** (-2 * MACULAR_PEAK_DENSITY * MACULAR[colour] * (self.macular - 1))
-        return min(max(1 - (1 - depth) * passes, -0.5), 0.95)
+        return (1 - (1 - AT_FOVEA * depth) * passes) / AT_FOVEA
 
     def blood(self, contrast: float) -> float:
         """Return the contrast of a vessel or haemorrhage, 0 to 1: its absorbance is in proportion to haemoglobin."""

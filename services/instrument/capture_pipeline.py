@@ -138,8 +138,8 @@ class Exposure:
     `dark` is None if an interrupted press has none. `begin_s` (clock seconds) and `duration_s` are those of all
     exposures, `dose_j_per_cm2` is their dose. `unusable` holds the reason of each lit frame that must not enter the
     picture, by its index; `missing` the reason of each other colour that was not taken; `split` how the exposures of
-    the lit frames were split; `overhead_s` what a lit frame took longer than its exposure, at most; `ready` what was
-    prepared of the frames during the exposure, by their numbers.
+    the lit frames were split; `overhead_s` what a lit frame took longer than its exposure, at most, None if this run
+    did not expose it; `ready` what was prepared of the frames during the exposure, by their numbers.
     """
 
     lit: tuple[Frame, ...]
@@ -151,7 +151,7 @@ class Exposure:
     unusable: Mapping[int, str] = field(default_factory=dict)
     missing: Mapping[Colour, str] = field(default_factory=dict)
     split: ExposureSplit = WHOLE
-    overhead_s: float = 0.0
+    overhead_s: float | None = None
     ready: Mapping[int, AssessedFrame] = field(default_factory=dict)
 
 
@@ -268,7 +268,7 @@ class CapturePipeline:
         verdicts = [self._verdict(frame, exposure) for frame in exposure.lit]
         best = next((k for k, verdict in enumerate(verdicts) if verdict.word == "good"), 0)
         light_e_per_um2 = verdicts[best].numbers.get("light_e_per_um2")
-        if verdicts[best].word == "good" and light_e_per_um2 is not None:
+        if verdicts[best].word == "good" and light_e_per_um2 is not None and exposure.overhead_s is not None:
             self._known = PressLight(light_e_per_um2 / exposure.lit[best].exposure_s, exposure.overhead_s)
         order = [best, *(k for k in range(len(verdicts)) if k != best)]
         unusable = {
@@ -455,8 +455,9 @@ class _Exposing:
 
     def report(self, frame: Frame) -> None:
         """Report a frame after its read-out, with the dose until now."""
-        now_s = self._clock.now_s()
-        self.overhead_s = max(self.overhead_s, now_s - self._reported_s - frame.exposure_s)
+        now_s, lit_s = self._clock.now_s(), self._head.light.on_since_s
+        begin_s = self._reported_s if lit_s is None else max(self._reported_s, lit_s)  # not the ledger's write before
+        self.overhead_s = max(self.overhead_s, now_s - begin_s - frame.exposure_s)
         self._reported_s = now_s
         self._taken(frame, self.given_j_per_cm2, self.duration_s)
 

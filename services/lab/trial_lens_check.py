@@ -22,6 +22,7 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationRefused, SpecError
 from device.head import Head, open_head
+from device.light_safety.burst import require_lit
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.trial_lens import EMMETROPIC, PowerVector, TrialLens
 from device.recon.estimation.refraction import NoRefraction, RefractionEstimator
@@ -145,7 +146,7 @@ def _read(head: Head, estimator: RefractionEstimator, lens: TrialLens) -> LensRe
     head.camera.prepare(shot)
     dark = head.camera.expose(shot).counts.copy()
     with head.light.on(Illumination(head.spec.light.colour)):
-        lit = head.camera.expose(shot).counts.copy()
+        lit = require_lit(head.camera.expose(shot)).counts.copy()
     found = estimator.find(lit, dark, estimator.defects(lit, dark))
     if not isinstance(found, NoRefraction):
         found = estimator.add_cylinder(found)

@@ -81,6 +81,16 @@ def test_parts_that_are_shorter_by_the_overhead_are_all_taken(overhead_s, count,
     assert rig.clock.now_s() - begin_s <= count * (whole_s + overhead_s) + 1e-5  # rounding
 
 
+def test_a_stalled_first_part_adds_no_light():
+    rig, whole_s, overhead_s, parts = guarded_rig(), 0.1, 0.005, 2
+    light = guarded(Rig(rig.camera, SimLight(rig.camera.world), rig.clock))
+    camera = SlowCamera(rig.camera, rig.clock, 0.05)
+    begin_s = rig.clock.now_s()
+    part = ExposureSettings((whole_s + overhead_s) / parts - overhead_s)
+    burst(camera, light, Illumination("green"), part, 4, rig.clock, parts=parts, whole_s=whole_s)
+    assert rig.clock.now_s() - begin_s <= 4 * (whole_s + overhead_s) + 1e-5  # rounding
+
+
 class UnpluggedCamera:
     """Camera that is unplugged after its first exposure."""
 

@@ -79,9 +79,11 @@ def test_a_frame_that_is_blurred_by_motion_is_left_out_and_costs_nothing(join: B
     assert np.nanmax(np.abs(joined.counts - alone.counts)) < 0.02 * np.nanmax(alone.counts)  # shifts within 0.01 pixels
 
 
-@pytest.mark.parametrize("peaks_e", [(5000, 5000, 5000, 1200), (600, 600, 150, 600), (200, 200, 200, 200)])
+@pytest.mark.parametrize(
+    "peaks_e", [(5000, 5000, 5000, 1200), (600, 600, 150, 600), (200, 200, 200, 200), (60, 60, 60, 2000)]
+)
 def test_noise_is_not_taken_for_motion_blur(join: BurstJoiner, peaks_e: tuple[float, ...]) -> None:
-    """A frame of less light than the others correlates less with them, and keeps its place."""
+    """A frame of less light than the others, or noise in the others, correlates less, and keeps its place."""
     frames = [frame(seen(RETINA, moved), peaks_e[k], 20 + k) for k, moved in enumerate(DRIFT_PX)]
     assert not [use.reason for use in join(frames).frames if "blurred" in (use.reason or "")]
 

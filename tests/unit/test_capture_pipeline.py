@@ -14,6 +14,7 @@ from device.errors import CameraMissing, CameraStalled, FrameError, LightFault
 from device.head import Head, hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.guard import GuardedLight
+from device.recon.assessment.exposure_split import WHOLE
 from device.recon.assessment.frame_quality import Verdict
 from device.recon.burst_reconstructor import PreparedFrame
 from device.recon.model.kernels import Pixels
@@ -190,6 +191,16 @@ def test_exposures_are_split_while_the_eye_moves_and_the_report_says_why(bench: 
     (note,) = split_notes(second.split)
     assert f"split into {len(second.lit)} frames" in note
     assert f"{10 * exposure_s:.2f} degrees" in note
+
+
+def test_a_resumed_press_says_nothing_of_the_overhead_of_frames(bench: Bench) -> None:
+    pipeline = CapturePipeline(
+        bench.head, bench.clock, bench.pipeline.reconstructor, bench.pipeline.live, MovingEye(), bursts=NoBursts()
+    )
+    pipeline.assess(replace(pipeline.expose("OD"), overhead_s=None))
+    assert pipeline.choose_split(1) == WHOLE
+    pipeline.assess(pipeline.expose("OD"))
+    assert pipeline.choose_split(1).parts > 1
 
 
 class FailsInRed:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from device.sim.fundus import BLOOD, CHOROID, COLOURS, LEVEL, MACULA, fundus
-from device.sim.pigments import Pigments
+from device.sim.pigments import AT_FOVEA, Pigments
 from device.values import Colour
 
 colours = st.sampled_from(COLOURS)
@@ -43,6 +43,15 @@ def test_macular_pigment_is_seen_in_blue_and_not_in_red(quantity: float) -> None
     eye = Pigments(macular=quantity)
     assert eye.macula("red", MACULA["red"]) == pytest.approx(MACULA["red"])
     assert (eye.macula("blue", MACULA["blue"]) - MACULA["blue"]) * (quantity - 1) >= 0
+
+
+@given(colours, st.floats(0, 3))
+def test_macular_pigment_absorbs_at_the_fovea_and_never_below_0(colour: Colour, quantity: float) -> None:
+    mean, eye = (1 - AT_FOVEA * Pigments(macular=one).macula(colour, MACULA[colour]) for one in (1.0, quantity))
+    assert eye > 0
+    assert eye / mean == pytest.approx(
+        10 ** (-2 * 0.35 * {"red": 0, "green": 0.15, "blue": 0.95}[colour] * (quantity - 1))
+    )
 
 
 def test_a_dark_fundus_with_little_haemoglobin_is_drawn_so() -> None:

@@ -45,7 +45,7 @@ def register_group(
     }
     near = {k: (0.0, 0.0) if k == centre else found[centre, k].shift_px for k in used}
     refined = _refined(registrar, {k: flats[k] for k in used}, near)
-    if blurred := _blurred({k: one.correlation for k, one in refined.items()}, light):
+    if blurred := _blurred(refined, light):
         reasons |= blurred
         near = {k: one.shift_px for k, one in refined.items() if k not in blurred}
         refined = _refined(registrar, {k: flats[k] for k in near}, near)
@@ -54,26 +54,28 @@ def register_group(
     return shifts, reasons
 
 
-def _blurred(correlation: Mapping[int, float], light: Mapping[int, float]) -> dict[int, str]:
+def _blurred(found: Mapping[int, Registration], light: Mapping[int, float]) -> dict[int, str]:
     """Return the reason of each frame that is less sharp than most, by its correlation with the mean of the others.
 
-    The expected correlation is sqrt(p / (1 + p)), p being the signal-to-noise ratio of the median frame times the
-    light of this one over the median light. Fewer than FEWEST frames do not show which one is blurred.
+    The expected correlation is sqrt(p / (1 + p)), p being the signal-to-noise ratio of the median frame, times the
+    light of this one over the median light if it has less. Fewer than FEWEST frames do not show which one is blurred,
+    and two are always kept.
     """
-    if len(correlation) < FEWEST:
+    if len(found) < FEWEST:
         return {}
-    values = np.clip(list(correlation.values()), 0.0, 0.999)
-    typical, usual = float(np.median(values)), float(np.median([light[k] for k in correlation]))
-    scatter = 1.4826 * float(np.median(np.abs(values - typical)))  # standard deviation of a normal distribution
+    values = np.clip([one.correlation for one in found.values()], 0.0, 0.999)
+    typical, usual = float(np.median(values)), float(np.median([light[k] for k in found]))
+    by_chance = float(np.median([one.sd for one in found.values()])) * (1 - typical**2)
+    scatter = max(1.4826 * float(np.median(np.abs(values - typical))), by_chance)  # 1.4826: of a normal distribution
     signal = typical**2 / (1 - typical**2)  # over the noise of the median frame
     reasons = {}
-    for k, value in correlation.items():
-        power = signal * light[k] / usual
+    for k, one in found.items():
+        power = signal * min(light[k] / usual, 1.0)
         expected = float(np.sqrt(power / (1 + power)))
         least = min(LEAST_SHARPNESS * expected, expected - LEAST_SCATTER * scatter)
-        if value < least:
-            reasons[k] = f"is blurred by motion (correlation {value:.2f}, at least {least:.2f})"
-    return reasons
+        if one.correlation < least:
+            reasons[k] = f"is blurred by motion (correlation {one.correlation:.2f}, at least {least:.2f})"
+    return reasons if len(found) - len(reasons) >= 2 else {}
 
 
 def _pairs(registrar: Registrar, details: dict[int, Detail]) -> dict[tuple[int, int], Registration]:

@@ -54,11 +54,13 @@ class Weighting:
     def of(cls, frame: Linear, noise: Noise, least_dn: float) -> "Weighting":
         """Return the weights for the noise of a sample and for what the model lacks.
 
-        Samples darker than `least_dn` have none, unless the whole frame is that dark.
+        Samples darker than `least_dn`, or than DARK_SHARE of the mean if that is less, have none; 0: all are used.
         """
         model_dn = MODEL_SHARE * frame.mean_dn
         variance_dn2 = noise.per_dn * np.maximum(frame.y, 0) + noise.floor_dn2 + model_dn**2
-        is_used = (frame.good >= LEAST_GOOD) & (frame.y >= min(least_dn, DARK_SHARE * frame.mean_dn))
+        is_used = frame.good >= LEAST_GOOD
+        if least_dn > 0:  # else noise below 0 counts as much as noise above
+            is_used &= frame.y >= min(least_dn, DARK_SHARE * frame.mean_dn)
         weights = (is_used / variance_dn2).astype(np.float32)
         down, across = (_cosines(size) for size in frame.y.shape)
         by_rows = np.einsum("ai,bi,ij->abj", down, down, weights, optimize=True)

@@ -192,12 +192,14 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
-    return CaptureFrames(tuple(lit), colours, dark, _dark_fits_colours(lit[0], colours.values()), unusable=unusable)
+    return CaptureFrames(
+        tuple(lit), colours, dark, _dark_fits_colours(dark or lit[0], colours.values()), unusable=unusable
+    )
 
 
-def _dark_fits_colours(lit: Path, others: Iterable[Path]) -> bool:
-    """Return True if the dark frame, which is as long as the lit one, fits the frames in other colours of light."""
-    dark_s, *others_s = (_exposure_s(one) for one in (lit, *others))
+def _dark_fits_colours(dark: Path, others: Iterable[Path]) -> bool:
+    """Return True if the dark frame fits the frames in other colours of light, as far as they state an exposure."""
+    dark_s, *others_s = (_exposure_s(one) for one in (dark, *others))
     return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
 
 
