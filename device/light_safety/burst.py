@@ -51,13 +51,20 @@ def burst(
             taken(frame)
             longest_s, last_s = max(longest_s, clock.now_s() - last_s), clock.now_s()
             if parts > 1 and len(frames) == 1:
-                overhead_s = longest_s - shot.exposure_s
-                if whole_s is None:
-                    whole_s = parts * shot.exposure_s
-                else:  # no more than the overhead for which the parts were made shorter: a stall adds no light
-                    overhead_s = min(overhead_s, (whole_s - parts * shot.exposure_s) / (parts - 1))
-                most_s = min(most_s, count * (whole_s + overhead_s) + ROUNDING_S)
+                most_s = min(most_s, count * _whole_s(shot.exposure_s, longest_s, parts, whole_s) + ROUNDING_S)
     return tuple(frames)
+
+
+def _whole_s(part_s: float, longest_s: float, parts: int, whole_s: float | None) -> float:
+    """Return how long the lamp may be on for one split exposure: `whole_s` with the overhead of one frame, seconds.
+
+    `longest_s`: duration of the first part, of `part_s` of exposure. A longer overhead than the one by which the parts
+    were made shorter does not count: a stall adds no light.
+    """
+    overhead_s = longest_s - part_s
+    if whole_s is None:
+        return parts * part_s + overhead_s
+    return whole_s + min(overhead_s, (whole_s - parts * part_s) / (parts - 1))
 
 
 def colour_sequence(

@@ -28,7 +28,7 @@ def details(kept: StoredCalibration) -> tuple[str, ...]:
         ("geometry", _geometry(found.geometry)),
         ("field", "unknown" if found.field_deg is None else f"{found.field_deg:g} deg"),
         *((name, "unknown" if getattr(found, name) is None else "measured") for name in ("dark_dn", "flat", "bad")),
-        ("refraction offset", _offset(found.refraction_offset)),
+        ("trial lenses", _offset(found.refraction_offset)),
         *((f"psf {k}", printable(psf.name)) for k, psf in enumerate(found.psfs)),
         *((printable(name), f"{value:.4g}") for name, value in provenance.figures),
     ]

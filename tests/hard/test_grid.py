@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from device.recon.estimation.defective_pixels import DefectFinder
 from services.lab.hard_cases.cases import CASES, CLEAN, NAMED
 from services.lab.hard_cases.cells import DEFAULT_SCHEDULE, CaseRunner, Cell
 from services.lab.hard_cases.frames import Eye
@@ -51,19 +50,6 @@ def test_the_grid_and_the_command_give_the_same_picture(grid: CaseRunner, clean:
     assert clean[0].pcc == pytest.approx(_pcc(np.load(order.output)), abs=1e-4)
     assert made.report.warnings == clean[0].warnings
     assert clean[0].pcc > 0.95
-
-
-def test_a_faint_halo_on_large_pixels_is_left_out() -> None:
-    """Its first ring has 4 % more light than the field; left in, it cost 0.12 of the correlation."""
-    eye = Eye("IMX296, merged", "imx296", {"sim.seed": 5, "sim.eye.m_dpt": -1.5, "sim.peak_e": 8000.0}, merged=4)
-    frame = NAMED["glare, 0.3 % clipped"].build(eye)
-    places = DefectFinder(frame.simulated.calibration, frame.simulated.shape)(frame.raw)
-    kept = np.ones(frame.raw.shape, np.bool_)
-    kept.ravel()[places] = False
-    light_dn = eye.clean.raw[kept].astype(float) - eye.spec.camera.black_dn
-    added_dn = frame.raw[kept].astype(float) - eye.clean.raw[kept]
-    assert (added_dn < 0.01 * np.maximum(light_dn, 100)).all()
-    assert kept.mean() > 0.96
 
 
 def _pcc(picture: np.ndarray) -> float:

@@ -45,11 +45,11 @@ def test_invalid_pin_is_refused(authenticator: PinAuthenticator, pin: str) -> No
 
 def test_pin_file_holds_a_salted_hash_readable_by_its_owner_only(tmp_path: Path, clock: VirtualClock) -> None:
     first, second = (PinAuthenticator(tmp_path / name, clock) for name in ("a.json", "b.json"))
-    first.set_pin("1234", None)
-    second.set_pin("1234", None)
+    first.set_pin("918273645", None)
+    second.set_pin("918273645", None)
     stored = [(tmp_path / name).read_bytes() for name in ("a.json", "b.json")]
     assert stored[0] != stored[1]
-    assert not any(b"1234" in content for content in stored)
+    assert not any(b"918273645" in content for content in stored)
     assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == 0o600
 
 

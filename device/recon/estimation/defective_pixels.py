@@ -10,7 +10,7 @@ the noise is not an image of light: it is a defect.
 * single outliers (warm, blinking, cosmic ray): off the median of a ring around them by more than NOISE_SD standard
   deviations plus `ring_ranges` of the PSF times the ring's range; none above MOST_OUTLIERS;
 * gaps without light (dead columns, rows, areas) with a sharp border (NARROW_PX, SHADOW, EDGE, EDGE_SHARE);
-* the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_FALL).
+* the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_SD).
 
 A frame without a candidate pixel costs one pass over its pixels.
 """
@@ -46,7 +46,6 @@ EDGE_SHARE = 0.5  # of the border of a dark area that must be sharp
 LEAST_EDGE_PX = 12  # of sharp border in a frame, for a search of dark areas
 HALO = 0.01  # of the light of the fitted field: more is a reflex. Overexposed eyes have at most 0.003
 HALO_BEGINS = 0.05  # of it in the first ring; an eye of 8 dpt with the stored PSF has up to 0.04
-HALO_FALL = 0.01  # of it from the first ring to the second; such an eye has up to 0.006, faint halos 0.02 and more
 HALO_SD = 3.0  # standard errors of a ring's mean excess
 HALO_MARGIN = 3  # samples beyond the last ring with an excess
 HALO_TURNS = 5  # the halo biases the first fit of the field
@@ -355,23 +354,12 @@ def _halo_rings(excess: Image, noise: float, good: Mask, ring: NDArray[np.int64]
         return 0
     number = np.bincount(rings)
     mean = np.bincount(rings, excess[near]) / np.maximum(number, 1)
-    sd = noise / np.sqrt(np.maximum(number / 4, 1))
+    limit = np.maximum(HALO, HALO_SD * noise / np.sqrt(np.maximum(number / 4, 1)))
     first = int(np.flatnonzero(number[1:])[0]) + 1
-    if mean[first] < HALO_BEGINS and not _falls(mean[first:], sd[first:], number[first:]):
+    if mean[first] < HALO_BEGINS:
         return 0
-    limit = np.maximum(HALO, HALO_SD * sd)
     below = np.flatnonzero((mean[1:] <= limit[1:]) & (number[1:] > 0))
     return int(below[0]) if below.size else int(rings.max())
-
-
-def _falls(mean: NDArray[np.float64], sd: NDArray[np.float64], number: NDArray[np.int64]) -> bool:
-    """Return whether the excess of the first ring is above that of the second by HALO_FALL and by HALO_SD errors.
-
-    A halo falls from ring to ring, also a faint one; the excess by another PSF changes over the size of that PSF.
-    """
-    if mean.size < 2 or not number[1]:
-        return False
-    return bool(mean[0] - mean[1] > max(HALO_FALL, HALO_SD * float(np.hypot(sd[0], sd[1]))))
 
 
 def clipped(counts: Pixels, white_dn: float, noise_dn: float) -> Mask:

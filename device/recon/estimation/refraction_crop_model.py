@@ -96,7 +96,10 @@ class Fit:
 
 
 class CropModel:
-    """Model of the frame that an `EdgeLikelihood` was started with, on the same grid, for a PSF with this radius."""
+    """Model of the frame that an `EdgeLikelihood` was started with, on the same grid, for a PSF with this radius.
+
+    `seen_share`, from `start` on: area of the sensor over that of the blurred field; below 1 the light is cropped.
+    """
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
         self._edges, grid = edges, edges.grid
@@ -112,7 +115,7 @@ class CropModel:
         self._twice[0] = 1
         if cols % 2 == 0:
             self._twice[-1] = 1
-        self._otf = np.zeros(frequency.shape, np.complex64)
+        self._otf, self.seen_share = np.zeros(frequency.shape, np.complex64), 1.0
 
     def start(self, eye_dpt: Floats) -> None:
         """Set the weights of the frame's samples, and the object's prior from the likelihood of an eye."""
@@ -146,18 +149,14 @@ class CropModel:
         matrix = np.array([[np.vdot(a, b) for b in derivatives] for a in solved], np.float64)
         return np.asarray(np.linalg.inv((matrix + matrix.T) / 2))
 
-    @property
-    def seen_share(self) -> float:
-        """Area of the sensor over that of the blurred field: below 1 the sensor crops the light."""
-        reach_samples = self._edges.edge.radius_samples + self._psf_samples
-        return float(np.prod(self._grid.window)) / (np.pi * reach_samples**2)
-
     def _set_prior(self, eye_dpt: Floats) -> None:
         """Set the object's reach from the edge, and the level of its detail from the rings of the likelihood."""
         edges, edge = self._edges, self._edges.edge
         frequencies, levels = detail_levels(edges, eye_dpt)
         lit = np.pi * edge.radius_samples**2
-        seen = self.seen_share
+        seen = self.seen_share = float(np.prod(self._grid.window)) / (
+            np.pi * (edge.radius_samples + self._psf_samples) ** 2
+        )
         share = min(seen * float((edges.likelihood.taper**2).mean()), 1.0)
         logs = np.log(levels) - DETAIL_EXPONENT * np.log(frequencies / REFERENCE)
         self._root = (self._root_shape * np.exp(logs.mean() / 2) / np.sqrt(lit * share)).astype(np.float32)
