@@ -60,7 +60,8 @@ class Head:
 
     `provenance` describes the origin of an archived calibration; None without an archive. `present_eye` is called with
     the next eye while the lamp is dark; a simulated head then shows that eye. `place_trial_lens` puts a trial lens
-    before it, at a distance from its pupil in mm; None with a real camera, whose operator does.
+    before it, at a distance from its pupil in mm, and `place_white_card` a white card in place of the eye; None with a
+    real camera, whose operator does.
     """
 
     spec: InstrumentSpec
@@ -73,6 +74,7 @@ class Head:
     provenance: Provenance | None = None
     present_eye: Callable[[Eye, str | None], None] = no_repositioning
     place_trial_lens: Callable[[TrialLens, float], None] | None = None
+    place_white_card: Callable[[], None] | None = None
 
     @property
     def kind(self) -> str:
@@ -328,6 +330,15 @@ def trial_lens_placer(world: World) -> Callable[[TrialLens, float], None]:
     return place
 
 
+def white_card_placer(world: World) -> Callable[[], None]:
+    """Return a function that puts a white card in place of the eye of a simulated head."""
+
+    def place() -> None:
+        world.eyes = world.eyes.behind_card()
+
+    return place
+
+
 def target_placer(world: World) -> Callable[[CalibrationTarget], None]:
     """Return a function that places calibration targets before a simulated head, as bright as one exposure needs."""
     e_per_s = TARGET_FILL_SHARE * world.spec.camera.full_well_e / world.spec.camera.exposure_s
@@ -401,9 +412,10 @@ def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     """Return an opened real or simulated head with its calibration, guarded light, camera, chips and button."""
     spec, calibration = opening.spec, opening.calibration()
     facing: Callable[[Eye, str | None], None] = no_repositioning
-    lens_placer = None
+    lens_placer = card_placer = None
     if spec.camera.backend == "sim":
         facing, lens_placer = opening.world.present_eye, trial_lens_placer(opening.world)
+        card_placer = white_card_placer(opening.world)
         facing("OD", None)  # traces the light now, not while a lamp is on
     light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
     camera = opening.camera(light)
@@ -411,7 +423,7 @@ def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
     chips, button = opening.chips(), opening.button()
     return Head(
         spec, camera, light, calibration, chips, button,
-        provenance=known, present_eye=facing, place_trial_lens=lens_placer,
+        provenance=known, present_eye=facing, place_trial_lens=lens_placer, place_white_card=card_placer,
     )  # fmt: skip
 
 

@@ -193,12 +193,23 @@ class RefractionOffset:
 
 
 @dataclass(frozen=True)
+class WhiteReference:
+    """Light of a white card before the head, in each colour of the ring at full drive, in DN per second.
+
+    The mean over the sensor above the dark frame (`calibration/white_card.py`). It sets the hue of colour pictures.
+    """
+
+    dn_per_s: tuple[tuple[Colour, float], ...]
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Measured or simulated calibration of one head.
 
     `psfs` has one entry or a stack over depth, for all colours or for each (`for_colour`); `dark_dn` (dark frame) and
     `flat` (flat frame) are (rows, cols) or None; `bad` marks defective pixels; `field_deg` is the diameter of the
-    illuminated disc around the centre (None: not known); `refraction_offset` is None if no trial lenses were shown.
+    illuminated disc around the centre (None: not known); `refraction_offset` is None if no trial lenses were shown,
+    `white` if no white card was.
     PsfError without PSFs or for PSFs of different shapes.
     """
 
@@ -211,6 +222,7 @@ class Calibration:
     bad: Mask | None = None
     simulated: bool = False
     refraction_offset: RefractionOffset | None = None
+    white: WhiteReference | None = None
 
     def __post_init__(self) -> None:
         if not self.psfs:
@@ -236,8 +248,9 @@ class Calibration:
         digest = hashlib.sha256(repr((self.sensor, self.geometry, self.field_deg, colours)).encode())
         for array in (*(psf.pixels for psf in self.psfs), self.dark_dn, self.flat, self.bad):
             digest.update(b"-" if array is None else repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        if self.refraction_offset is not None:  # so that a calibration without one keeps its identity
-            digest.update(repr(self.refraction_offset).encode())
+        for later in (self.refraction_offset, self.white):  # a calibration without them keeps its identity
+            if later is not None:
+                digest.update(repr(later).encode())
         return digest.hexdigest()[:16]
 
 
@@ -265,13 +278,16 @@ class ChannelUse:
     """What became of one colour: shift from the reference channel in pixels (rows, cols), and whether it is predicted.
 
     What is at (r, c) of the reference stands at (r, c) + `shift_px` in this channel; None for a predicted one. `reason`
-    says why a colour is missing in the picture; None for one that the picture has.
+    says why a colour is missing in the picture; None for one that the picture has. `white_ratio` is the light of its
+    frame over that of a white card in the same lamp light; None without a white reference: the hue is then that of
+    photographs.
     """
 
     name: Colour
     shift_px: tuple[float, float] | None
     predicted: bool = False
     reason: str | None = None
+    white_ratio: float | None = None
 
 
 @dataclass(frozen=True)

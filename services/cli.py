@@ -367,6 +367,25 @@ def show_trial_lenses(
     typer.echo(f"{done.stored.calibration.id} is in force; reports subtract its offset")
 
 
+@app.command("white-card")
+def show_white_card(
+    head: Annotated[Path, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")],
+    archive: Annotated[Path | None, typer.Option(help="Of calibrations; by default the one in the head file.")] = None,
+) -> None:
+    """Show a white card to the head's own light: colour pictures then have the colours of the retina.
+
+    Without it they have the hue of photographs. The reference goes into the calibration in force.
+    """
+    from services.lab.calibration_words import details
+    from services.lab.check_head import with_archive
+    from services.lab.white_card_check import measure_white_card
+
+    _progress("the lamp shines for moments: a white card stands before the head, and no person")
+    stored = measure_white_card(with_archive(load_head(head), archive), SystemClock(), _ask_operator, typer.echo)
+    typer.echo(next(line for line in details(stored) if "white card" in line))
+    typer.echo(f"{stored.calibration.id} is in force; colour pictures are balanced by it")
+
+
 def _colours(words: str) -> tuple[Colour, ...]:
     known: dict[str, Colour] = {"red": "red", "green": "green", "blue": "blue"}
     named = [word.strip() for word in words.split(",") if word.strip()]

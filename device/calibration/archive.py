@@ -35,11 +35,12 @@ from device.errors import (
     StoreError,
     StoreFull,
 )
-from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, Sensor
+from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, Sensor, WhiteReference
 
 MANIFEST, CURRENT = "manifest.toml", "current"
 MAPS = ("dark_dn", "flat", "bad")
-FORMAT, OFFSET_FORMAT = 1, 2  # the second has a refraction offset, which earlier releases cannot read
+FORMAT, OFFSET_FORMAT, WHITE_FORMAT = 1, 2, 3  # by what earlier releases cannot read: refraction offset, white card
+FORMATS = (FORMAT, OFFSET_FORMAT, WHITE_FORMAT)
 ID, NAME = re.compile("[0-9a-f]{16}"), re.compile(r"[a-z][a-z0-9_]*\.(npy|toml)")
 
 
@@ -210,16 +211,23 @@ def _manifest(calibration: Calibration, provenance: Provenance, arrays: dict[str
     table = asdict(provenance) | {"made_at": provenance.made_at.isoformat(), "figures": None}
     table["unknown"] = list(provenance.unknown)
     return {
-        "format": FORMAT if calibration.refraction_offset is None else OFFSET_FORMAT,
+        "format": _format(calibration),
         "id": calibration.id, "simulated": calibration.simulated, "field_deg": calibration.field_deg,
         "psf_names": [psf.name for psf in calibration.psfs],
         "psf_colours": [psf.colour or "every" for psf in calibration.psfs],
         "sensor": asdict(calibration.sensor),
         "geometry": asdict(calibration.geometry) if calibration.geometry else None,
         "refraction_offset": asdict(calibration.refraction_offset) if calibration.refraction_offset else None,
+        "white": dict(calibration.white.dn_per_s) if calibration.white else None,
         "provenance": table, "figures": dict(provenance.figures),
         "sha256": {name: hashlib.sha256(content).hexdigest() for name, content in arrays.items()},
     }  # fmt: skip
+
+
+def _format(calibration: Calibration) -> int:
+    if calibration.white is not None:
+        return WHITE_FORMAT
+    return FORMAT if calibration.refraction_offset is None else OFFSET_FORMAT
 
 
 def _read_files(place: Path) -> dict[str, bytes]:
@@ -231,8 +239,8 @@ def _read_files(place: Path) -> dict[str, bytes]:
 
 def _parse_manifest(files: Mapping[str, bytes]) -> dict[str, Any]:
     manifest = tomllib.loads(unsealed(_required_file(files, MANIFEST)))
-    if manifest["format"] not in (FORMAT, OFFSET_FORMAT):
-        known = f"{FORMAT} and {OFFSET_FORMAT}"
+    if manifest["format"] not in FORMATS:
+        known = f"{FORMAT} to {WHITE_FORMAT}"
         raise CalibrationFormat(f"this calibration was kept in format {manifest['format']}; known here are {known}")
     return manifest
 
@@ -257,6 +265,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
             field_deg=_numbers({"field_deg": manifest.get("field_deg")})["field_deg"],
             simulated=_BOOL.validate_python(manifest["simulated"]),
             refraction_offset=_offset(manifest.get("refraction_offset")),
+            white=_white(manifest.get("white")),
             **{name: _checked_map(arrays.get(f"{name}.npy"), name) for name in MAPS},
         )
         figures = tuple(manifest["figures"].items())
@@ -271,6 +280,7 @@ def _read(files: Mapping[str, bytes], id: str) -> StoredCalibration:
 
 _BOOL, _NUMBERS, _PROVENANCE = TypeAdapter(bool), TypeAdapter(dict[str, float | None]), TypeAdapter(Provenance)
 _COLOUR: TypeAdapter[Colour] = TypeAdapter(Colour)
+_WHITE: TypeAdapter[dict[Colour, float]] = TypeAdapter(dict[Colour, float])
 _PARSE_ERRORS = (ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RecursionError)
 
 
@@ -288,6 +298,16 @@ def _offset(table: dict[str, Any] | None) -> RefractionOffset | None:
     if not all(isinstance(value, int | float) and isfinite(value) for value in asdict(offset).values()):
         raise ValueError("the refraction offset holds a value that is no number")
     return offset
+
+
+def _white(table: dict[str, Any] | None) -> WhiteReference | None:
+    """Return the white reference of a manifest; None without one. ValueError unless all lights are above 0."""
+    if table is None:
+        return None
+    lights = _WHITE.validate_python(table)
+    if not all(isfinite(value) and value > 0 for value in lights.values()):
+        raise ValueError("the white reference holds a value that is no light")
+    return WhiteReference(tuple(lights.items()))
 
 
 def _checked_map(array: np.ndarray | None, name: str) -> np.ndarray | None:

@@ -18,14 +18,11 @@ from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
+from device.recon.white_balance import balanced, white_ratios
 from device.values import ChannelUse, Colour, Image, Reconstruction
 
 NO_TIME = "the time budget left no time for this colour"
 NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
-
-# Mean light of a colour over that of green: medians of the four photographs of NUMERICS.md 10.3, in linear light. They
-# set the hue until the calibration has a white reference: no level of a channel depends on lamp, sensor or diffuser.
-OVER_GREEN = (11.6, 1.0, 0.385)  # red, green, blue
 
 
 @dataclass(frozen=True)
@@ -48,6 +45,7 @@ class ColourReconstructor:
 
     def __init__(self, green: Reconstructor, others: Mapping[Colour, Reconstructor]) -> None:
         calibration, shape = green.calibration, green.shape
+        self._calibration = calibration
         self.others, self.clock, self.join_cost = others, green.clock, DurationEstimate()
         self._otfs = {
             colour: InterpolatedOtf(one.calibration.psfs[one.psf_index])
@@ -59,17 +57,20 @@ class ColourReconstructor:
         self._field = disc(shape, middle, radius_px)[self.box]
         if others:
             noise = np.random.default_rng(0).random(shape, np.float32)
-            self._join({"green": noise, **dict.fromkeys(others, noise)}, 1)  # measures the cost
+            self._join({"green": noise, **dict.fromkeys(others, noise)}, 1, {})  # measures the cost
 
     def steps(
         self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
         deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the steps of `green`, a pause after each round of the other colours, and the picture with its colours.
 
         `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason
-        of each colour without a frame. `deadline` is also that of `green`; it moves by the time of the pauses. The
-        picture is a ColourReconstruction if another colour was solved; its report lists every colour.
+        of each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
+        if it is not known: the hue is then that of photographs. `deadline` is also that of `green`; it moves by the
+        time of the pauses. The picture is a ColourReconstruction if another colour was solved; its report lists every
+        colour.
         """
         run = _Run(self, deadline)
         made = yield from run.green(green)
@@ -90,24 +91,25 @@ class ColourReconstructor:
             yield replace(made, report=replace(made.report, channels=(ChannelUse("green", (0.0, 0.0)), *gone)))
             return
         begin_s = self.clock.now_s()
-        joined, colour_picture = self._join(pictures, made.report.bin)
+        joined = self._join(pictures, made.report.bin, lights_dn_per_s or {})
         seconds = made.report.seconds | {"colour": run.spent_s + self.clock.now_s() - begin_s}
         notes = tuple(NOT_REGISTERED.format(name) for name in joined.doubtful)
         report = replace(
             made.report, seconds=seconds, channels=(*joined.channels, *gone), warnings=(*made.report.warnings, *notes)
         )
-        yield ColourReconstruction(made.picture, report, made.simulated or simulated, colour_picture)
+        yield ColourReconstruction(made.picture, report, made.simulated or simulated, joined.picture)
 
-    def _join(self, pictures: Mapping[Colour, Image], n: int) -> tuple[ColourPicture, Image]:
-        """Return the channels, joined on the lit field only, and their picture in the hue of photographs."""
+    def _join(self, pictures: Mapping[Colour, Image], n: int, lights_dn_per_s: Mapping[Colour, float]) -> ColourPicture:
+        """Return the channels, joined on the lit field only and balanced by the white reference."""
         begin_s = self.clock.now_s()
         cropped: dict[Colour, Image] = {
             name: np.ascontiguousarray(picture[self.box]) for name, picture in pictures.items()
         }
-        joined = join_colours(cropped, self._field, n)
-        picture = with_hue_of_photographs(joined.picture, self._field)
+        joined, ratios = join_colours(cropped, self._field, n), white_ratios(self._calibration, lights_dn_per_s)
+        channels = tuple(replace(one, white_ratio=ratios.get(one.name)) for one in joined.channels)
+        picture = balanced(joined.picture, self._field, ratios)
         self.join_cost.add(self.clock.now_s() - begin_s)
-        return joined, picture
+        return replace(joined, picture=picture, channels=channels)
 
     def refocus(self, colour: Colour, scale: float) -> None:
         """Use the PSF of a colour stretched by `scale` in its last stage; 1 selects the stored PSF.
@@ -172,14 +174,3 @@ class _Run:
         yield step
         if self._deadline is not None and isinstance(step, RoundDone):
             self._deadline = self._deadline.later(self._owner.clock.now_s() - begin_s)
-
-
-def with_hue_of_photographs(picture: Image, field: Image) -> Image:
-    """Return a picture (rows, cols, 3) whose red and blue have the mean over the field that photographs have.
-
-    `field` is the lit field, (rows, cols) in 0..1. The mean of green stays. A channel without light stays as it is.
-    """
-    inside = field > 0.5
-    means = picture[inside].mean(axis=0, dtype=np.float64)
-    wanted = means[1] * np.array(OVER_GREEN)
-    return np.asarray(picture * np.where(means > 0, wanted / np.maximum(means, 1e-30), 1), np.float32)

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from device.config.head_file import InstrumentSpec
+from device.optics.retina_chart import PAPER_REFLECTANCE
 from device.optics.trial_lens import PowerVector, TrialLens, correction_behind
 from device.sim.fundus import FIELD_CENTRE_DEG, Fundus
 from device.sim.objects import draw_object, moved_behind_field
@@ -35,7 +36,7 @@ class RenderedEyes:
 
     def __init__(self, spec: InstrumentSpec, eye: Eye, choose: EffectSelector) -> None:
         self.scene = Scene(spec, spec.light.colour, eye)
-        self._choose, self.turn_deg = choose, STRAIGHT
+        self._choose, self.turn_deg, self._shows_card = choose, STRAIGHT, False
         self._setups: dict[tuple[Eye, Colour, Pair], OpticalSetup] = {}
         self._rates: dict[tuple[Eye, Colour, int, Pair], Image] = {}
         self._retinas: dict[tuple[Eye, Pair], Fundus] = {}
@@ -62,6 +63,12 @@ class RenderedEyes:
         eyes = RenderedEyes(spec.model_copy(update={"sim": sim}), self.scene.eye, self._choose)
         eyes._retinas = self._retinas
         return eyes
+
+    def behind_card(self) -> "RenderedEyes":
+        """Return these eyes with a white card in front of them, in the light of the lamp."""
+        covered = copy(self)
+        covered._shows_card = True
+        return covered
 
     @cached_property
     def plan(self) -> tuple[Decision, ...]:
@@ -121,8 +128,11 @@ class RenderedEyes:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
         `step`, 0 to STEPS, is the number of frames for which the eye has drifted and turned. Computed once for each
-        combination.
+        combination. Behind a white card no eye is seen.
         """
+        return self._card_e_per_s(eye, colour) if self._shows_card else self._of_eye_e_per_s(eye, colour, step)
+
+    def _of_eye_e_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
         key = eye, colour, step, self.turn_deg
         if key not in self._rates:
             setup = self.setup(eye, colour)
@@ -134,6 +144,13 @@ class RenderedEyes:
                 setup = build_setup(scene, moved, self._chosen(scene))
             self._rates[key] = electrons_per_s(setup)
         return self._rates[key]
+
+    def _card_e_per_s(self, eye: Eye, colour: Colour) -> Image:
+        """Return the light of paper in place of the eye, lit as its field was; far from any focus it is even."""
+        reflectance = self.retina(eye).plane(colour)
+        gain = PAPER_REFLECTANCE / float(reflectance[reflectance > 0].mean(dtype=np.float64))
+        seen = self._of_eye_e_per_s(eye, colour)
+        return np.full_like(seen, gain * float(seen.mean(dtype=np.float64)))
 
     def _chosen(self, scene: Scene) -> tuple[Decision, ...]:
         planned = scene.colour == self.scene.spec.light.colour and scene.turn_deg == STRAIGHT

@@ -30,6 +30,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor, Step, default_schedule
+from device.recon.white_balance import light_dn_per_s
 from device.values import (
     EYES,
     Calibration,
@@ -108,6 +109,7 @@ class ColoursReconstructor(Protocol):
     def steps(
         self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
         deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the steps of `green`, a pause after each round of the other colours, and the picture with colours."""
 
@@ -318,7 +320,10 @@ class CapturePipeline:
         if shot.dark is not None:
             dark_s = shot.dark.exposure_s
             dark = dark if all(dark_fits(one.exposure_s, dark_s) for one in shot.colours.values()) else None
-        return self.colours.steps(green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing)
+        return self.colours.steps(
+            green, colours, dark, simulated=simulated, deadline=deadline, missing=shot.missing,
+            lights_dn_per_s=_lights_dn_per_s(shot, self._head.calibration, dark),
+        )  # fmt: skip
 
     def reassess(self, shot: ExposedCapture, report: Report) -> Verdict:
         """Return the final verdict, from the first one, the report and the number of tries of the slot."""
@@ -344,6 +349,18 @@ class CapturePipeline:
         made = self.live(counts, simulated=seen.frame.simulated, deadline=deadline, quick=True)
         jpeg = picture_files.to_jpeg(crop_to_field(made.picture, self._head), PREVIEW_PX, made.simulated)
         return jpeg, self._feedback.aim(counts, seen.exposed_s)
+
+
+def _lights_dn_per_s(
+    shot: ExposedCapture, calibration: Calibration, colours_dark: Counts | None
+) -> dict[Colour, float]:
+    """Return the light of each colour of a press at full drive; none without a white reference to compare with."""
+    lights = dict[Colour, float]()
+    for frame in (shot.frame, *shot.colours.values()) if calibration.white is not None else ():
+        if (glow := frame.illumination) is not None:
+            dark = counts_of(shot.dark) if frame is shot.frame else colours_dark
+            lights[glow.colour] = light_dn_per_s(frame.counts, dark, calibration, frame.exposure_s * glow.level)
+    return lights
 
 
 def plan_pipeline(

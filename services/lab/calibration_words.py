@@ -1,7 +1,7 @@
 """Text of `diffuscope calibrations` for one archived calibration."""
 
 from device.calibration.archive import StoredCalibration
-from device.values import Calibration, Geometry, RefractionOffset
+from device.values import Calibration, Geometry, RefractionOffset, WhiteReference
 
 
 def printable(text: str) -> str:
@@ -29,6 +29,7 @@ def details(kept: StoredCalibration) -> tuple[str, ...]:
         ("field", "unknown" if found.field_deg is None else f"{found.field_deg:g} deg"),
         *((name, "unknown" if getattr(found, name) is None else "measured") for name in ("dark_dn", "flat", "bad")),
         ("trial lenses", _offset(found.refraction_offset)),
+        ("white card", _white(found.white)),
         *((f"psf {k}", printable(psf.name)) for k, psf in enumerate(found.psfs)),
         *((printable(name), f"{value:.4g}") for name, value in provenance.figures),
     ]
@@ -42,6 +43,12 @@ def _offset(offset: RefractionOffset | None) -> str:
     if offset is None:
         return "not measured"
     return f"M {offset.m_dpt:+.2f} (sd {offset.m_sd_dpt:.2f}), J0 {offset.j0_dpt:+.2f}, J45 {offset.j45_dpt:+.2f} dpt"
+
+
+def _white(white: WhiteReference | None) -> str:
+    if white is None:
+        return "not measured"
+    return ", ".join(f"{colour} {light:.3g}" for colour, light in white.dn_per_s) + " DN/s"
 
 
 def _numbers(kept: StoredCalibration) -> str:

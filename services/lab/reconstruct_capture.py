@@ -19,6 +19,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
+from device.recon.white_balance import light_dn_per_s
 from device.values import Calibration, Colour, FrameUse, Image, Reconstruction, Report
 from services.lab.reconstruct_burst import common_raw, rejections, unusable_raws, without_bad
 from services.lab.reconstruct_file import (
@@ -49,7 +50,8 @@ class CaptureFrames:
     """Raw frames of one capture: the burst `lit`, its reference first, and one frame in each other colour of light.
 
     `dark`: dark frame of the burst and, where it fits them, of the other colours; `light`: colour of the burst, None if
-    it is unknown; `unusable`: reason of each frame of the burst that must not enter the picture, by its index.
+    it is unknown; `unusable`: reason of each frame of the burst that must not enter the picture, by its index;
+    `full_drive_s`: exposure of the first frame in each light, seconds times the level of the lamp, where it is known.
     """
 
     lit: tuple[Path, ...]
@@ -58,6 +60,7 @@ class CaptureFrames:
     dark_fits_colours: bool = True
     light: Colour | None = None
     unusable: Mapping[int, str] = field(default_factory=dict)
+    full_drive_s: Mapping[Colour, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ class CaptureReconstructor:
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
         made = plan.solve([without_bad(one.raw) for one in lit], unusable, dark, {
             name: without_bad(one.raw) for name, one in others.items()
-        }, dark if frames.dark_fits_colours else None)  # fmt: skip
+        }, dark if frames.dark_fits_colours else None, frames.full_drive_s)  # fmt: skip
         return self._reported(made, plan, [*lit, *others.values()], notes)
 
     def _single(self, frames: CaptureFrames) -> CaptureReconstruction:
@@ -205,7 +208,7 @@ class _Plan:
 
     def solve(
         self, lit: Sequence[Pixels], unusable: Mapping[int, str], dark: Image | None,
-        others: Mapping[Colour, Pixels], others_dark: Image | None,
+        others: Mapping[Colour, Pixels], others_dark: Image | None, full_drive_s: Mapping[Colour, float],
     ) -> Reconstruction:  # fmt: skip
         """Return the picture, with `colour` if another colour was solved; at least one frame of the burst is usable."""
         deadline = None if self._budget_s is None else Deadline.after(self._clock, self._budget_s)
@@ -216,12 +219,26 @@ class _Plan:
         )  # fmt: skip
         if self._colours is not None:
             solved = {name: counts for name, counts in others.items() if name not in self._missing}
+            lights = self._lights_dn_per_s({**solved, "green": lit[0]}, dark, others_dark, full_drive_s)
             steps = self._colours.steps(
-                steps, solved, others_dark, simulated=False, deadline=deadline, missing=self._missing
+                steps, solved, others_dark, simulated=False, deadline=deadline, missing=self._missing,
+                lights_dn_per_s=lights,
             )  # fmt: skip
         (made,) = deque(steps, maxlen=1)
         assert isinstance(made, Reconstruction)
         return replace(made, report=replace(made.report, frames=_in_given_order(made.report, order)))
+
+    def _lights_dn_per_s(
+        self, frames: Mapping[Colour, Pixels], dark: Image | None, others_dark: Image | None,
+        full_drive_s: Mapping[Colour, float],
+    ) -> dict[Colour, float]:  # fmt: skip
+        """Return the light of each colour at full drive; none without a white reference to compare with."""
+        calibration = self.single.calibration
+        return {
+            name: light_dn_per_s(counts, dark if name == "green" else others_dark, calibration, full_drive_s[name])
+            for name, counts in frames.items()
+            if calibration.white is not None and name in full_drive_s
+        }
 
 
 def _in_given_order(report: Report, order: Sequence[int]) -> tuple[FrameUse, ...]:

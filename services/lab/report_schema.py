@@ -93,6 +93,11 @@ CHANNEL: Mapping[str, JsonValue] = {
     "reason": {
         "type": ["string", "null"], "description": "Why the picture has not this colour; null for one that it has.",
     },
+    "white_ratio": {
+        "type": ["number", "null"],
+        "description": "Light of its frame over that of a white card in the same lamp light. Null without a white "
+        "reference in the calibration: the hue is then that of photographs.",
+    },
 }  # fmt: skip
 VERDICT: Mapping[str, str] = {
     "saturated": "Share of saturated pixels of the raw frame, 0 to 1.",

@@ -93,7 +93,10 @@ def _frame_as_json(one: FrameUse) -> JsonValue:
 
 def _channel_as_json(one: ChannelUse) -> JsonValue:
     shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
-    return {"name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason}
+    return {
+        "name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason,
+        "white_ratio": one.white_ratio,
+    }  # fmt: skip
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -199,7 +202,8 @@ def _channels(value: object) -> tuple[ChannelUse, ...]:
 def _channel(entries: JsonObject) -> ChannelUse:
     name = one_of(entries.get("name"), *get_args(Colour))
     shift_px, predicted = _checked(entries, "shift_px", _position, None), entries.get("predicted") is True
-    return ChannelUse(name, shift_px, predicted, _checked(entries, "reason", text, None))
+    reason, white_ratio = _checked(entries, "reason", text, None), _checked(entries, "white_ratio", _number, None)
+    return ChannelUse(name, shift_px, predicted, reason, white_ratio)
 
 
 def _dose_report(entries: JsonObject) -> DoseReport:

@@ -57,6 +57,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
     "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
     "trial-lenses --head {0}/head.toml", "trial-lenses --head {0}/head.toml --archive {0}/a --vertex-mm 40",
+    "white-card --head {0}/head.toml", "white-card --head {0}/head.toml --archive {0}/a",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2", "archive plan {0}/none -o {0}/plan.toml",
     "archive plan {0}/scene -o {0}/plan.toml --rounds 2 --budget-s 1", "archive plan",
     "archive run", "archive run {0}/plan.toml -o {0}/results --workers 0", "archive report",  # with or without Dask

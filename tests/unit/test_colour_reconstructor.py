@@ -5,9 +5,10 @@ import pytest
 from scipy import ndimage
 
 from device.clock import Deadline, SystemClock
-from device.recon.colour_reconstructor import NO_TIME, OVER_GREEN, ColourReconstruction, ColourReconstructor
+from device.recon.colour_reconstructor import NO_TIME, ColourReconstruction, ColourReconstructor
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor, RoundDone, StageResult, Step
+from device.recon.white_balance import OVER_GREEN, RGB
 from device.values import Colour, Image, Reconstruction
 from tests.moving_retina import RETINA, SHAPE, burst_calibration, field, frame, seen
 
@@ -71,7 +72,7 @@ def test_the_picture_has_three_channels_on_the_grid_of_green(bench: Bench) -> No
     box = bench.colours.box
     inside = field()[box] > 0.5
     means = made.colour[inside].mean(axis=0)
-    assert means / means[1] == pytest.approx(OVER_GREEN, rel=1e-3)
+    assert means / means[1] == pytest.approx([OVER_GREEN[colour] for colour in RGB], rel=1e-3)
     inside = ndimage.binary_erosion(inside, iterations=12)  # away from the edge, which moves with each channel
     of_red = {moved: correlation(made.colour[..., 0], seen(RED, moved)[box], inside) for moved in ((0, 0), MOVED_PX)}
     assert of_red[0, 0] > max(0.85, of_red[MOVED_PX] + 0.02)

@@ -102,14 +102,16 @@ class FrameAnswer(StoredPart):
 class ChannelAnswer(StoredPart):
     """One colour of light: its shift from green (rows, cols; pixels), whether it is predicted, not measured.
 
-    `reason`: why the picture has not this colour; null for one that it has. File `raw-red.tiff` is the raw frame of
-    red.
+    `reason`: why the picture has not this colour; null for one that it has. `white_ratio`: its light over that of a
+    white card; null without a white reference, when the hue is that of photographs. File `raw-red.tiff` is the raw
+    frame of red.
     """
 
     name: Colour
     shift_px: tuple[Number, Number] | None
     predicted: bool
     reason: str | None
+    white_ratio: Number | None
 
 
 class EyeCorrectionAnswer(StoredPart):

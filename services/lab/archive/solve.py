@@ -192,9 +192,15 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
+    full_drive_s = {
+        stated.illumination.colour: stated.exposure_s * stated.illumination.level
+        for stated in map(_stated, (lit[0], *colours.values()))
+        if stated is not None and stated.illumination is not None and stated.exposure_s is not None
+    }
     return CaptureFrames(
-        tuple(lit), colours, dark, _dark_fits_colours(dark or lit[0], colours.values()), unusable=unusable
-    )
+        tuple(lit), colours, dark, _dark_fits_colours(dark or lit[0], colours.values()), unusable=unusable,
+        full_drive_s=full_drive_s,
+    )  # fmt: skip
 
 
 def _dark_fits_colours(dark: Path, others: Iterable[Path]) -> bool:

@@ -1,0 +1,68 @@
+"""White balance of a colour picture: the light of each colour over that of a white card in the same lamp light.
+
+The level of a solved channel says nothing about its colour: lamp, sensor and diffuser have their own response to each
+colour. The card divides them out. Without one, the hue is that of photographs. NUMERICS.md 10.4.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from device.recon.colour import RGB
+from device.recon.model.kernels import Pixels
+from device.values import Calibration, Colour, Image
+
+# Mean light of a colour over that of green: medians of the four photographs of NUMERICS.md 10.3, in linear light.
+OVER_GREEN: dict[Colour, float] = {"red": 11.6, "green": 1.0, "blue": 0.385}
+
+
+def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration, full_drive_s: float) -> float:
+    """Return the mean light of a frame over the sensor at full drive, DN per second, without bad pixels.
+
+    `counts` (rows, cols); `dark`: dark frame of the same exposure, None: that of the calibration, else its black level.
+    `full_drive_s` is the exposure in seconds times the level of the lamp.
+    """
+    level: Pixels | Image | float = calibration.sensor.black_dn
+    if dark is not None:
+        level = dark
+    elif calibration.dark_dn is not None:
+        level = calibration.dark_dn
+    if calibration.bad is None:
+        return (_mean(counts) - _mean(level)) / full_drive_s
+    good = ~calibration.bad
+    return (_mean(counts[good]) - _mean(level if isinstance(level, float | int) else level[good])) / full_drive_s
+
+
+def white_ratios(calibration: Calibration, lights_dn_per_s: Mapping[Colour, float]) -> dict[Colour, float]:
+    """Return each light over that of the white card; only the colours that have both, with a light above 0."""
+    white = {} if calibration.white is None else dict(calibration.white.dn_per_s)
+    return {colour: light / white[colour] for colour, light in lights_dn_per_s.items() if light > 0 and colour in white}
+
+
+def balanced(picture: Image, field: Image, ratios: Mapping[Colour, float]) -> Image:
+    """Return a picture (rows, cols, 3) whose red and blue have the mean over the field that the white card gives them.
+
+    `field` is the lit field, (rows, cols) in 0..1. The mean of green stays. A colour without a value in `ratios`,
+    or any without one of green, has that of photographs. A channel without light stays as it is.
+    """
+    green = ratios.get("green")
+    hue = [OVER_GREEN[colour] if not green else _share(colour, ratios, green) for colour in RGB]
+    inside = field > 0.5
+    means = picture[inside].mean(axis=0, dtype=np.float64)
+    wanted = means[1] * np.array(hue)
+    return np.asarray(picture * np.where(means > 0, wanted / np.maximum(means, 1e-30), 1), np.float32)
+
+
+def _share(colour: Colour, ratios: Mapping[Colour, float], green: float) -> float:
+    """Return the light of a channel over that of green; amber light stands for red, as in the picture."""
+    measured = ratios.get(colour, ratios.get("amber") if colour == "red" else None)
+    return OVER_GREEN[colour] if measured is None else measured / green
+
+
+def _mean(values: Pixels | Image | float) -> float:
+    """Return the mean of the values that are not missing (NaN)."""
+    if isinstance(values, float | int):
+        return float(values)
+    if np.issubdtype(values.dtype, np.integer):
+        return float(values.mean(dtype=np.float64))
+    return float(np.nanmean(values, dtype=np.float64))
