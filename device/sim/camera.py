@@ -51,7 +51,8 @@ class SimCamera:
         return Frame(counts, shot.exposure_s, world.frames, world.illumination, simulated=True)
 
     def prepare(self, shot: ExposureSettings) -> None:
-        """Do nothing: every exposure sets its own time."""
+        """Compute the light of a moving eye for frames of this length, not later while the lamp is lit."""
+        self.world.eyes.render_burst(self.world.eye, shot.exposure_s)
 
     def close(self) -> None:
         """Close the camera, so that later exposures raise CameraMissing; idempotent."""

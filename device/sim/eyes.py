@@ -19,6 +19,7 @@ from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
+MOST_PARTS = 4  # into which an exposure of a moving eye is split
 FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 Pair = tuple[float, float]
@@ -38,7 +39,7 @@ class RenderedEyes:
         self.scene = Scene(spec, spec.light.colour, eye)
         self._choose, self.turn_deg, self._shows_card = choose, STRAIGHT, False
         self._setups: dict[tuple[Eye, Colour, Pair], OpticalSetup] = {}
-        self._rates: dict[tuple[Eye, Colour, int, Pair], Image] = {}
+        self._rates: dict[tuple[Eye, Colour, int, int, Pair], Image] = {}
         self._retinas: dict[tuple[Eye, Pair], Fundus] = {}
 
     def turned_to(self, eye: Eye, field: str | None) -> "RenderedEyes":
@@ -124,24 +125,39 @@ class RenderedEyes:
         """Whether the retina moves between the frames of a burst."""
         return self.drift_px != 0 or self.torsion_deg != 0
 
-    def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
+    def parts(self, exposure_s: float) -> int:
+        """Return how many exposures of this length fit into one of a picture, 1 to MOST_PARTS; 1 for a still eye."""
+        if not (self.moves or self.scene.sim.eye.drift_deg_per_s):
+            return 1
+        return min(max(1, round(self.scene.spec.camera.exposure_s / exposure_s)), MOST_PARTS)
+
+    def render_burst(self, eye: Eye, exposure_s: float) -> None:
+        """Compute the light of an eye in the picture's colour for each frame of a burst of exposures of this length."""
+        parts = self.parts(exposure_s)
+        for step in range((STEPS + 1) * parts if self.moves else 1):
+            self.electrons_per_s(eye, self.scene.spec.light.colour, step, parts)
+
+    def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0, parts: int = 1) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
-        `step`, 0 to STEPS, is the number of frames for which the eye has drifted and turned. Computed once for each
-        combination. Behind a white card no eye is seen.
+        `step` is the number of frames for which the eye has drifted and turned; it is back where it was after those of
+        STEPS + 1 exposures. A frame lasts for 1 / `parts` of a picture's exposure. Computed once for each combination.
+        Behind a white card no eye is seen.
         """
-        return self._card_e_per_s(eye, colour) if self._shows_card else self._of_eye_e_per_s(eye, colour, step)
+        return self._card_e_per_s(eye, colour) if self._shows_card else self._of_eye_e_per_s(eye, colour, step, parts)
 
-    def _of_eye_e_per_s(self, eye: Eye, colour: Colour, step: int = 0) -> Image:
-        key = eye, colour, step, self.turn_deg
+    def _of_eye_e_per_s(self, eye: Eye, colour: Colour, step: int = 0, parts: int = 1) -> Image:
+        step %= (STEPS + 1) * parts
+        key = eye, colour, step, parts, self.turn_deg
         if key not in self._rates:
             setup = self.setup(eye, colour)
-            if step > 0:
-                scene = setup.scene
+            if step > 0 or parts > 1:
+                scene, exposures = setup.scene, (step + 0.5) / parts - 0.5  # of the middle of the frame, like the blur
                 radius_px = scene.geometry.px_per_deg * scene.half_field_deg
-                away_px, turn_deg = (0.0, step * self.drift_px), step * self.torsion_deg
+                away_px, turn_deg = (0.0, exposures * self.drift_px), exposures * self.torsion_deg
                 moved = moved_behind_field(self.retina(eye), away_px, radius_px, turn_deg)
                 setup = build_setup(scene, moved, self._chosen(scene))
+                setup.drift_px = setup.drift_px[0] / parts, setup.drift_px[1] / parts
             self._rates[key] = electrons_per_s(setup)
         return self._rates[key]
 

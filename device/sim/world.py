@@ -9,7 +9,7 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
 from device.sim.blinks import lid_share
-from device.sim.eyes import STEPS, EffectSelector, RenderedEyes
+from device.sim.eyes import EffectSelector, RenderedEyes
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, decide
@@ -75,14 +75,13 @@ class World:
         """Present an eye to the head, with the fault "eye.other" the fellow eye; a calibration target stays in place.
 
         The eye turns to the fixation target of a field of view; None: it looks straight on. Its light is computed now
-        for the picture's and the aiming colour, not later while the lamp is lit: with drift for each step of a burst.
+        for the picture's and the aiming colour, not later while the lamp is lit: with motion for each frame of a burst.
         """
         self.eye = FELLOW_EYE[eye] if self.has_fault("eye.other") else eye
         self.eyes = self.eyes.turned_to(self.eye, field)
         for colour in {self.spec.light.colour, self.spec.light.preview_colour}:
             self.electrons_per_s(colour)
-        for step in range(1, STEPS + 1) if self.eyes.moves else ():
-            self.eyes.electrons_per_s(self.eye, self.spec.light.colour, step)
+        self.eyes.render_burst(self.eye, self.spec.camera.exposure_s)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -145,8 +144,10 @@ class World:
         glow = self.illumination  # read once: the guard's thread may turn the lamp off at any time
         if glow is None:
             return np.broadcast_to(unlit_e, self.shape)
-        step = self.lit_frames % (STEPS + 1) if self.eyes.moves and glow.colour == self.spec.light.colour else 0
-        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step)
+        step, parts = 0, 1
+        if glow.colour == self.spec.light.colour:
+            step, parts = self.lit_frames if self.eyes.moves else 0, self.eyes.parts(exposure_s)
+        returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step, parts)
         begin_s = self.clock.now_s() - exposure_s
         closed = 1.0 if self.has_fault("eye.closed") else lid_share(self.scene, max(begin_s, 0.0), exposure_s)
         if closed > 0:

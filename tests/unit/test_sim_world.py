@@ -273,6 +273,29 @@ def test_a_drifting_retina_moves_from_frame_to_frame_behind_a_field_that_stands_
     assert not moved.reflectance["green"][~ndimage.binary_dilation(field, iterations=2)].any()
 
 
+def test_a_shorter_frame_of_a_moving_eye_has_a_shorter_blur_and_step():
+    """Two halves of an exposure together show what the whole one does; each moves half as far."""
+    moving, frames = lit_frames(4.0)
+    halves = []
+    moving.lit_frames = 0
+    for _ in range(4):
+        halves.append(moving.electrons(0.05))
+        moving.lit_frames += 1
+    assert moving.eyes.parts(0.05) == 2
+    moved = float(np.abs(frames[1] - frames[0]).max())
+
+    def apart(one, other):
+        """Return the difference of two frames in steps of one exposure."""
+        return float(np.abs(one - other).max()) / moved
+
+    # 0.1: light from beyond the edge of the field is smeared with the picture in one long frame
+    assert apart(halves[0] + halves[1], frames[0]) < 0.1
+    assert apart(halves[2] + halves[3], frames[1]) < 0.1
+    assert apart(2 * halves[0], frames[0]) == pytest.approx(0.25, abs=0.1), "its middle is a quarter of a step before"
+    assert apart(2 * halves[1], 2 * halves[0]) == pytest.approx(0.5, abs=0.1)
+    assert World(small_head(), VirtualClock()).eyes.parts(0.05) == 1, "a still eye looks the same in any exposure"
+
+
 def test_torsion_turns_the_retina_about_the_middle_of_the_field_from_frame_to_frame():
     turning = World(small_head(eye=EyeSpec(torsion_deg_per_s=30.0)), VirtualClock())
     assert turning.eyes.torsion_deg == pytest.approx(3.0)
