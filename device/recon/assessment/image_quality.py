@@ -24,6 +24,7 @@ MOST_UNSEEN = 0.1  # share of the pixels: where more is missing, figures of the 
 MOST_SATURATED = 0.001  # share of the pixels
 # Figures that use the PSF: set to None if the model does not explain the frame.
 PSF_FIGURES = ("structure_nats", "structure_sure", "cutoff_per_px", "resolution_um", "coverage")
+SPECTRUM_FIGURES = ("cutoff_per_px", "resolution_um")
 FAINT_DN = 1e-9
 NO_SIGNAL = "There is no signal in this frame."
 # The words of these messages and of `quality_warnings` are sorted by KINDS in services/lab/hard_cases/judgement.py.
@@ -154,9 +155,13 @@ def is_lit(quality: dict[str, float | None]) -> bool:
 def is_measured(name: str, quality: dict[str, float | None]) -> bool:
     """Return True if the figure `name`, one of PSF_FIGURES, is valid for a frame that the model explains.
 
-    `coverage` always is. The others are valid if the field is lit and at most MOST_UNSEEN of the frame is missing.
+    `coverage` always is. The others are valid if the field is lit and at most MOST_UNSEEN of the frame is missing, the
+    resolution also only if the frame has the PSF's structure: the power of a glare's halo would count as detail.
     """
-    return name == "coverage" or (is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_UNSEEN)
+    if name == "coverage":
+        return True
+    is_foreign = name in SPECTRUM_FIGURES and (quality.get("structure_sure") or 0.0) < -MISMATCH_SD
+    return is_lit(quality) and (quality.get("missing") or 0.0) <= MOST_UNSEEN and not is_foreign
 
 
 def psf_match(quality: dict[str, float | None]) -> Match:
