@@ -23,6 +23,7 @@ BAND_PER_PX = (0.01, 0.12)
 GUIDE_PX, GUIDE_EPS = 17, 0.01  # window of the guided filter, and the share of the guide's variance that is noise
 GUIDED_SHARE = 0.5  # of the filtered picture; the rest keeps what green does not show
 LEAST_SD = 10.0  # of the correlation: wrong registrations had 9.2 or less, right ones 10 or more (NUMERICS.md 10.1)
+LEAST_CERTAIN = 0.5  # of the correlation itself: in a small picture the surface has too few places for LEAST_SD
 
 # Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over four
 # photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3).
@@ -82,7 +83,7 @@ def register_colours(
         found = Registration((0.0, 0.0), 1.0, 0.0)
         if name != reference:
             found = registrar.register(target, registrar.detail(flat))
-        if found.correlation < LEAST_SD * found.sd:
+        if found.correlation < min(LEAST_SD * found.sd, LEAST_CERTAIN):
             doubtful.append(name)
             found = Registration((0.0, 0.0), 0.0, 0.0)
         elif name != reference:

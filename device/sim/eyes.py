@@ -144,7 +144,9 @@ class RenderedEyes:
         STEPS + 1 exposures. A frame lasts for 1 / `parts` of a picture's exposure. Computed once for each combination.
         Behind a white card no eye is seen.
         """
-        return self._card_e_per_s(eye, colour) if self._shows_card else self._of_eye_e_per_s(eye, colour, step, parts)
+        if self._shows_card:
+            return _of_card(self.retina(eye).plane(colour), self._of_eye_e_per_s(eye, colour))
+        return self._of_eye_e_per_s(eye, colour, step, parts)
 
     def _of_eye_e_per_s(self, eye: Eye, colour: Colour, step: int = 0, parts: int = 1) -> Image:
         step %= (STEPS + 1) * parts
@@ -161,13 +163,12 @@ class RenderedEyes:
             self._rates[key] = electrons_per_s(setup)
         return self._rates[key]
 
-    def _card_e_per_s(self, eye: Eye, colour: Colour) -> Image:
-        """Return the light of paper in place of the eye, lit as its field was; far from any focus it is even."""
-        reflectance = self.retina(eye).plane(colour)
-        gain = PAPER_REFLECTANCE / float(reflectance[reflectance > 0].mean(dtype=np.float64))
-        seen = self._of_eye_e_per_s(eye, colour)
-        return np.full_like(seen, gain * float(seen.mean(dtype=np.float64)))
-
     def _chosen(self, scene: Scene) -> tuple[Decision, ...]:
         planned = scene.colour == self.scene.spec.light.colour and scene.turn_deg == STRAIGHT
         return self.plan if planned else self._choose(scene)
+
+
+def _of_card(reflectance: Image, light: Image) -> Image:
+    """Return the light of paper in place of an eye with this reflectance; far from any focus it is even."""
+    gain = PAPER_REFLECTANCE / float(reflectance[reflectance > 0].mean(dtype=np.float64))
+    return np.full_like(light, gain * float(light.mean(dtype=np.float64)))

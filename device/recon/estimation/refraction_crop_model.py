@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
@@ -31,6 +32,7 @@ MOST_ITERATIONS = 40  # of conjugate gradients; with 80 the errors are the same
 COVARIANCE_ITERATIONS = 20  # for the covariance: its sds change by 1 % at the most
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
 DARK_SHARE = 0.1  # of the mean
+NEAR_SAMPLES = 5  # side of the square of the local mean
 RIDGE = 1e-5  # of the mean information on a cosine, for windows whose dark part leaves some of them undetermined
 MODEL_SHARE = 0.0022  # of the mean: sd of what the model lacks
 DERIVATIVE_STEP_DPT = 0.05
@@ -54,13 +56,15 @@ class Weighting:
     def of(cls, frame: Linear, noise: Noise, least_dn: float) -> "Weighting":
         """Return the weights for the noise of a sample and for what the model lacks.
 
-        Samples darker than `least_dn`, or than DARK_SHARE of the mean if that is less, have none; 0: all are used.
+        They follow the local mean: by a sample itself, noise would weigh itself, and choose its own samples. Samples
+        darker than `least_dn`, or than DARK_SHARE of the mean if that is less, have none; 0: all are used.
         """
-        model_dn = MODEL_SHARE * frame.mean_dn
-        variance_dn2 = noise.per_dn * np.maximum(frame.y, 0) + noise.floor_dn2 + model_dn**2
-        is_used = frame.good >= LEAST_GOOD
-        if least_dn > 0:  # else noise below 0 counts as much as noise above
-            is_used &= frame.y >= min(least_dn, DARK_SHARE * frame.mean_dn)
+        model_dn, is_used = MODEL_SHARE * frame.mean_dn, frame.good >= LEAST_GOOD
+        near = ndimage.uniform_filter(np.where(is_used, frame.y, 0), NEAR_SAMPLES)
+        near /= np.maximum(ndimage.uniform_filter(is_used.astype(np.float32), NEAR_SAMPLES), 1 / NEAR_SAMPLES**2)
+        variance_dn2 = noise.per_dn * np.maximum(near, 0) + noise.floor_dn2 + model_dn**2
+        if least_dn > 0:
+            is_used &= near >= min(least_dn, DARK_SHARE * frame.mean_dn)
         weights = (is_used / variance_dn2).astype(np.float32)
         down, across = (_cosines(size) for size in frame.y.shape)
         by_rows = np.einsum("ai,bi,ij->abj", down, down, weights, optimize=True)

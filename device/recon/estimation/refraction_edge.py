@@ -29,6 +29,7 @@ from device.values import Calibration, Geometry, Image
 
 SAMPLE_UM = 24.0
 PARAMETERS = 4
+ROUNDING_STEP = 7  # every such row and column shows whether counts are whole numbers
 
 Floats = NDArray[np.float64]
 
@@ -85,13 +86,13 @@ class EdgeLikelihood:
         self._flat_places = np.arange(self.band.where.size)
         self.levels = np.zeros(int(self.band.ring.max(initial=0)) + 1)
         self.noise = Noise(0.0, 1.0)
-        self._is_integer, self.dithered_dn = False, 0.0
+        self._is_rounded, self.dithered_dn = False, 0.0
         self._noise_dn2 = 1.0
 
     def start(self, counts: Pixels, dark: Pixels | None, defects: Places | None) -> Linear:
         """Return the frame on this model's samples, and begin with the calibrated edge."""
         self.frame = self.likelihood.frame(counts, dark, defects)
-        self._is_integer = counts.dtype.kind == "u"
+        self._is_rounded = _is_rounded(counts)
         self.edge = self.prior.calibrated
         return self.frame
 
@@ -100,7 +101,7 @@ class EdgeLikelihood:
         self.likelihood.residual_of(self.frame, transform(self.likelihood.geometry, *eye_dpt))
         self.noise = self.likelihood.noise(self.frame)
         self._noise_dn2 = noise_power(self.noise, self.frame, self.likelihood.sample_weights)
-        self.dithered_dn = self.noise.dithered_dn(self.grid.n) if self._is_integer else 0.0
+        self.dithered_dn = self.noise.dithered_dn(self.grid.n) if self._is_rounded else 0.0
 
     def fit_smooth(self, eye_dpt: Floats) -> float:
         """Fit the smooth part within the present edge through the PSF of an eye; return its mean level in DN."""
@@ -178,3 +179,12 @@ class EdgeLikelihood:
         """Return the present edge in degrees, with the sd of the diameter from the linear model."""
         radius_sd_samples = 0.0 if model is None else float(np.linalg.inv(model.matrix)[0, 0] ** 0.5)
         return self.prior.in_degrees(self.edge, radius_sd_samples)
+
+
+def _is_rounded(counts: Pixels) -> bool:
+    """Return True for counts as a converter gives them: whole numbers, also in a float frame with missing pixels."""
+    if counts.dtype.kind == "u":
+        return True
+    some = counts[::ROUNDING_STEP, ::ROUNDING_STEP]
+    some = some[np.isfinite(some)]
+    return some.size > 0 and bool((some == np.rint(some)).all())
