@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from device.values import Sensor
 
-DITHERING_SD = 0.4  # counts
+DITHERING_SD = 0.5  # counts
 LEAST_DN2 = 1e-20  # lower limit against a division by 0 for a black frame; float frames may be tiny
 
 
@@ -23,7 +23,7 @@ class Noise:
         """Return the light in DN from which on a pixel's noise dithers the rounding of its counts, for n x n pixels.
 
         Rounding shifts the mean of counts with a noise of sd s by up to exp(-2 pi^2 s^2) / pi (Widrow and Kollar 2008):
-        by 0.013 counts where s is DITHERING_SD, and to 0 a light of a tenth of a count where s is small.
+        by 0.002 counts where s is DITHERING_SD, and to 0 a light of a tenth of a count where s is small.
         """
         pixel, rest_dn2 = n * n, max(self.floor_dn2 * n * n - 1 / 12, 0.0)
         return max(DITHERING_SD**2 - rest_dn2, 0.0) / (self.per_dn * pixel) if self.per_dn > 0 else 0.0
