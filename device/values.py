@@ -305,6 +305,9 @@ class Report:
     psf_scale: float = 1.0
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
+    psf_cylinder: dict[str, float | None] | None = None
+    """Cylinder by which the PSF was warped beside its scale, and the gain of the picture; null without one."""
+
     refraction_dpt: dict[str, float | str | None] | None = None
     """Refraction of the eye as spectacle correction in dpt, negative for myopia; null without a known geometry."""
 

@@ -60,6 +60,8 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
         del entries["frames"]
     if not made.channels:
         del entries["channels"]
+    if made.psf_cylinder is None:
+        del entries["psf_cylinder"]
     if not light.limits_unchecked:
         del entries["limits_unchecked"]
     if report.moved:
@@ -167,6 +169,7 @@ def _reconstruction(entries: JsonObject) -> Report:
         seconds=_checked(entries, "seconds", _numbers, {}),
         psf_index=_lenient(entries, "psf_index", _whole, 0),
         psf_scale=_lenient(entries, "psf_scale", _number, 1.0),
+        psf_cylinder=_lenient(entries, "psf_cylinder", _figures, None),
         refraction_dpt=_checked(entries, "refraction_dpt", _refraction, None),
         regularisation=_lenient(entries, "regularisation", _copied, {}),
         noise_dn=_lenient(entries, "noise_dn", _number, None),
@@ -308,6 +311,11 @@ def _whole(value: object) -> int:
 def _numbers(value: object) -> dict[str, float]:
     """Return the numbers of an object by name; null is no number and omitted, ValueError for another type."""
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
+
+
+def _figures(value: object) -> dict[str, float | None]:
+    """Return the numbers and nulls of an object by name; ValueError for another type."""
+    return {name: None if one is None else _number(one) for name, one in _object(value).items()}
 
 
 def _refraction(value: object) -> dict[str, float | str | None]:

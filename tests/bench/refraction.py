@@ -3,11 +3,13 @@
 Frames of photographs behind the textbook optics (`tests/textbook`), M from -6 to 6 dpt, full and a fifth of the light.
 Half of them have a field edge that deviates from the calibration: 0.2 deg too large, 0.1 deg too small, 0.1 deg off
 centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope reconstruct`, and its
-report is scored. Exit status 1 if a line fails.
+report is scored. `picture` measures what the PSF with the cylinder gains, `time` the processor time of the estimates.
+Exit status 1 if a line fails.
 """
 
 import argparse
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,9 +18,11 @@ import numpy as np
 from PIL import Image as Photograph
 
 from device.clock import SystemClock
+from device.recon.estimation.refraction import Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
+from device.recon.model.grid import disc
 from device.recon.reconstructor import Reconstructor
-from device.values import Calibration, Geometry, Psf, Sensor
+from device.values import Calibration, Geometry, Image, Psf, Reconstruction, Sensor
 from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees, photographed
 from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
 
@@ -240,11 +244,15 @@ def head_of(case: Case) -> int:
 @cache
 def calibrated(camera: Camera, field_deg: float, head: int) -> Reconstructor:
     """Return the reconstructor of `diffuscope reconstruct` for a head."""
+    return Reconstructor(calibration_of(camera, field_deg, head), camera.shape, PLANNER, SystemClock(), timed=False)
+
+
+def calibration_of(camera: Camera, field_deg: float, head: int) -> Calibration:
+    """Return the calibration of a head with this camera and field."""
     optics = Optics(PITCH_UM[camera])
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, 2.0**camera.bits - 1)
     geometry = Geometry(optics.pitch_um, optics.distance_um, optics.magnification)
-    calibration = Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
-    return Reconstructor(calibration, camera.shape, PLANNER, SystemClock(), timed=False)
+    return Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
 
 
 def scene_of(case: Case, data: Path) -> tuple[Plane, Plane, Plane]:
@@ -313,18 +321,137 @@ def judge_faults(seed: int, count: int, data: Path) -> bool:
     return holds
 
 
+CYLINDERS_DPT = (0.0, -1.0, -2.0, -4.0)
+LEAST_GAIN_DB = 0.1  # mean, by a cylinder of -2 dpt
+
+
+def astigmatic_cases(camera: Camera, field_deg: float, seed: int) -> Iterator[Case]:
+    """Yield one case for each photograph, cylinder and light: exact edge, M from -4 to 4 dpt, any axis."""
+    rng = np.random.default_rng((seed, camera.bits, round(10 * field_deg)))
+    for photo in PHOTOGRAPHS[:4]:
+        for cylinder_dpt in CYLINDERS_DPT:
+            for light in (1.0, 0.2):
+                turn, m_dpt = 2 * rng.uniform(0, np.pi), float(rng.uniform(-4, 4))
+                j0_dpt, j45_dpt = (-cylinder_dpt / 2 * float(part) for part in (np.cos(turn), np.sin(turn)))
+                eye = (m_dpt, j0_dpt, j45_dpt)
+                yield Case(camera, field_deg, FieldEdge(field_deg), eye, photo, light, int(rng.integers(2**31)))
+
+
+def psnr_db(case: Case, picture: Image, truth: Plane) -> float:
+    """Return the PSNR of a picture within 0.7 degrees of the field's edge, after the best scale and offset."""
+    shape = case.camera.shape
+    radius_px = (case.field_deg / 2 - 0.7) * Optics(PITCH_UM[case.camera]).px_per_deg
+    inside = disc(shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), radius_px) > 0.5
+    true = blurred(truth, np.pad(np.ones((1, 1)), 1), shape)[inside]
+    columns = np.stack([picture[inside].astype(np.float64), np.ones(true.size)], axis=1)
+    error = columns @ np.linalg.lstsq(columns, true, rcond=None)[0] - true
+    return float(10 * np.log10(true.max() ** 2 / np.mean(error**2)))
+
+
+def picture_gain(case: Case, data: Path) -> tuple[float, float | None]:
+    """Return the gain of the picture in dB by the cylinder, and the predicted one; None if the PSF has no cylinder."""
+    retina, right_deg, down_deg = scene_of(case, data)
+    scene = retina * case.edge.light(right_deg, down_deg)
+    counts, own = expose(case, scene), calibrated(case.camera, case.field_deg, head_of(case))
+    made = own(counts)
+    *_, without = own.steps(counts, refraction=own.begin_refraction(counts, with_cylinder=False))
+    assert isinstance(without, Reconstruction)
+    stated = made.report.psf_cylinder
+    gain_db = psnr_db(case, made.picture, scene) - psnr_db(case, without.picture, scene)
+    return gain_db, None if stated is None else stated["gain_db"]
+
+
+def judge_pictures(seed: int, data: Path) -> bool:
+    """Print the gain by the cylinder for each sensor, cylinder and light; return True if the mean at -2 dpt holds."""
+    gains_db: list[float] = []
+    for camera, field_deg in ((IMX296, 33.4), (IMX296, 45.0), (QUANTALUX, 33.4)):
+        found: dict[tuple[float, float], list[tuple[float, float | None]]] = {}
+        for case in astigmatic_cases(camera, field_deg, seed):
+            cylinder_dpt = -2 * float(np.hypot(*case.eye[1:]))
+            found.setdefault((round(cylinder_dpt, 1), case.light), []).append(picture_gain(case, data))
+        for (cylinder_dpt, light), pairs in found.items():
+            measured, predicted = (" ".join("   -" if one is None else f"{one:+.2f}" for one in part) for part in zip(
+                *pairs, strict=True
+            ))  # fmt: skip
+            print(
+                f"{camera.bits} bit {field_deg:g} deg, cylinder {cylinder_dpt:+.0f} dpt, light {light:g}: gain "
+                f"{measured} dB, predicted {predicted}", flush=True,
+            )  # fmt: skip
+            gains_db += [gain for gain, _ in pairs if cylinder_dpt == CYLINDERS_DPT[2]]
+    mean_db = float(np.mean(gains_db))
+    holds = mean_db >= LEAST_GAIN_DB
+    print(f"{'ok  ' if holds else 'MISS'} picture: mean gain {mean_db:+.2f} dB at {CYLINDERS_DPT[2]:g} dpt", flush=True)
+    return holds
+
+
+REPEATS = 5
+MOST_CYLINDER_RATIO = 3.0
+
+
+def processor_s(act: Callable[[], object]) -> float:
+    """Return the median processor time of a call, of all threads of this process."""
+    times = []
+    for _ in range(REPEATS):
+        begin_s = time.process_time()
+        act()
+        times.append(time.process_time() - begin_s)
+    return float(np.median(times))
+
+
+def times_s(case: Case, planner: Planner, data: Path) -> tuple[float, float, float]:
+    """Return the processor times of a planned FFT pair of the sensor, of M with edge, and of the cylinder."""
+    retina, right_deg, down_deg = scene_of(case, data)
+    counts = expose(case, retina * case.edge.light(right_deg, down_deg))
+    calibration = calibration_of(case.camera, case.field_deg, head_of(case))
+    estimator, pair = RefractionEstimator(calibration, case.camera.shape, planner, 0), planner.plan(case.camera.shape)
+    found = estimator.find(counts)
+    assert isinstance(found, Refraction), found.reason
+    estimator.add_cylinder(found)  # compiles
+    return (
+        processor_s(lambda: (pair.forward(), pair.inverse())), processor_s(lambda: estimator.find(counts)),
+        processor_s(lambda: estimator.add_cylinder(found)),
+    )  # fmt: skip
+
+
+def judge_times(seed: int, data: Path) -> bool:
+    """Print the processor time of M with edge and of the cylinder beside that of a planned full-size FFT pair.
+
+    Return True if the cylinder takes at most three times M.
+    """
+    holds, planner = True, Planner(None)
+    for name, group in GROUPS.items():
+        if group.cylinder_dpt:
+            continue
+        for case in list(cases(group.camera, group.field_deg, 4, seed, 1.0, name="time"))[1::2]:
+            pair_s, m_s, cylinder_s = times_s(case, planner, data)
+            is_fast = cylinder_s <= MOST_CYLINDER_RATIO * m_s
+            holds &= is_fast
+            print(
+                f"{'ok  ' if is_fast else 'MISS'} {name} {case.photo[-14:]} light {case.light:g}: pair {pair_s:.3f} s, "
+                f"M with edge {m_s:.3f} s ({m_s / pair_s:.1f} pairs), cylinder {cylinder_s:.3f} s "
+                f"({cylinder_s / pair_s:.1f} pairs, {cylinder_s / m_s:.1f} of M; at most {MOST_CYLINDER_RATIO:g})",
+                flush=True,
+            )
+    return holds
+
+
 def main() -> None:
     """Score the groups; exit status 1 if a line fails."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder with fundus/")
     parser.add_argument("--frames", type=int, default=60, help="frames of each group")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="*", choices=[*GROUPS, "faults"], default=[*GROUPS, "faults"])
+    others: dict[str, Callable[[], bool]] = {
+        "faults": lambda: judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data),
+        "picture": lambda: judge_pictures(arguments.seed, arguments.data),
+        "time": lambda: judge_times(arguments.seed, arguments.data),
+    }
+    parser.add_argument("--only", nargs="*", choices=[*GROUPS, *others], default=[*GROUPS, *others])
     arguments = parser.parse_args()
     held = []
     for name in arguments.only:
-        if name == "faults":
-            held.append(judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data))
+        if name in others:
+            held.append(others[name]())
             continue
         group, found = GROUPS[name], []
         for case in cases(group.camera, group.field_deg, arguments.frames, arguments.seed, group.cylinder_dpt):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.psf_warp import Wavefront, transform
 from device.recon.estimation.refraction_crop import CropRefinement
 from device.recon.estimation.refraction_cylinder import find_cylinder
 from device.recon.estimation.refraction_edge import EdgeLikelihood
@@ -49,6 +49,8 @@ MOST_SD_DPT = 1.5
 MOST_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
+LEAST_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains 0.02 to 0.13 dB, and as |J|^2
+
 Floats = NDArray[np.float64]
 
 
@@ -60,6 +62,16 @@ class Cylinder:
     j0_sd_dpt: float
     j45_dpt: float
     j45_sd_dpt: float
+
+    @property
+    def in_doubt(self) -> bool:
+        """True if the PSF of the mean sphere is to be used: |J| < 0.25 dpt, or |J|^2 < 2 (sd_J0^2 + sd_J45^2).
+
+        A picture loses in proportion to the squared error of (J0, J45). The expected error is sd_J0^2 + sd_J45^2 with
+        the estimate, and |J|^2 of the estimate less as much without a cylinder.
+        """
+        size_dpt, sd_dpt = np.hypot(self.j0_dpt, self.j45_dpt), np.hypot(self.j0_sd_dpt, self.j45_sd_dpt)
+        return bool(size_dpt < max(LEAST_CYLINDER_DPT, 2**0.5 * sd_dpt))
 
 
 @dataclass(frozen=True)
@@ -85,6 +97,14 @@ class Refraction:
     def in_doubt(self) -> bool:
         """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 `sd_dpt`)."""
         return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
+
+    @property
+    def psf_wavefront(self) -> Wavefront | None:
+        """Wavefront of the PSF of the picture, with the cylinder if it is not in doubt; None for the stored PSF."""
+        cylinder = self.cylinder
+        if cylinder is not None and not cylinder.in_doubt:
+            return Wavefront(self.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt)
+        return None if self.in_doubt else Wavefront(self.sphere_dpt)
 
 
 @dataclass(frozen=True)
@@ -222,10 +242,10 @@ class RefractionEstimator:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
         return 1 - self.geometry.scale_per_dpt * m_dpt
 
-    def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
-        """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
+    def otf(self, grid: Grid, eye: Wavefront) -> Spectrum:
+        """Return the OTF of an eye on a grid, complex64 (rows, cols//2 + 1)."""
         otf = self._edges.likelihood.interpolated_otf
-        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, *eye))
 
 
 class Search:
