@@ -6,7 +6,7 @@ only if its measured cost fits into the time that is left.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, isinf
 from threading import Lock
@@ -37,7 +37,7 @@ from device.recon.estimation.refraction import (
     RefractionEstimator,
     can_estimate_refraction,
 )
-from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction_notation import report_of, scatter_of
 from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -241,7 +241,7 @@ class Reconstructor:
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
         rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
-        refraction: RefractionTask | None = None,
+        refraction: RefractionTask | None = None, others: Sequence[Pixels] = (),
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -251,15 +251,16 @@ class Reconstructor:
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
         sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
-        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun. FrameError for
-        another shape than that of the sensor, or if too many pixels are missing (`Preprocessor`).
+        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun, and `others` are the
+        other frames of its burst, which join the refraction if time is left. FrameError for another shape than that of
+        the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run, task = _Run(self, counts, dark, deadline, rounds), refraction
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick and refract:
-                task = self._estimate_refraction(run, task)
+                task = self._estimate_refraction(run, task, others)
             if not run.has_time_for(stage):
                 break
             pauses = stage is self.stages[-1] and len(self.stages) > 1
@@ -272,8 +273,7 @@ class Reconstructor:
         solve_s = solved_s - begin_s - run.refraction_s - run.cylinder_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
         if task is not None and isinstance(run.refraction, Refraction):
-            if task.is_done or run.fits(self._cylinder_s):
-                self._take_cylinder(run, task)
+            self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
             seconds["cylinder"] = run.cylinder_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
@@ -289,10 +289,13 @@ class Reconstructor:
         frame = counts, dark, defects
         return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder)
 
-    def _estimate_refraction(self, run: "_Run", task: RefractionTask | None) -> RefractionTask | None:
+    def _estimate_refraction(
+        self, run: "_Run", task: RefractionTask | None, others: Sequence[Pixels]
+    ) -> RefractionTask | None:
         """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
 
-        `task`: that of the frame, if it has begun. Return the task, None without a refractor or without time.
+        `task`: that of the frame, if it has begun; `others`: the other frames of its burst. Return the task, None
+        without a refractor or without time.
         """
         begin_s, eye = self.clock.now_s(), None
         if self.refractor is None:
@@ -302,10 +305,11 @@ class Reconstructor:
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
+            if others and with_cylinder:
+                task.join([plane(one, 0) for one in others])
             run.refraction = found = task.found()
             self._find_cost.add(task.find_s)
-            if run.deadline is None or task.is_done:
-                self._take_cylinder(run, task)
+            self._take_cylinder(run, task, wait=run.deadline is None)
             best = run.refraction if isinstance(run.refraction, Refraction) else found
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
         self._refocus(eye)
@@ -314,15 +318,18 @@ class Reconstructor:
 
     @property
     def _cylinder_s(self) -> float:
-        """Estimated duration of the search for a cylinder in seconds."""
+        """Estimated duration of the search for a cylinder and of the joining with other frames in seconds."""
         return max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
 
-    def _take_cylinder(self, run: "_Run", task: RefractionTask) -> None:
-        """Wait for the refraction of the run with its cylinder; add the time to `cylinder_s`."""
+    def _take_cylinder(self, run: "_Run", task: RefractionTask, wait: bool) -> None:
+        """Set the refraction of the run to that with its cylinder, joined with other frames, as far as it is known.
+
+        With `wait` until all is known; `cylinder_s` grows by this time.
+        """
         begin_s = self.clock.now_s()
-        run.refraction = task.whole()
-        if task.cylinder_s > 0:
-            self._cylinder_cost.add(task.cylinder_s)
+        run.refraction = task.whole() if wait else task.latest()
+        if task.is_done and task.cylinder_s > 0:
+            self._cylinder_cost.add(task.cylinder_s + task.join_s)
         run.cylinder_s += self.clock.now_s() - begin_s
 
     def _refocus(self, eye: Wavefront | None) -> None:
@@ -370,7 +377,7 @@ class Reconstructor:
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=run.rounds_done, stopped=run.stopped, seconds=seconds,
             psf_index=self.psf_index, psf_scale=psf_scale, psf_cylinder=self._psf_cylinder(run),
-            refraction_dpt=None if eye is None else report_of(eye),
+            refraction_dpt=None if eye is None else report_of(eye), refraction_scatter=scatter_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin,
             residual=diagnostics.residual,

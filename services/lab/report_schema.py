@@ -48,6 +48,14 @@ PSF_CYLINDER: Mapping[str, str] = {
         "prior; not measured. Pictures gained about twice as much in tests. Null for a method without this prior."
     ),
 }
+SCATTER: Mapping[str, str] = {
+    "frames": "Number of frames of the burst whose refraction was compared.",
+    "sd_dpt": "Standard deviation of the mean sphere between these frames in dpt.",
+    "stated_sd_dpt": (
+        "Standard deviation that one frame states in dpt. If `sd_dpt` is larger, `sd` of the refraction is `sd_dpt`."
+    ),
+    "chi2": "Sum of the squared deviations over the stated variance; `frames` - 1 is expected at most.",
+}
 REGULARISATION: Mapping[str, str] = {
     "tau": "Weight of the total variation (methods variation and open).",
     "misfit": "Robust rms of the residual in units of the noise, from which tau follows (method open).",
@@ -78,7 +86,12 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
-LATER = ("frames", "channels", "psf_cylinder")  # fields of `Report` that earlier releases did not write
+LATER = (
+    "frames",
+    "channels",
+    "psf_cylinder",
+    "refraction_scatter",
+)  # fields of `Report` that earlier releases did not write
 FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
@@ -246,6 +259,7 @@ def report_schema() -> dict[str, JsonValue]:
         },
         "psf_cylinder": {"type": ["object", "null"], "properties": _each(PSF_CYLINDER, _figure)},
         "refraction_dpt": {"type": ["object", "null"], "properties": _refraction()},
+        "refraction_scatter": {"type": ["object", "null"], "properties": _each(SCATTER, _number)},
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
         "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},

@@ -60,8 +60,9 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
         del entries["frames"]
     if not made.channels:
         del entries["channels"]
-    if made.psf_cylinder is None:
-        del entries["psf_cylinder"]
+    for name in ("psf_cylinder", "refraction_scatter"):
+        if entries[name] is None:
+            del entries[name]
     if not light.limits_unchecked:
         del entries["limits_unchecked"]
     if report.moved:
@@ -171,6 +172,7 @@ def _reconstruction(entries: JsonObject) -> Report:
         psf_scale=_lenient(entries, "psf_scale", _number, 1.0),
         psf_cylinder=_lenient(entries, "psf_cylinder", _figures, None),
         refraction_dpt=_checked(entries, "refraction_dpt", _refraction, None),
+        refraction_scatter=_lenient(entries, "refraction_scatter", _numbers, None),
         regularisation=_lenient(entries, "regularisation", _copied, {}),
         noise_dn=_lenient(entries, "noise_dn", _number, None),
         residual=_lenient(entries, "residual", _number, None),

@@ -3,7 +3,8 @@
 Frames of photographs behind the textbook optics (`tests/textbook`), M from -6 to 6 dpt, full and a fifth of the light.
 Half of them have a field edge that deviates from the calibration: 0.2 deg too large, 0.1 deg too small, 0.1 deg off
 centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope reconstruct`, and its
-report is scored. `picture` measures what the PSF with the cylinder gains, `time` the processor time of the estimates.
+report is scored. `picture` measures what the PSF with the cylinder gains, `bursts` the refraction of several frames and
+its scatter between them, `time` the processor time of the estimates.
 Exit status 1 if a line fails.
 """
 
@@ -255,23 +256,26 @@ def calibration_of(camera: Camera, field_deg: float, head: int) -> Calibration:
     return Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
 
 
-def scene_of(case: Case, data: Path) -> tuple[Plane, Plane, Plane]:
+def scene_of(case: Case, data: Path, shift_deg: tuple[float, float] = (0.0, 0.0)) -> tuple[Plane, Plane, Plane]:
     """Return the retina of a case without its edge, and the field angles (right, down) in degrees."""
     optics = Optics(PITCH_UM[case.camera])
     reach_deg = case.edge.diameter_deg + case.edge.width_deg + 3
     right_deg, down_deg = degrees(optics, round(reach_deg * optics.px_per_deg / 2) * 2)
     zoom = case.zoom * case.field_deg / float(np.ptp(right_deg))
     place = data / "fundus" / case.photo
-    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, (0, 0)), right_deg, down_deg
+    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, shift_deg), right_deg, down_deg
 
 
-def expose(case: Case, scene: Plane, exposure: float = PEAK) -> Counts:
-    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light."""
+def expose(case: Case, scene: Plane, exposure: float = PEAK, number: int = 1) -> Counts:
+    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light.
+
+    `number`: that of the frame, which selects its noise.
+    """
     optics = Optics(PITCH_UM[case.camera])
     psf = caustic(optics, surface(optics.pitch_um, head_of(case)), Prescription.of_power_vector(*case.eye))
     light = blurred(scene, psf, case.camera.shape)
     electrons = light / max(float(light.max()), 1e-9) * exposure * case.camera.full_well_e * case.light
-    return case.camera.read(electrons, np.random.default_rng((case.seed, 1)))
+    return case.camera.read(electrons, np.random.default_rng((case.seed, number)))
 
 
 def faults(seed: int, count: int, data: Path) -> Iterator[tuple[str, Scored]]:
@@ -384,6 +388,60 @@ def judge_pictures(seed: int, data: Path) -> bool:
     return holds
 
 
+BURST = 4  # frames
+DRIFT_DEG, ACCOMMODATION_DPT = 0.15, 0.3  # sd of each frame
+CHI2_OF_ONE_PERCENT = 11.34  # of BURST - 1 degrees of freedom
+MOST_ALARMS = 0.1  # share of the bursts of an eye that does not accommodate
+
+
+def burst_of(case: Case, data: Path, accommodation_dpt: float) -> tuple[list[Counts], Plane]:
+    """Return the frames of a moving eye and their true M in dpt; M of each has this sd around that of the case."""
+    rng = np.random.default_rng((case.seed, 2))
+    frames, spheres_dpt = [], case.eye[0] + accommodation_dpt * rng.standard_normal(BURST)
+    for k, sphere_dpt in enumerate(spheres_dpt):
+        right, down = DRIFT_DEG * rng.standard_normal(2)
+        retina, right_deg, down_deg = scene_of(case, data, (float(right), float(down)))
+        moved = replace(case, eye=(float(sphere_dpt), *case.eye[1:]))
+        frames.append(expose(moved, retina * case.edge.light(right_deg, down_deg), number=k + 3))
+    return frames, spheres_dpt
+
+
+def judge_bursts(seed: int, count: int, data: Path) -> bool:
+    """Print errors of M of the first frame and of the burst, and the scatter, of `count` bursts of each sensor.
+
+    Return True if at most MOST_ALARMS of the eyes that do not accommodate have a chi^2 beyond 1 % of its values.
+    """
+    alarms: list[bool] = []
+    for name in ("imx296-33", "imx296-45", "paper-33"):
+        group = GROUPS[name]
+        for case in list(cases(group.camera, group.field_deg, 2 * count, seed, 0.5, name="burst"))[1::2]:
+            for accommodation_dpt in (0.0, ACCOMMODATION_DPT):
+                frames, spheres_dpt = burst_of(case, data, accommodation_dpt)
+                estimator = calibrated(case.camera, case.field_deg, head_of(case)).refractor
+                assert estimator is not None
+                found = estimator.find(frames[0])
+                first = estimator.add_cylinder(found) if isinstance(found, Refraction) else found
+                whole = estimator.join(first, frames, None) if isinstance(first, Refraction) else first
+                if not (isinstance(first, Refraction) and isinstance(whole, Refraction) and whole.scatter is not None):
+                    print(f"{name} light {case.light:g}: refused", flush=True)
+                    continue
+                if accommodation_dpt == 0:
+                    alarms.append(whole.scatter.chi2 > CHI2_OF_ONE_PERCENT)
+                print(
+                    f"{name} light {case.light:g}: error of the first {-first.sphere_dpt - spheres_dpt[0]:+.3f} (sd "
+                    f"{first.sd_dpt:.3f}), of the burst {-whole.sphere_dpt - spheres_dpt.mean():+.3f} (sd "
+                    f"{whole.sd_dpt:.3f}) dpt; scatter true {np.std(spheres_dpt, ddof=1):.3f}, found "
+                    f"{whole.scatter.sd_dpt:.3f} dpt, chi2 {whole.scatter.chi2:.1f}", flush=True,
+                )  # fmt: skip
+    share = float(np.mean(alarms))
+    holds = share <= MOST_ALARMS
+    print(
+        f"{'ok  ' if holds else 'MISS'} bursts: {len(alarms)} of one M, {share:.0%} beyond chi2 (at most 10)",
+        flush=True,
+    )
+    return holds
+
+
 REPEATS = 5
 MOST_CYLINDER_RATIO = 3.0
 
@@ -444,6 +502,7 @@ def main() -> None:
     others: dict[str, Callable[[], bool]] = {
         "faults": lambda: judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data),
         "picture": lambda: judge_pictures(arguments.seed, arguments.data),
+        "bursts": lambda: judge_bursts(arguments.seed, max(arguments.frames // 12, 1), arguments.data),
         "time": lambda: judge_times(arguments.seed, arguments.data),
     }
     parser.add_argument("--only", nargs="*", choices=[*GROUPS, *others], default=[*GROUPS, *others])

@@ -19,8 +19,8 @@ from tests.journey.conftest import Diffuscope
 
 REPORT_KEYS = {  # the public interface
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
-    "regularisation", "noise_dn", "residual", "quality", "warnings", "solved", "given", "psf_channels", "bayer",
-    "frames", "channels",
+    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "solved", "given",
+    "psf_channels", "bayer", "frames", "channels",
 }  # fmt: skip
 
 

@@ -47,7 +47,10 @@ FIGURES = (
     "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
 )  # fmt: skip
 CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
-WARPED = {"psf_cylinder": {"j0_dpt": -1.0, "j45_dpt": 0.25, "gain_db": None}}
+WARPED = {
+    "psf_cylinder": {"j0_dpt": -1.0, "j45_dpt": 0.25, "gain_db": None},
+    "refraction_scatter": {"frames": 4, "sd_dpt": 0.05, "stated_sd_dpt": 0.04, "chi2": 4.6875},
+}
 REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
     SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,

@@ -28,7 +28,7 @@ from services.records.capture import Capture
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
 DESIGNED = [  # public interface: keys of report.json
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
-    "regularisation", "noise_dn", "residual", "quality", "warnings", "frames", "channels",
+    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "frames", "channels",
 ]  # fmt: skip
 
 
