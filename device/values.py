@@ -321,8 +321,16 @@ class Report:
     psf_scale: float = 1.0
     """Isotropic scale of the stored PSF that explains the frame; 1: as calibrated."""
 
+    psf_cylinder: dict[str, float | None] | None = None
+    """Cylinder by which the PSF was warped beside its scale, and the predicted gain of the picture; null without one.
+    Not in earlier releases."""
+
     refraction_dpt: dict[str, float | str | None] | None = None
     """Refraction of the eye as spectacle correction in dpt, negative for myopia; null without a known geometry."""
+
+    refraction_scatter: dict[str, float] | None = None
+    """Scatter of the mean sphere between the frames of a burst; null for less than three frames. Not in earlier
+    releases."""
 
     regularisation: dict[str, Any] = field(default_factory=dict)
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""

@@ -50,10 +50,10 @@ def caustic() -> Image:
 PSF = Psf(caustic())
 
 
-def frame(image: Image, peak_e: float, seed: int) -> Counts:
-    """Return the counts of an exposure whose brightest pixel holds `peak_e` electrons."""
+def frame(image: Image, peak_e: float, seed: int, psf: Psf = PSF) -> Counts:
+    """Return the counts of an exposure through `psf` whose brightest pixel holds `peak_e` electrons."""
     size = [fft.next_fast_len(n + 90, real=True) for n in SHAPE]
-    blurred = fft.irfft2(fft.rfft2(image, size) * fft.rfft2(PSF.pixels, size), size)
+    blurred = fft.irfft2(fft.rfft2(image, size) * fft.rfft2(psf.pixels, size), size)
     light = np.maximum(blurred[40 : 40 + SHAPE[0], 40 : 40 + SHAPE[1]], 0)
     random = np.random.default_rng(seed)
     electrons = random.poisson(light * peak_e / light.max()) + random.normal(0, READ_E, SHAPE)

@@ -103,7 +103,7 @@ class BurstReconstructor:
         if len(used) == 1:
             yield from run.solve_one(frames[used[0]], dark, uses, used[0], simulated, tasks.get(used[0]))
         else:
-            yield from run.solve_joined(frames[used[0]], dark, saturated, simulated, tasks.get(used[0]))
+            yield from run.solve_joined([frames[k] for k in used], dark, saturated, simulated, tasks.get(used[0]))
 
     def _quick_look(
         self, counts: Pixels, dark: Pixels | None, prepared: PreparedFrame | None, simulated: bool
@@ -158,16 +158,17 @@ class _Run:
             self._deadline = None if self._deadline is None else self._deadline.later(begin_s - paused_s)
 
     def solve_joined(
-        self, counts: Pixels, dark: Pixels | None, saturated: float | None, simulated: bool,
+        self, used: Sequence[Pixels], dark: Pixels | None, saturated: float | None, simulated: bool,
         refraction: RefractionTask | None,
     ) -> Iterator[Step]:  # fmt: skip
-        """Yield the steps of the picture of the joined frame; the arguments are those of its first frame."""
+        """Yield the steps of the picture of the joined frames `used`; `saturated` and `refraction` are the first's."""
         owner, joined = self._owner, self.joined
         assert joined is not None
         total, is_solved = joined.counts * np.float32(joined.light), False
         for step in owner.single.steps(
-            counts, dark, simulated=simulated, deadline=self._deadline, joined=total, refraction=refraction
-        ):
+            used[0], dark, simulated=simulated, deadline=self._deadline, joined=total, refraction=refraction,
+            others=used[1:],
+        ):  # fmt: skip
             if isinstance(step, RoundDone):
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:

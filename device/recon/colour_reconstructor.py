@@ -13,13 +13,13 @@ import numpy as np
 from device.clock import Deadline
 from device.errors import FrameError
 from device.recon.colour import ColourPicture, join_colours
-from device.recon.estimation.psf_warp import InterpolatedOtf
+from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, transform
 from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, Step
 from device.recon.white_balance import balanced, white_ratios
-from device.values import ChannelUse, Colour, Image, Reconstruction
+from device.values import ChannelUse, Colour, Geometry, Image, Reconstruction, Report
 
 NO_TIME = "the time budget left no time for this colour"
 NOT_REGISTERED = "{} could not be registered: no shift matches better than chance. It is shown where it was taken."
@@ -74,11 +74,12 @@ class ColourReconstructor:
         """
         run = _Run(self, deadline)
         made = yield from run.green(green)
+        eye = psf_wavefront(made.report, self._calibration.geometry)
         pictures: dict[Colour, Image] = {"green": made.picture}
         reasons = dict(missing or {})
         for colour, counts in frames.items():
             try:
-                solved = yield from run.solve(colour, counts, dark, made.report.psf_scale)
+                solved = yield from run.solve(colour, counts, dark, eye)
             except FrameError as error:
                 reasons[colour] = error.message
                 continue
@@ -111,8 +112,8 @@ class ColourReconstructor:
         self.join_cost.add(self.clock.now_s() - begin_s)
         return replace(joined, picture=picture, channels=channels)
 
-    def refocus(self, colour: Colour, scale: float) -> None:
-        """Use the PSF of a colour stretched by `scale` in its last stage; 1 selects the stored PSF.
+    def refocus(self, colour: Colour, eye: Wavefront | None) -> None:
+        """Use the PSF of a colour for `eye` in its last stage; None selects the stored PSF.
 
         A colour that shares green's reconstructor has the PSF of the picture before.
         """
@@ -120,9 +121,22 @@ class ColourReconstructor:
             return
         stage = self.others[colour].stages[-1]
         otf = stage.model.stored
-        if scale != 1:
-            otf = self._otfs[colour].on_grid(stage.grid.shape, stage.grid.n, scale * np.eye(2))
-        stage.refocus(otf, scale)
+        if eye is not None and self._calibration.geometry is not None:
+            otf = self._otfs[colour].on_grid(
+                stage.grid.shape, stage.grid.n, transform(self._calibration.geometry, *eye)
+            )
+        stage.refocus(otf, eye)
+
+
+def psf_wavefront(report: Report, geometry: Geometry | None) -> Wavefront | None:
+    """Return the wavefront of the PSF that a report states; None for the stored PSF."""
+    if geometry is None or (report.psf_scale == 1 and report.psf_cylinder is None):
+        return None
+    m_dpt, cylinder = (1 - report.psf_scale) / geometry.scale_per_dpt, report.psf_cylinder
+    if cylinder is None:
+        return Wavefront(m_dpt)
+    j0_dpt, j45_dpt = (float(cylinder[key] or 0.0) for key in ("j0_dpt", "j45_dpt"))  # of the correcting lens
+    return Wavefront(m_dpt, -j0_dpt, j45_dpt)
 
 
 class _Run:
@@ -140,9 +154,9 @@ class _Run:
         raise AssertionError("a reconstruction ends with a picture")
 
     def solve(
-        self, colour: Colour, counts: Pixels, dark: Pixels | None, scale: float
+        self, colour: Colour, counts: Pixels, dark: Pixels | None, eye: Wavefront | None
     ) -> Generator[Step, None, Image | None]:
-        """Yield a pause after each round of one colour, and return its picture; its PSF is stretched by `scale`.
+        """Yield a pause after each round of one colour, and return its picture; its PSF is that of `eye`.
 
         None if no time is left for it. FrameError for a useless frame.
         """
@@ -153,7 +167,7 @@ class _Run:
             owner.join_cost.halve_maximum()
             return None
         begin_s = owner.clock.now_s()
-        owner.refocus(colour, scale)
+        owner.refocus(colour, eye)
         deadline = None if self._deadline is None else self._deadline.later(-join_s)
         for step in one.steps(counts, dark, simulated=True, deadline=deadline, refract=False):
             if isinstance(step, RoundDone):

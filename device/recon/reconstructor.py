@@ -6,7 +6,7 @@ only if its measured cost fits into the time that is left.
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, isinf
 from threading import Lock
@@ -28,13 +28,16 @@ from device.recon.assessment.image_quality import (
 from device.recon.assessment.psf_consistency import Match, PsfConsistency
 from device.recon.estimation.corrected_refraction import corrected
 from device.recon.estimation.defective_pixels import DefectFinder
+from device.recon.estimation.power_law_prior import PowerLaw
+from device.recon.estimation.psf_gain import PsfGain
+from device.recon.estimation.psf_warp import Wavefront
 from device.recon.estimation.refraction import (
     NoRefraction,
     Refraction,
     RefractionEstimator,
     can_estimate_refraction,
 )
-from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction_notation import report_of, scatter_of
 from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.methods import DEFAULT, METHODS, Method, method_named
 from device.recon.model.fft_plans import Planner, Spectrum
@@ -133,7 +136,7 @@ class _Stage:
         self.recipe, self.is_closed_form = recipe, method.rounds == 0
         self.model = method.model(calibration, shape, recipe.bin, planner, index)
         self.grid = self.model.grid
-        self.scale = 1.0
+        self.eye: Wavefront | None = None  # of the PSF in use; None: the stored one
         self.solver: Solver = method.solver(self.model, calibration, planner, dict(recipe.settings))
         self.preparer = Preprocessor(calibration, self.grid, self.solver.input_buffer)
         self.joined_preparer = Preprocessor(without_sensor(calibration), self.grid, self.solver.input_buffer)
@@ -141,9 +144,9 @@ class _Stage:
         self.planes: Image = np.zeros((1, *self.grid.shape), np.float32)
         self.start_cost, self.round_cost, self.finish_cost = DurationEstimate(), DurationEstimate(), DurationEstimate()
 
-    def refocus(self, otf: Spectrum, scale: float) -> None:
-        """Use `otf`, the OTF of the PSF scaled by `scale`, from the next `solver.start` on; no-op if in use."""
-        self.scale = scale
+    def refocus(self, otf: Spectrum, eye: Wavefront | None) -> None:
+        """Use `otf`, the OTF of the PSF of `eye`, from the next `solver.start` on; no-op if in use."""
+        self.eye = eye
         if otf is not self.model.otf:
             self.model.refocus(otf)
             self.solver.refocus()
@@ -171,9 +174,10 @@ class Reconstructor:
     Not thread-safe: one thread at a time. `timed` measures the cost of every step on noise, before the first deadline;
     False saves this time where no deadline is used. `consistency` tests the PSF on each frame, outside the deadline
     (for files). `audience`: the reader of the warnings. With `refract`, and with known geometry and field, the
-    refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF scaled
+    refraction of the eye is estimated after the first stage (before a single one); the later stages use the PSF warped
     accordingly, or the stored PSF if there is no reliable estimate; `field_fixed` takes the field of the calibration as
-    exact. It is estimated in a thread; its cylinder, if it fits into the deadline, while the picture is solved.
+    exact. It is estimated in a thread; its cylinder, if it fits into the deadline, while the picture is solved. The PSF
+    of the picture has the cylinder only if that is known before the solution begins: a deadline does not wait for it.
     `methods`: the table in which the recipes' methods are looked up. SettingError if a bin is below 1, or for a method
     that the table does not have.
     """
@@ -200,6 +204,7 @@ class Reconstructor:
         self._refracted = self.stages[min(1, len(self.stages) - 1) :]  # the stages that use the PSF of the eye
         self._find_cost, self._refocus_cost = DurationEstimate(), DurationEstimate()
         self._cylinder_cost = DurationEstimate()
+        self._gain = None if self.refractor is None else PsfGain(self.stages[-1].model)
         self._consistency: PsfConsistency | None = None
         self._audience = audience
         self._warm_up(timed)
@@ -220,8 +225,8 @@ class Reconstructor:
             )
         self._find_cost, self._cylinder_cost = DurationEstimate(), DurationEstimate()
         self(noise, rounds=2)
-        for m_dpt in (1.0, None):
-            self._refocus(m_dpt)
+        for eye in (Wavefront(1.0), None):
+            self._refocus(eye)
 
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
@@ -236,7 +241,7 @@ class Reconstructor:
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
         rounds: int | None = None, quick: bool = False, joined: Image | None = None, refract: bool = True,
-        refraction: RefractionTask | None = None,
+        refraction: RefractionTask | None = None, others: Sequence[Pixels] = (),
     ) -> Iterator[Step]:  # fmt: skip
         """Yield the result of each stage, then the best picture that fits into `deadline`, with its report.
 
@@ -246,15 +251,16 @@ class Reconstructor:
         last one; the deadline moves by the time until the iteration continues, and meanwhile this reconstructor may be
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
         sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
-        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun. FrameError for
-        another shape than that of the sensor, or if too many pixels are missing (`Preprocessor`).
+        use the PSF of the picture before; `refraction` is the task of this frame, if it has begun, and `others` are the
+        other frames of its burst, which join the refraction if time is left. FrameError for another shape than that of
+        the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
         run, task = _Run(self, counts, dark, deadline, rounds), refraction
         begin_s = self.clock.now_s()
         for stage in self.stages[:1] if quick else self.stages:
             if stage is self._refracted[0] and not quick and refract:
-                task = self._estimate_refraction(run, task)
+                task = self._estimate_refraction(run, task, others)
             if not run.has_time_for(stage):
                 break
             pauses = stage is self.stages[-1] and len(self.stages) > 1
@@ -264,11 +270,11 @@ class Reconstructor:
         picture = to_sensor(run.done.picture, run.done.grid)
         finished_s = self.clock.now_s()
         run.done.finish_cost.add(finished_s - solved_s)
-        solve_s = solved_s - begin_s - run.refraction_s - run.between_s
+        solve_s = solved_s - begin_s - run.refraction_s - run.cylinder_s - run.between_s
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
         if task is not None and isinstance(run.refraction, Refraction):
-            self._wait_for_cylinder(run, task)
-            seconds["cylinder"] = self.clock.now_s() - finished_s
+            self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
+            seconds["cylinder"] = run.cylinder_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
     def begin_refraction(
@@ -283,12 +289,15 @@ class Reconstructor:
         frame = counts, dark, defects
         return RefractionTask(self.refractor, self._refraction_lock, self.clock, frame, with_cylinder)
 
-    def _estimate_refraction(self, run: "_Run", task: RefractionTask | None) -> RefractionTask | None:
+    def _estimate_refraction(
+        self, run: "_Run", task: RefractionTask | None, others: Sequence[Pixels]
+    ) -> RefractionTask | None:
         """Estimate the refraction if time is left; set the OTF of the later stages to it, or to the stored PSF's.
 
-        `task`: that of the frame, if it has begun. Return the task, None without a refractor or without time.
+        `task`: that of the frame, if it has begun; `others`: the other frames of its burst. Return the task, None
+        without a refractor or without time.
         """
-        begin_s = self.clock.now_s()
+        begin_s, eye = self.clock.now_s(), None
         if self.refractor is None:
             return None
         cost_s = self._find_cost.seconds + self._refocus_cost.seconds + run.cost_s(self._refracted[0])
@@ -296,35 +305,41 @@ class Reconstructor:
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
-            run.refraction = task.found()
+            if others and with_cylinder:
+                task.join([plane(one, 0) for one in others])
+            run.refraction = found = task.found()
             self._find_cost.add(task.find_s)
-        self._refocus(run.selected_dpt)
-        run.refraction_s = self.clock.now_s() - begin_s
+            self._take_cylinder(run, task, wait=run.deadline is None)
+            best = run.refraction if isinstance(run.refraction, Refraction) else found
+            eye = best.psf_wavefront if isinstance(best, Refraction) else None
+        self._refocus(eye)
+        run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s
         return task
 
     @property
     def _cylinder_s(self) -> float:
-        """Estimated duration of the search for a cylinder in seconds."""
+        """Estimated duration of the search for a cylinder and of the joining with other frames in seconds."""
         return max(self._cylinder_cost.seconds, CYLINDER_SEARCHES * self._find_cost.seconds)
 
-    def _wait_for_cylinder(self, run: "_Run", task: RefractionTask) -> None:
-        """Set the refraction of the run to that with its cylinder, if the deadline permits to wait for it."""
-        if not task.is_done and not run.fits(self._cylinder_s):
-            return
-        run.refraction = task.whole()
-        self._cylinder_cost.add(task.cylinder_s)
+    def _take_cylinder(self, run: "_Run", task: RefractionTask, wait: bool) -> None:
+        """Set the refraction of the run to that with its cylinder, joined with other frames, as far as it is known.
 
-    def _refocus(self, m_dpt: float | None) -> None:
-        """Set the OTF of the later stages to an eye with mean sphere `m_dpt`; None selects the stored PSF."""
+        With `wait` until all is known; `cylinder_s` grows by this time.
+        """
+        begin_s = self.clock.now_s()
+        run.refraction = task.whole() if wait else task.latest()
+        if task.is_done and task.cylinder_s > 0:
+            self._cylinder_cost.add(task.cylinder_s + task.join_s)
+        run.cylinder_s += self.clock.now_s() - begin_s
+
+    def _refocus(self, eye: Wavefront | None) -> None:
+        """Set the OTF of the later stages to that of an eye; None selects the stored PSF."""
         if self.refractor is None:
             return
         begin_s = self.clock.now_s()
         for stage in self._refracted:
-            if m_dpt is None:
-                stage.refocus(stage.model.stored, 1.0)
-            else:
-                stage.refocus(self.refractor.otf(stage.grid, m_dpt), self.refractor.scale(m_dpt))
-        if m_dpt is not None:
+            stage.refocus(stage.model.stored if eye is None else self.refractor.otf(stage.grid, eye), eye)
+        if eye is not None:
             self._refocus_cost.add(self.clock.now_s() - begin_s)
 
     def _refuse_other_shapes(self, counts: Pixels) -> None:
@@ -343,8 +358,9 @@ class Reconstructor:
         }  # fmt: skip
         misfit = diagnostics.residual if isfinite(field_radius_px(self.calibration)) else None
         match, eye = psf_match(quality), run.refraction
+        psf_scale = 1.0 if self.refractor is None or run.eye is None else self.refractor.scale(run.eye.m_dpt)
         if self._consistency is not None and not dark:
-            figures = self._consistency(run.counts, run.psf_scale, run.known_defects)
+            figures = self._consistency(run.counts, psf_scale, run.known_defects)
             quality |= {} if figures is None else figures.report_figures
             match = Match.UNKNOWN if figures is None else figures.match
         warnings = (NO_SIGNAL,) if dark else quality_warnings(quality, match, misfit, self._audience)
@@ -360,13 +376,26 @@ class Reconstructor:
             warnings += (f"The refraction of {-eye.sphere_dpt:+.1f} dpt (sd {eye.sd_dpt:.1f}) is uncertain.",)
         return Report(
             method=recipe.method, bin=recipe.bin, rounds=run.rounds_done, stopped=run.stopped, seconds=seconds,
-            psf_index=self.psf_index, psf_scale=run.psf_scale,
-            refraction_dpt=None if eye is None else report_of(eye),
+            psf_index=self.psf_index, psf_scale=psf_scale, psf_cylinder=self._psf_cylinder(run),
+            refraction_dpt=None if eye is None else report_of(eye), refraction_scatter=scatter_of(eye),
             regularisation=dict(diagnostics.regularisation),
             noise_dn=None if diagnostics.noise_dn is None else diagnostics.noise_dn * recipe.bin,
             residual=diagnostics.residual,
             quality=quality, warnings=warnings,
         )  # fmt: skip
+
+    def _psf_cylinder(self, run: "_Run") -> dict[str, float | None] | None:
+        """Return `psf_cylinder` of the report: the cylinder of the picture's PSF, and its gain if it is predicted."""
+        eye, stage = run.eye, run.done
+        if eye is None or eye == Wavefront(eye.m_dpt) or self.refractor is None or self._gain is None:
+            return None
+        assert run.solved is not None
+        figures, noise_dn = run.solved.diagnostics.regularisation, run.solved.diagnostics.noise_dn
+        log_power, slope, gain_db = figures.get("prior_log_power"), figures.get("prior_slope"), None
+        if log_power is not None and slope is not None and noise_dn:
+            other = self.refractor.otf(stage.grid, Wavefront(eye.m_dpt))
+            gain_db = self._gain(stage.model.otf, other, PowerLaw(log_power, slope), noise_dn)
+        return {"j0_dpt": -eye.j0_dpt, "j45_dpt": eye.j45_dpt, "gain_db": gain_db}
 
 
 @dataclass(frozen=True)
@@ -387,18 +416,17 @@ class _Run:
         self._defects = owner.defects
         self._found: dict[int, Places | None] = {}
         self.deadline, self.most = deadline, most
-        self.channels = 1 if counts.ndim == 2 else counts.shape[2]
         self.done: _Stage = owner.stages[0]
         self.solved: _Solved | None = None  # None before the first stage
         self.rounds_done, self.stopped = 0, "done"
         self.refraction: Refraction | NoRefraction | None = None
-        self.refraction_s, self.between_s, self.psf_scale = 0.0, 0.0, 1.0
+        self.refraction_s = self.cylinder_s = self.between_s = 0.0
+        self.eye: Wavefront | None = None  # of the PSF of the last stage
 
     @property
-    def selected_dpt(self) -> float | None:
-        """Mean sphere M of the PSF for the later stages, in dpt; None for the stored PSF."""
-        eye = self.refraction
-        return None if not isinstance(eye, Refraction) or eye.in_doubt else eye.sphere_dpt
+    def channels(self) -> int:
+        """Number of channels of the frame."""
+        return 1 if self.counts.ndim == 2 else self.counts.shape[2]
 
     def fits(self, cost_s: float) -> bool:
         """Return True if a step of `cost_s` seconds fits into the time left, or if there is no deadline."""
@@ -442,8 +470,7 @@ class _Run:
             stage.planes = np.zeros((self.channels, *stage.grid.shape), np.float32)
         for c in range(self.channels):
             yield from self._channel(stage, c, pauses, joined)
-        self.done = stage
-        self.psf_scale = stage.scale
+        self.done, self.eye = stage, stage.eye
 
     def _channel(self, stage: _Stage, c: int, pauses: bool, joined: Image | None) -> Iterator[RoundDone]:
         """Solve one channel of a stage; the diagnostics of the last channel are those of the frame."""

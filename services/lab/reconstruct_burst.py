@@ -10,9 +10,18 @@ from device.config.image_files import Raw
 from device.errors import FrameError, SettingError
 from device.recon.burst import MOST_FRAMES, BurstJoiner
 from device.recon.estimation.psf_selection import most_likely_psf
+from device.recon.estimation.refraction import (
+    NoRefraction,
+    Refraction,
+    RefractionEstimator,
+    can_estimate_refraction,
+)
+from device.recon.estimation.refraction_burst import LEAST_FRAMES
+from device.recon.estimation.refraction_notation import report_of, scatter_of
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.values import FrameUse
+from device.recon.reconstructor import plane
+from device.values import FrameUse, Report
 from services.lab.reconstruct_file import (
     FileReconstruction,
     file_report,
@@ -78,12 +87,38 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
     deadline = None if options.budget_s is None else Deadline.after(clock, max(options.budget_s - join_s, 1e-6))
     made = solver(joined.counts, simulated=any(one.simulated for one in loaded), deadline=deadline)
     notes = tuple(dict.fromkeys(note for one in loaded for note in one.notes))
+    report = made.report
+    if deadline is None and can_estimate_refraction(calibration):
+        estimator = RefractionEstimator(calibration, common.solved_shape, planner, index, options.field_fixed)
+        used = [plane(without_bad(loaded[one.index].raw), 0) for one in joined.frames if one.used]
+        report = with_scatter(report, estimator, used)
     report = replace(
-        file_report(made.report, solver, options),
-        seconds={"join": join_s} | made.report.seconds, frames=joined.frames,
-        warnings=(*made.report.warnings, *rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
+        file_report(report, solver, options),
+        seconds={"join": join_s} | report.seconds, frames=joined.frames,
+        warnings=(*report.warnings, *rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
     )  # fmt: skip
     return FileReconstruction(made.picture, report, made.simulated or calibration.simulated)
+
+
+def with_scatter(report: Report, estimator: RefractionEstimator, used: Sequence[Pixels]) -> Report:
+    """Return the report of a joined frame with the scatter of the refraction between its frames `used`, in counts.
+
+    The sd of M grows by the scatter, and frames that differ too much refuse the refraction. Less than three frames, or
+    a first one that has no refraction by itself, leave the report as it is.
+    """
+    stated = report.refraction_dpt
+    if len(used) < LEAST_FRAMES or stated is None or stated["refused"] is not None:
+        return report
+    first = estimator.find(used[0], None, estimator.defects(used[0]))
+    whole = estimator.add_cylinder(first) if isinstance(first, Refraction) else first
+    if isinstance(whole, NoRefraction):
+        return report
+    joined = estimator.join(whole, used, None)
+    if isinstance(joined, NoRefraction):
+        return replace(report, refraction_dpt=report_of(joined))
+    growth = 1.0 if joined.scatter is None else joined.scatter.growth
+    grown = stated | {"sd": float(stated["sd"] or 0.0) * growth}
+    return replace(report, refraction_dpt=grown, refraction_scatter=scatter_of(joined))
 
 
 def unusable_raws(loaded: Sequence[LoadedRaw]) -> dict[int, str]:

@@ -23,7 +23,7 @@ SECONDS: Mapping[str, str] = {
     "colour": "Pictures in the other colours of light, their registration, and the colour picture; captures only.",
     "solve": "Preprocessing and all rounds of the solver.",
     "refract": "Estimate of the refraction, and the change of the PSF to it.",
-    "cylinder": "Estimate of the cylinder, after the picture.",
+    "cylinder": "Wait for the estimate of the cylinder: before the picture if it has no time budget, or after it.",
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
 }
 REFRACTION: Mapping[str, str] = {
@@ -39,6 +39,22 @@ REFRACTION: Mapping[str, str] = {
     "field_deg": "Diameter of the lit field that was found with the refraction, in degrees.",
     "field_deg_sd": "Standard deviation of `field_deg` in degrees; 0 for a field that was held.",
     "refused": "Reason for which there is no refraction, and every number is null; null with a refraction.",
+}
+PSF_CYLINDER: Mapping[str, str] = {
+    "j0_dpt": "Jackson cross cylinder J0 of the correction by which the PSF was warped, without the head's offset.",
+    "j45_dpt": "Jackson cross cylinder J45 of the correction by which the PSF was warped, without the head's offset.",
+    "gain_db": (
+        "Predicted gain in dB by the cylinder over the PSF that is only scaled, for a linear solution with the fitted "
+        "prior; not measured. Pictures gained about twice as much in tests. Null for a method without this prior."
+    ),
+}
+SCATTER: Mapping[str, str] = {
+    "frames": "Number of frames of the burst whose refraction was compared.",
+    "sd_dpt": "Standard deviation of the mean sphere between these frames in dpt.",
+    "stated_sd_dpt": (
+        "Standard deviation that one frame states in dpt. If `sd_dpt` is larger, `sd` of the refraction is `sd_dpt`."
+    ),
+    "chi2": "Sum of the squared deviations over the stated variance; `frames` - 1 is expected at most.",
 }
 REGULARISATION: Mapping[str, str] = {
     "tau": "Weight of the total variation (methods variation and open).",
@@ -70,7 +86,12 @@ QUALITY: Mapping[str, str] = {
     "psf_orientation": "Evidence for the PSF as given (above 5) or rotated by 180 degrees (below -5), in sd.",
     "psf_mirrored": "Evidence for the PSF mirrored left to right (above 5) or top to bottom (below -5), in sd.",
 }
-LATER = ("frames", "channels")  # fields of `Report` that earlier releases did not write
+LATER = (
+    "frames",
+    "channels",
+    "psf_cylinder",
+    "refraction_scatter",
+)  # fields of `Report` that earlier releases did not write
 FRAME: Mapping[str, JsonValue] = {
     "index": {"type": "integer", "description": "Place of the frame in the burst, from 0."},
     "used": {"type": "boolean", "description": "True if the picture has the light of this frame."},
@@ -241,7 +262,9 @@ def report_schema() -> dict[str, JsonValue]:
             "properties": _each(SECONDS, _number),
             "additionalProperties": {"type": "number"},
         },
+        "psf_cylinder": {"type": ["object", "null"], "properties": _each(PSF_CYLINDER, _figure)},
         "refraction_dpt": {"type": ["object", "null"], "properties": _refraction()},
+        "refraction_scatter": {"type": ["object", "null"], "properties": _each(SCATTER, _number)},
         "regularisation": {"type": "object", "properties": _each(REGULARISATION, _figure)},
         "quality": {"type": "object", "properties": _each(QUALITY, _figure)},
         "frames": {"type": "array", "items": {"type": "object", "properties": dict(FRAME)}},

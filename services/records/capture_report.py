@@ -60,6 +60,9 @@ def _known_entries(report: CaptureReport) -> dict[str, JsonValue]:
         del entries["frames"]
     if not made.channels:
         del entries["channels"]
+    for name in ("psf_cylinder", "refraction_scatter"):
+        if entries[name] is None:
+            del entries[name]
     if not light.limits_unchecked:
         del entries["limits_unchecked"]
     if report.moved:
@@ -93,10 +96,8 @@ def _frame_as_json(one: FrameUse) -> JsonValue:
 
 def _channel_as_json(one: ChannelUse) -> JsonValue:
     shift: JsonValue = None if one.shift_px is None else list(one.shift_px)
-    return {
-        "name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason,
-        "white_ratio": one.white_ratio,
-    }  # fmt: skip
+    entries = {"name": one.name, "shift_px": shift, "predicted": one.predicted, "reason": one.reason}
+    return entries if one.white_ratio is None else entries | {"white_ratio": one.white_ratio}
 
 
 def _laterality_as_json(seen: LateralityEstimate) -> dict[str, JsonValue]:
@@ -170,7 +171,9 @@ def _reconstruction(entries: JsonObject) -> Report:
         seconds=_checked(entries, "seconds", _numbers, {}),
         psf_index=_lenient(entries, "psf_index", _whole, 0),
         psf_scale=_lenient(entries, "psf_scale", _number, 1.0),
+        psf_cylinder=_lenient(entries, "psf_cylinder", _figures, None),
         refraction_dpt=_checked(entries, "refraction_dpt", _refraction, None),
+        refraction_scatter=_lenient(entries, "refraction_scatter", _numbers, None),
         regularisation=_lenient(entries, "regularisation", _copied, {}),
         noise_dn=_lenient(entries, "noise_dn", _number, None),
         residual=_lenient(entries, "residual", _number, None),
@@ -312,6 +315,11 @@ def _whole(value: object) -> int:
 def _numbers(value: object) -> dict[str, float]:
     """Return the numbers of an object by name; null is no number and omitted, ValueError for another type."""
     return {name: _number(one) for name, one in _object(value).items() if one is not None}
+
+
+def _figures(value: object) -> dict[str, float | None]:
+    """Return the numbers and nulls of an object by name; ValueError for another type."""
+    return {name: None if one is None else _number(one) for name, one in _object(value).items()}
 
 
 def _refraction(value: object) -> dict[str, float | str | None]:

@@ -3,11 +3,14 @@
 Frames of photographs behind the textbook optics (`tests/textbook`), M from -6 to 6 dpt, full and a fifth of the light.
 Half of them have a field edge that deviates from the calibration: 0.2 deg too large, 0.1 deg too small, 0.1 deg off
 centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope reconstruct`, and its
-report is scored. Exit status 1 if a line fails.
+report is scored. `picture` measures what the PSF with the cylinder gains, `bursts` the refraction of several frames and
+its scatter between them, `time` the processor time of the estimates.
+Exit status 1 if a line fails.
 """
 
 import argparse
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,9 +19,11 @@ import numpy as np
 from PIL import Image as Photograph
 
 from device.clock import SystemClock
+from device.recon.estimation.refraction import Refraction, RefractionEstimator
 from device.recon.model.fft_plans import Planner
+from device.recon.model.grid import disc
 from device.recon.reconstructor import Reconstructor
-from device.values import Calibration, Geometry, Psf, Sensor
+from device.values import Calibration, Geometry, Image, Psf, Reconstruction, Sensor
 from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees, photographed
 from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
 
@@ -240,30 +245,37 @@ def head_of(case: Case) -> int:
 @cache
 def calibrated(camera: Camera, field_deg: float, head: int) -> Reconstructor:
     """Return the reconstructor of `diffuscope reconstruct` for a head."""
+    return Reconstructor(calibration_of(camera, field_deg, head), camera.shape, PLANNER, SystemClock(), timed=False)
+
+
+def calibration_of(camera: Camera, field_deg: float, head: int) -> Calibration:
+    """Return the calibration of a head with this camera and field."""
     optics = Optics(PITCH_UM[camera])
     sensor = Sensor(camera.black_dn, camera.gain_e_per_dn, camera.read_noise_e, 2.0**camera.bits - 1)
     geometry = Geometry(optics.pitch_um, optics.distance_um, optics.magnification)
-    calibration = Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
-    return Reconstructor(calibration, camera.shape, PLANNER, SystemClock(), timed=False)
+    return Calibration((measured_psf(optics.pitch_um, head),), sensor, geometry, field_deg)
 
 
-def scene_of(case: Case, data: Path) -> tuple[Plane, Plane, Plane]:
+def scene_of(case: Case, data: Path, shift_deg: tuple[float, float] = (0.0, 0.0)) -> tuple[Plane, Plane, Plane]:
     """Return the retina of a case without its edge, and the field angles (right, down) in degrees."""
     optics = Optics(PITCH_UM[case.camera])
     reach_deg = case.edge.diameter_deg + case.edge.width_deg + 3
     right_deg, down_deg = degrees(optics, round(reach_deg * optics.px_per_deg / 2) * 2)
     zoom = case.zoom * case.field_deg / float(np.ptp(right_deg))
     place = data / "fundus" / case.photo
-    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, (0, 0)), right_deg, down_deg
+    return photographed(photograph(place), right_deg, down_deg, zoom, case.turn_deg, shift_deg), right_deg, down_deg
 
 
-def expose(case: Case, scene: Plane, exposure: float = PEAK) -> Counts:
-    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light."""
+def expose(case: Case, scene: Plane, exposure: float = PEAK, number: int = 1) -> Counts:
+    """Return the counts of a lit scene; its brightest pixel has `exposure` of the full well, times the case's light.
+
+    `number`: that of the frame, which selects its noise.
+    """
     optics = Optics(PITCH_UM[case.camera])
     psf = caustic(optics, surface(optics.pitch_um, head_of(case)), Prescription.of_power_vector(*case.eye))
     light = blurred(scene, psf, case.camera.shape)
     electrons = light / max(float(light.max()), 1e-9) * exposure * case.camera.full_well_e * case.light
-    return case.camera.read(electrons, np.random.default_rng((case.seed, 1)))
+    return case.camera.read(electrons, np.random.default_rng((case.seed, number)))
 
 
 def faults(seed: int, count: int, data: Path) -> Iterator[tuple[str, Scored]]:
@@ -313,18 +325,195 @@ def judge_faults(seed: int, count: int, data: Path) -> bool:
     return holds
 
 
+CYLINDERS_DPT = (0.0, -1.0, -2.0, -4.0)
+LEAST_GAIN_DB = 0.1  # mean, by a cylinder of -2 dpt
+
+
+def astigmatic_cases(camera: Camera, field_deg: float, seed: int) -> Iterator[Case]:
+    """Yield one case for each photograph, cylinder and light: exact edge, M from -4 to 4 dpt, any axis."""
+    rng = np.random.default_rng((seed, camera.bits, round(10 * field_deg)))
+    for photo in PHOTOGRAPHS[:4]:
+        for cylinder_dpt in CYLINDERS_DPT:
+            for light in (1.0, 0.2):
+                turn, m_dpt = 2 * rng.uniform(0, np.pi), float(rng.uniform(-4, 4))
+                j0_dpt, j45_dpt = (-cylinder_dpt / 2 * float(part) for part in (np.cos(turn), np.sin(turn)))
+                eye = (m_dpt, j0_dpt, j45_dpt)
+                yield Case(camera, field_deg, FieldEdge(field_deg), eye, photo, light, int(rng.integers(2**31)))
+
+
+def psnr_db(case: Case, picture: Image, truth: Plane) -> float:
+    """Return the PSNR of a picture within 0.7 degrees of the field's edge, after the best scale and offset."""
+    shape = case.camera.shape
+    radius_px = (case.field_deg / 2 - 0.7) * Optics(PITCH_UM[case.camera]).px_per_deg
+    inside = disc(shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), radius_px) > 0.5
+    true = blurred(truth, np.pad(np.ones((1, 1)), 1), shape)[inside]
+    columns = np.stack([picture[inside].astype(np.float64), np.ones(true.size)], axis=1)
+    error = columns @ np.linalg.lstsq(columns, true, rcond=None)[0] - true
+    return float(10 * np.log10(true.max() ** 2 / np.mean(error**2)))
+
+
+def picture_gain(case: Case, data: Path) -> tuple[float, float | None]:
+    """Return the gain of the picture in dB by the cylinder, and the predicted one; None if the PSF has no cylinder."""
+    retina, right_deg, down_deg = scene_of(case, data)
+    scene = retina * case.edge.light(right_deg, down_deg)
+    counts, own = expose(case, scene), calibrated(case.camera, case.field_deg, head_of(case))
+    made = own(counts)
+    *_, without = own.steps(counts, refraction=own.begin_refraction(counts, with_cylinder=False))
+    assert isinstance(without, Reconstruction)
+    stated = made.report.psf_cylinder
+    gain_db = psnr_db(case, made.picture, scene) - psnr_db(case, without.picture, scene)
+    return gain_db, None if stated is None else stated["gain_db"]
+
+
+def judge_pictures(seed: int, data: Path) -> bool:
+    """Print the gain by the cylinder for each sensor, cylinder and light; return True if the mean at -2 dpt holds."""
+    gains_db: list[float] = []
+    for camera, field_deg in ((IMX296, 33.4), (IMX296, 45.0), (QUANTALUX, 33.4)):
+        found: dict[tuple[float, float], list[tuple[float, float | None]]] = {}
+        for case in astigmatic_cases(camera, field_deg, seed):
+            cylinder_dpt = -2 * float(np.hypot(*case.eye[1:]))
+            found.setdefault((round(cylinder_dpt, 1), case.light), []).append(picture_gain(case, data))
+        for (cylinder_dpt, light), pairs in found.items():
+            measured, predicted = (" ".join("   -" if one is None else f"{one:+.2f}" for one in part) for part in zip(
+                *pairs, strict=True
+            ))  # fmt: skip
+            print(
+                f"{camera.bits} bit {field_deg:g} deg, cylinder {cylinder_dpt:+.0f} dpt, light {light:g}: gain "
+                f"{measured} dB, predicted {predicted}", flush=True,
+            )  # fmt: skip
+            gains_db += [gain for gain, _ in pairs if cylinder_dpt == CYLINDERS_DPT[2]]
+    mean_db = float(np.mean(gains_db))
+    holds = mean_db >= LEAST_GAIN_DB
+    print(f"{'ok  ' if holds else 'MISS'} picture: mean gain {mean_db:+.2f} dB at {CYLINDERS_DPT[2]:g} dpt", flush=True)
+    return holds
+
+
+BURST = 4  # frames
+DRIFT_DEG, ACCOMMODATION_DPT = 0.15, 0.3  # sd of each frame
+CHI2_OF_ONE_PERCENT = 11.34  # of BURST - 1 degrees of freedom
+MOST_ALARMS = 0.1  # share of the bursts of an eye that does not accommodate
+
+
+def burst_of(case: Case, data: Path, accommodation_dpt: float) -> tuple[list[Counts], Plane]:
+    """Return the frames of a moving eye and their true M in dpt; M of each has this sd around that of the case."""
+    rng = np.random.default_rng((case.seed, 2))
+    frames, spheres_dpt = [], case.eye[0] + accommodation_dpt * rng.standard_normal(BURST)
+    for k, sphere_dpt in enumerate(spheres_dpt):
+        right, down = DRIFT_DEG * rng.standard_normal(2)
+        retina, right_deg, down_deg = scene_of(case, data, (float(right), float(down)))
+        moved = replace(case, eye=(float(sphere_dpt), *case.eye[1:]))
+        frames.append(expose(moved, retina * case.edge.light(right_deg, down_deg), number=k + 3))
+    return frames, spheres_dpt
+
+
+def judge_bursts(seed: int, count: int, data: Path) -> bool:
+    """Print errors of M of the first frame and of the burst, and the scatter, of `count` bursts of each sensor.
+
+    Return True if at most MOST_ALARMS of the eyes that do not accommodate have a chi^2 beyond 1 % of its values.
+    """
+    alarms: list[bool] = []
+    for name in ("imx296-33", "imx296-45", "paper-33"):
+        group = GROUPS[name]
+        for case in list(cases(group.camera, group.field_deg, 2 * count, seed, 0.5, name="burst"))[1::2]:
+            for accommodation_dpt in (0.0, ACCOMMODATION_DPT):
+                frames, spheres_dpt = burst_of(case, data, accommodation_dpt)
+                estimator = calibrated(case.camera, case.field_deg, head_of(case)).refractor
+                assert estimator is not None
+                found = estimator.find(frames[0])
+                first = estimator.add_cylinder(found) if isinstance(found, Refraction) else found
+                whole = estimator.join(first, frames, None) if isinstance(first, Refraction) else first
+                if not (isinstance(first, Refraction) and isinstance(whole, Refraction) and whole.scatter is not None):
+                    print(f"{name} light {case.light:g}: refused", flush=True)
+                    continue
+                if accommodation_dpt == 0:
+                    alarms.append(whole.scatter.chi2 > CHI2_OF_ONE_PERCENT)
+                print(
+                    f"{name} light {case.light:g}: error of the first {-first.sphere_dpt - spheres_dpt[0]:+.3f} (sd "
+                    f"{first.sd_dpt:.3f}), of the burst {-whole.sphere_dpt - spheres_dpt.mean():+.3f} (sd "
+                    f"{whole.sd_dpt:.3f}) dpt; scatter true {np.std(spheres_dpt, ddof=1):.3f}, found "
+                    f"{whole.scatter.sd_dpt:.3f} dpt, chi2 {whole.scatter.chi2:.1f}", flush=True,
+                )  # fmt: skip
+    share = float(np.mean(alarms))
+    holds = share <= MOST_ALARMS
+    print(
+        f"{'ok  ' if holds else 'MISS'} bursts: {len(alarms)} of one M, {share:.0%} beyond chi2 (at most 10)",
+        flush=True,
+    )
+    return holds
+
+
+REPEATS = 5
+MOST_CYLINDER_RATIO = 3.0
+
+
+def processor_s(act: Callable[[], object]) -> float:
+    """Return the median processor time of a call, of all threads of this process."""
+    times = []
+    for _ in range(REPEATS):
+        begin_s = time.process_time()
+        act()
+        times.append(time.process_time() - begin_s)
+    return float(np.median(times))
+
+
+def times_s(case: Case, planner: Planner, data: Path) -> tuple[float, float, float, float]:
+    """Return the processor times of a planned FFT pair of the sensor, M with edge, cylinder, and a frame of a burst."""
+    retina, right_deg, down_deg = scene_of(case, data)
+    counts = expose(case, retina * case.edge.light(right_deg, down_deg))
+    calibration = calibration_of(case.camera, case.field_deg, head_of(case))
+    estimator, pair = RefractionEstimator(calibration, case.camera.shape, planner, 0), planner.plan(case.camera.shape)
+    found = estimator.find(counts)
+    assert isinstance(found, Refraction), found.reason
+    whole = estimator.add_cylinder(found)  # compiles
+    assert isinstance(whole, Refraction), whole.reason
+    return (
+        processor_s(lambda: (pair.forward(), pair.inverse())), processor_s(lambda: estimator.find(counts)),
+        processor_s(lambda: estimator.add_cylinder(found)),
+        processor_s(lambda: estimator.join(whole, [counts] * BURST, None)) / BURST,
+    )  # fmt: skip
+
+
+def judge_times(seed: int, data: Path) -> bool:
+    """Print the processor time of M with edge and of the cylinder beside that of a planned full-size FFT pair.
+
+    Return True if the cylinder takes at most three times M.
+    """
+    holds, planner = True, Planner(None)
+    for name, group in GROUPS.items():
+        if group.cylinder_dpt:
+            continue
+        for case in list(cases(group.camera, group.field_deg, 4, seed, 1.0, name="time"))[1::2]:
+            pair_s, m_s, cylinder_s, frame_s = times_s(case, planner, data)
+            is_fast = cylinder_s <= MOST_CYLINDER_RATIO * m_s
+            holds &= is_fast
+            print(
+                f"{'ok  ' if is_fast else 'MISS'} {name} {case.photo[-14:]} light {case.light:g}: pair {pair_s:.3f} s, "
+                f"M with edge {m_s:.3f} s ({m_s / pair_s:.1f} pairs), cylinder {cylinder_s:.3f} s "
+                f"({cylinder_s / pair_s:.1f} pairs, {cylinder_s / m_s:.1f} of M; at most {MOST_CYLINDER_RATIO:g}), a "
+                f"frame of a burst {frame_s:.3f} s",
+                flush=True,
+            )
+    return holds
+
+
 def main() -> None:
     """Score the groups; exit status 1 if a line fails."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder with fundus/")
     parser.add_argument("--frames", type=int, default=60, help="frames of each group")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="*", choices=[*GROUPS, "faults"], default=[*GROUPS, "faults"])
+    others: dict[str, Callable[[], bool]] = {
+        "faults": lambda: judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data),
+        "picture": lambda: judge_pictures(arguments.seed, arguments.data),
+        "bursts": lambda: judge_bursts(arguments.seed, max(arguments.frames // 12, 1), arguments.data),
+        "time": lambda: judge_times(arguments.seed, arguments.data),
+    }
+    parser.add_argument("--only", nargs="*", choices=[*GROUPS, *others], default=[*GROUPS, *others])
     arguments = parser.parse_args()
     held = []
     for name in arguments.only:
-        if name == "faults":
-            held.append(judge_faults(arguments.seed, max(arguments.frames // 12, 1), arguments.data))
+        if name in others:
+            held.append(others[name]())
             continue
         group, found = GROUPS[name], []
         for case in cases(group.camera, group.field_deg, arguments.frames, arguments.seed, group.cylinder_dpt):

@@ -1,6 +1,7 @@
 """Picture viewer: equal output of both renderers, WebGL self-test and fallback, loupe, loading on demand."""
 
 import io
+import re
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
@@ -445,3 +446,19 @@ def test_a_picture_is_in_colour_and_red_free_is_the_one_in_green(open_page: Open
     wait_until_drawn(page, "colour 0 0")
     red, green, _ = pixel(pic)
     assert red > 1.5 * green
+
+
+def test_details_state_that_the_psf_has_the_cylinder(open_page: Open, real: Real) -> None:
+    """The answers of the real server have a `psf_cylinder` added: its simulated eye has no cylinder."""
+    stated = '"psf_cylinder": {"j0_dpt": 1.0, "j45_dpt": 0.0, "gain_db": 0.42}, "psf_scale"'
+
+    def astigmatic(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.text().replace('"psf_scale"', stated))
+
+    page = aiming(open_page, real)
+    take_picture(page)
+    page.route(re.compile(r"/api/(captures|visits)/[\w-]+$"), astigmatic)
+    page.reload()
+    page.get_by_role("button", name="Details").tap()
+    expect(page.get_by_role("dialog")).to_contain_text("Corrected for the cylinder, predicted gain 0.4 dB")

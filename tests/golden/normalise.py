@@ -26,6 +26,7 @@ COUNTS = {
 }
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
 MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier
+OF_THE_LOAD = {"psf_cylinder", "refraction_scatter"}  # parts of a report that only an estimate in time has
 OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer
 
 
@@ -66,7 +67,8 @@ class Normaliser:
                 value = value | {"value": "<number>"}
             if value.get("name") in OF_THE_COMPUTER and "limit" in value:
                 value = value | dict.fromkeys(("value", "known", "ok", "remedy"), "<of the computer>")
-            return {self.text(str(name)): self.json(one, str(name), measured) for name, one in value.items()}
+            kept = {name: one for name, one in value.items() if not (measured and name in OF_THE_LOAD)}
+            return {self.text(str(name)): self.json(one, str(name), measured) for name, one in kept.items()}
         if isinstance(value, bool) or value is None:
             return value
         return "<number>" if key in COUNTS or (measured and isinstance(value, float)) else value

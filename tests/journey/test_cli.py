@@ -18,8 +18,9 @@ from services.lab.reconstruct_inputs import ReconstructOptions
 from tests.journey.conftest import Diffuscope
 
 REPORT_KEYS = {  # the public interface
-    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
-    "noise_dn", "residual", "quality", "warnings", "solved", "given", "psf_channels", "bayer", "frames", "channels",
+    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
+    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "solved", "given",
+    "psf_channels", "bayer", "frames", "channels",
 }  # fmt: skip
 
 

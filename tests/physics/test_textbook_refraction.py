@@ -1,13 +1,17 @@
 """Refraction of textbook frames (`tests/textbook`), which share no code with simulator and estimator."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 
 from device.recon.estimation.psf_warp import transform, warped
-from device.recon.estimation.refraction import Refraction, RefractionEstimator
-from device.recon.estimation.refraction_notation import report_of
+from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
+from device.recon.estimation.refraction_notation import report_of, scatter_of
 from device.recon.model.fft_plans import Planner
-from device.values import Calibration, Geometry, Psf, Sensor
+from device.values import Calibration, Geometry, Psf, Report, Sensor
+from services.lab.reconstruct_burst import with_scatter
 from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees
 from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
 
@@ -32,12 +36,12 @@ def retina(right_deg: Plane, down_deg: Plane) -> Plane:
     return np.asarray((1 + 0.6 * disc) * (1 + 0.06 * texture / texture.std()) * (1 - 0.4 * vessels))
 
 
-def expose(eye: Prescription, edge: FieldEdge) -> Counts:
-    """Return the counts of an eye behind the textbook optics at 85 % of the full well."""
+def expose(eye: Prescription, edge: FieldEdge, moved_px: tuple[int, int] = (0, 0), seed: int = 6) -> Counts:
+    """Return the counts of an eye behind the textbook optics at 85 % of the full well; its retina is moved."""
     right_deg, down_deg = degrees(OPTICS, round((FIELD_DEG + 3) * OPTICS.px_per_deg / 2) * 2)
-    scene = retina(right_deg, down_deg) * edge.light(right_deg, down_deg)
+    scene = np.roll(retina(right_deg, down_deg), moved_px, (0, 1)) * edge.light(right_deg, down_deg)
     light = blurred(scene, caustic(OPTICS, SURFACE, eye), CAMERA.shape)
-    return CAMERA.read(light / light.max() * 0.85 * CAMERA.full_well_e, np.random.default_rng(6))
+    return CAMERA.read(light / light.max() * 0.85 * CAMERA.full_well_e, np.random.default_rng(seed))
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +98,62 @@ def test_the_cylinder_is_reported_on_the_axis_of_the_correcting_lens(estimator: 
 def test_a_frame_without_detail_is_refused(estimator: RefractionEstimator) -> None:
     noise = np.random.default_rng(1).normal(900, 20, CAMERA.shape).astype(np.uint16)
     assert not isinstance(estimator.find(noise), Refraction)
+
+
+MOVED_PX = ((0, 0), (2, -3), (-4, 1), (5, 4))  # of the retina, 0.2 to 0.7 deg; the lit field stands still
+SPHERE_DPT = -2.5
+CHI2_OF_ONE_PERCENT = 11.3  # chi^2 with three degrees of freedom, exceeded by 1 % of its values
+
+
+@cache
+def frame_of_burst(k: int, sphere_dpt: float = SPHERE_DPT) -> Counts:
+    """Return frame `k` of a burst of an eye that needs this correction."""
+    return expose(Prescription(sphere_dpt), FieldEdge(FIELD_DEG), MOVED_PX[k], 6 + k)
+
+
+@pytest.fixture(scope="module")
+def first(estimator: RefractionEstimator) -> Refraction:
+    """Return the refraction of the first frame of each burst."""
+    found = estimator.find(frame_of_burst(0))
+    assert isinstance(found, Refraction)
+    whole = estimator.add_cylinder(found)
+    assert isinstance(whole, Refraction)
+    return whole
+
+
+def test_frames_of_one_eye_scatter_within_their_sd(estimator: RefractionEstimator, first: Refraction) -> None:
+    burst = [frame_of_burst(k) for k in range(4)]
+    whole = estimator.join(first, burst, None)
+    assert isinstance(whole, Refraction)
+    assert whole.scatter is not None
+    assert (whole.scatter.count, whole.scatter.stated_sd_dpt) == (4, first.sd_dpt)
+    assert 0 < whole.scatter.chi2 < CHI2_OF_ONE_PERCENT
+    assert whole.sd_dpt == max(first.sd_dpt, whole.scatter.sd_dpt)
+    assert abs(whole.sphere_dpt + SPHERE_DPT) < 3 * first.sd_dpt
+    assert estimator.join(first, burst[:2], None) == first, "two frames have no scatter"
+
+
+def test_an_eye_that_accommodates_between_the_frames_has_the_sd_of_its_scatter(
+    estimator: RefractionEstimator, first: Refraction
+) -> None:
+    """The steps are good to 20 %, and a mean of four to 0.1 dpt: 2 sd of one frame."""
+    spheres_dpt = (SPHERE_DPT, -2.9, -2.2, -3.0)
+    burst = [frame_of_burst(k, sphere_dpt) for k, sphere_dpt in enumerate(spheres_dpt)]
+    whole = estimator.join(first, burst, None)
+    assert isinstance(whole, Refraction)
+    assert whole.scatter is not None
+    assert whole.scatter.chi2 > 3 * CHI2_OF_ONE_PERCENT
+    assert whole.sd_dpt == whole.scatter.sd_dpt == pytest.approx(float(np.std(spheres_dpt, ddof=1)), rel=0.2)
+    assert whole.sphere_dpt == pytest.approx(-np.mean(spheres_dpt), abs=0.1)
+    assert abs(first.sphere_dpt - whole.sphere_dpt) > 0.1
+    made = Report("variation", refraction_dpt=report_of(replace(first, sd_dpt=0.03)))  # that of a joined frame
+    files = with_scatter(made, estimator, burst)
+    assert files.refraction_scatter == scatter_of(whole)
+    assert files.refraction_dpt is not None
+    assert files.refraction_dpt["sd"] == pytest.approx(0.03 * whole.scatter.growth)
+
+
+def test_frames_with_too_different_refractions_are_refused(estimator: RefractionEstimator, first: Refraction) -> None:
+    whole = estimator.join(first, [frame_of_burst(0), frame_of_burst(1, -0.5), frame_of_burst(2, -4.5)], None)
+    assert isinstance(whole, NoRefraction)
+    assert "scatter" in whole.reason

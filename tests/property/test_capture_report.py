@@ -47,12 +47,23 @@ FIGURES = (
     "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
 )  # fmt: skip
 CYLINDER = {"refraction_dpt": dict.fromkeys(FIGURES, -1.25) | {"refused": None}}
+WARPED = {
+    "psf_cylinder": {"j0_dpt": -1.0, "j45_dpt": 0.25, "gain_db": None},
+    "refraction_scatter": {"frames": 4, "sd_dpt": 0.05, "stated_sd_dpt": 0.04, "chi2": 4.6875},
+}
+BALANCED = {
+    "channels": [
+        {"name": "red", "shift_px": [0.5, -1.0], "predicted": False, "reason": None, "white_ratio": 0.056},
+        {"name": "blue", "shift_px": None, "predicted": True, "reason": None},
+    ],
+}
 REFUSED = {"refraction_dpt": dict.fromkeys(FIGURES) | {"refused": "no structure"}}
 RELEASES: list[dict[str, Any]] = [
     SOLVER, SOLVER | LIGHT, SOLVER | LIGHT | VISIT, SOLVER | LIGHT | VISIT | VERDICT,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY, SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | REFUSED,
     SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER,
+    SOLVER | LIGHT | VISIT | VERDICT | LATERALITY | CORRECTED | FRAMES | ORIGIN | CYLINDER | WARPED | BALANCED,
 ]  # fmt: skip
 KEYS = sorted(RELEASES[-1])
 
@@ -118,7 +129,7 @@ def test_the_report_of_each_release_is_read_and_missing_entries_have_their_defau
 
 def test_an_empty_report_has_every_default_and_no_correction() -> None:
     assert read_report({}) == CaptureReport()
-    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED) - set(FRAMES) - set(ORIGIN)
+    assert set(report_as_json(CaptureReport())) == set(KEYS) - set(CORRECTED) - set(FRAMES) - set(ORIGIN) - set(WARPED)
 
 
 @given(stored_reports(), st.sampled_from(["R-nerve", "L-nerve"]))

@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from device.clock import Deadline, SystemClock
 from device.recon.colour_reconstructor import NO_TIME, ColourReconstruction, ColourReconstructor
+from device.recon.estimation.psf_warp import Wavefront
 from device.recon.model.fft_plans import Planner
 from device.recon.reconstructor import Reconstructor, RoundDone, StageResult, Step
 from device.recon.white_balance import OVER_GREEN, RGB
@@ -101,9 +102,9 @@ def test_a_useless_frame_or_none_of_a_colour_gives_green_and_the_reason(bench: B
 def test_red_is_solved_with_its_psf_stretched_as_that_of_green(bench: Bench) -> None:
     stage = bench.red.stages[-1]
     stored = stage.model.otf.copy()
-    bench.colours.refocus("red", 0.97)
+    bench.colours.refocus("red", Wavefront(9.0, 1.0, 1.0))
     assert not np.allclose(stage.model.otf, stored, atol=0.05)
-    bench.colours.refocus("red", 1.0)
+    bench.colours.refocus("red", None)
     assert np.array_equal(stage.model.otf, stored)
 
 

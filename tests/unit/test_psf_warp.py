@@ -5,7 +5,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.errors import SettingError
-from device.recon.estimation.psf_warp import InterpolatedOtf, transform, warped
+from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, transform, warped
 from device.recon.estimation.refraction import NoRefraction, RefractionEstimator
 from device.recon.estimation.shading import Shading
 from device.recon.model.forward_model import Model, otf
@@ -77,8 +77,9 @@ def test_restoring_the_stored_otf_restores_the_picture(method: str) -> None:
     counts = np.random.default_rng(0).integers(500, 600, SHAPE).astype(np.uint16)
     stage, before = reconstruct.stages[0], reconstruct(counts, rounds=2).picture
     assert reconstruct.refractor is not None
-    stage.refocus(reconstruct.refractor.otf(stage.grid, 6.0), reconstruct.refractor.scale(6.0))
-    assert (stage.scale, stage.model.otf is stage.model.stored) == (pytest.approx(0.97975), False)
+    eye = Wavefront(6.0, 1.0, -0.5)
+    stage.refocus(reconstruct.refractor.otf(stage.grid, eye), eye)
+    assert (stage.eye, stage.model.otf is stage.model.stored) == (eye, False)
     assert np.array_equal(reconstruct(counts, rounds=2).picture, before)
 
 

@@ -1,5 +1,6 @@
 """Refraction tasks: order of the calls of their estimator, which holds the state of one frame, and errors."""
 
+from dataclasses import replace
 from threading import Event, Lock
 from typing import Any
 
@@ -34,6 +35,10 @@ class Estimator:
         self.calls.append(("cylinder", found.sphere_dpt))
         return found
 
+    def join(self, found: Refraction, frames: Any, dark: Any) -> Refraction:
+        self.calls.append(("join", found.sphere_dpt))
+        return replace(found, sphere_dpt=float(np.mean([counts[0, 0] for counts in frames])))
+
 
 def begin(estimator: Any, lock: Lock, sphere_dpt: float, with_cylinder: bool = True) -> RefractionTask:
     frame = np.full((2, 2), sphere_dpt, np.float32), None, None
@@ -54,6 +59,24 @@ def test_the_cylinder_follows_its_own_search_also_with_other_tasks_waiting() -> 
     assert [sphere_dpt(task) for task in tasks] == [1.0, 2.0, 3.0]
     pairs = [tuple(estimator.calls[k : k + 2]) for k in (0, 2, 4)]
     assert sorted(pairs) == [(("find", dpt), ("cylinder", dpt)) for dpt in (1.0, 2.0, 3.0)]
+
+
+def test_other_frames_join_after_the_cylinder_and_do_not_hold_it_back() -> None:
+    """`latest` needs the refraction of the first frame only; another task may come in between."""
+    estimator, lock = Estimator(), Lock()
+    task = begin(estimator, lock, 1.0)
+    task.join([np.full((2, 2), 4.0, np.float32)])
+    other = begin(estimator, lock, 2.0)
+    estimator.go.set()
+    assert sphere_dpt(other) == 2.0
+    assert sphere_dpt(task) == 2.5
+    latest = task.latest()
+    assert isinstance(latest, Refraction)
+    assert (latest.sphere_dpt, task.is_done) == (2.5, True)
+    assert estimator.calls.index(("cylinder", 1.0)) < estimator.calls.index(("join", 1.0))
+    refused = begin(estimator, lock, 0.0)
+    refused.join([np.full((2, 2), 4.0, np.float32)])
+    assert isinstance(refused.whole(), NoRefraction)
 
 
 def test_a_refused_frame_and_a_task_without_cylinder_search_for_none() -> None:

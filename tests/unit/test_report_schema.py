@@ -41,7 +41,12 @@ def test_every_key_of_every_report_has_a_description() -> None:
     schema = report_schema.report_schema()
     assert list(described(schema)) == []
     light = DoseReport(limits_unchecked=("photochemical_dose",))
-    made = Report("none", channels=(ChannelUse("green", (0.0, 0.0)),))
+    made = Report(
+        "none",
+        channels=(ChannelUse("green", (0.0, 0.0)),),
+        psf_cylinder={"j0_dpt": 0.5},
+        refraction_scatter={"chi2": 3.0},
+    )
     full = CaptureReport(
         made, light=light, moved=(EyeCorrection("OD", "R-centre"),), confirmed=EyeConfirmation(), device=RecordOrigin()
     )

@@ -27,8 +27,8 @@ from services.records.capture import Capture
 
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4)
 DESIGNED = [  # public interface: keys of report.json
-    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "refraction_dpt", "regularisation",
-    "noise_dn", "residual", "quality", "warnings", "frames", "channels",
+    "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
+    "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "frames", "channels",
 ]  # fmt: skip
 
 

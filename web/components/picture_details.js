@@ -26,6 +26,10 @@ export function refractionText({ sphere, sd, sphere_sc: sphereOfCylinder, cylind
   return t("detail.refraction.value", { ...mean, sphere: signed(sphereOfCylinder), cylinder: signed(cylinder), axis: number(axis, 0) });
 }
 
+function psfText({ gain_db: gain = null }) {
+  return gain === null ? t("detail.psf.cylinder") : t("detail.psf.gain", { db: number(gain, 1) });
+}
+
 export function detailsDialog({ grey, visit }, actions, { capture: { id, report, calibration_id: calibration, links, versions = [] }, slot, eye }) {
   const total_s = Object.values(report.seconds ?? {}).reduce((sum, part) => sum + part, 0);
   const frames = report.frames ?? [];
@@ -39,6 +43,7 @@ export function detailsDialog({ grey, visit }, actions, { capture: { id, report,
     ...(channels.length ? [["channels", channels.map(channelText).join(", ")]] : []),
     ...(links.colour ? [["hue", t(channels.some((one) => one.white_ratio != null) ? "detail.hue.card" : "detail.hue.photographs")]] : []),
     ...(report.refraction_dpt ? [["refraction", refractionText(report.refraction_dpt)]] : []),
+    ...(report.psf_cylinder ? [["psf", psfText(report.psf_cylinder)]] : []),
     ["seconds", t("detail.seconds.value", { s: number(total_s, 2) })],
     ["calibration", calibration],
     ["id", id],

@@ -358,4 +358,7 @@ export const WORDS = {
   "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
   "detail.refraction.mean": "औसत स्फीयर {mean} ± {sd} dpt; चश्मे के लिए नहीं",
   "detail.refraction.none": "इस तस्वीर में नापा नहीं जा सकता",
+  "detail.psf": "तस्वीर का PSF",
+  "detail.psf.gain": "सिलिंडर के लिए सुधारा गया, अनुमानित लाभ {db} dB",
+  "detail.psf.cylinder": "सिलिंडर के लिए सुधारा गया",
 };

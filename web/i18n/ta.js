@@ -370,4 +370,7 @@ export const WORDS = {
   "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
   "detail.refraction.mean": "சராசரி ஸ்பியர் {mean} ± {sd} dpt; கண்ணாடிக்கு அல்ல",
   "detail.refraction.none": "இந்தப் படத்தில் அளக்க முடியாது",
+  "detail.psf": "படத்தின் PSF",
+  "detail.psf.gain": "சிலிண்டருக்காகத் திருத்தப்பட்டது, கணித்த ஆதாயம் {db} dB",
+  "detail.psf.cylinder": "சிலிண்டருக்காகத் திருத்தப்பட்டது",
 };

@@ -358,4 +358,7 @@ export const WORDS = {
   "detail.refraction.value": "{sphere} / {cylinder} × {axis}°, సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
   "detail.refraction.mean": "సగటు స్పియర్ {mean} ± {sd} dpt; కళ్లద్దాల కోసం కాదు",
   "detail.refraction.none": "ఈ చిత్రంలో కొలవడం సాధ్యం కాదు",
+  "detail.psf": "చిత్రం PSF",
+  "detail.psf.gain": "సిలిండర్ కోసం సరిచేయబడింది, అంచనా లాభం {db} dB",
+  "detail.psf.cylinder": "సిలిండర్ కోసం సరిచేయబడింది",
 };

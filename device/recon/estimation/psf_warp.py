@@ -7,6 +7,8 @@ wave propagation the correlation is 0.9995 at 5 dpt. M > 0 means that the beam l
 spectacle correction has the opposite sign.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft as scipy_fft
@@ -24,6 +26,14 @@ Transform = NDArray[np.float64]
 PADDING = 6  # oversampling of the stored spectrum: the interpolation error at the PSF's edge is (1/12)^2 = 0.7 %
 REACH = 1.06  # a stretch by 9 dpt extends 3 % beyond the last frequency, cylinders a little more
 LARGEST = 4e6  # numbers in the table: 32 MB
+
+
+class Wavefront(NamedTuple):
+    """Mean sphere M and cylinder J0, J45 of an eye in dpt, as `transform` takes them."""
+
+    m_dpt: float
+    j0_dpt: float = 0.0
+    j45_dpt: float = 0.0
 
 
 def transform(geometry: Geometry, m_dpt: float, j0_dpt: float = 0.0, j45_dpt: float = 0.0) -> Transform:

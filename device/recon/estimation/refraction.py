@@ -11,7 +11,7 @@ the smooth part is blurred by a fixed PSF, the estimate is biased by one third t
 is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found for each fine search.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.psf_warp import transform
+from device.recon.estimation.psf_warp import Wavefront, transform
+from device.recon.estimation.refraction_burst import LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
 from device.recon.estimation.refraction_crop import CropRefinement
 from device.recon.estimation.refraction_cylinder import find_cylinder
 from device.recon.estimation.refraction_edge import EdgeLikelihood
@@ -49,6 +50,8 @@ MOST_SD_DPT = 1.5
 MOST_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
+LEAST_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains 0.02 to 0.13 dB, and as |J|^2
+
 Floats = NDArray[np.float64]
 
 
@@ -61,6 +64,16 @@ class Cylinder:
     j45_dpt: float
     j45_sd_dpt: float
 
+    @property
+    def in_doubt(self) -> bool:
+        """True if the PSF of the mean sphere is to be used: |J| below 0.25 dpt or 3 sd (the rms of both sds).
+
+        A picture loses in proportion to the squared error of (J0, J45), so that an estimate beyond 2 sd is expected to
+        gain; but 14 % of the estimates of an eye without a cylinder are, and 1 % beyond 3 sd (Rayleigh distribution).
+        """
+        size_dpt, sd_dpt = np.hypot(self.j0_dpt, self.j45_dpt), np.hypot(self.j0_sd_dpt, self.j45_sd_dpt) / 2**0.5
+        return bool(size_dpt < max(LEAST_CYLINDER_DPT, 3 * sd_dpt))
+
 
 @dataclass(frozen=True)
 class Refraction:
@@ -69,7 +82,8 @@ class Refraction:
     The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
     (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
     the coarse grid. `edge` is the edge of the lit field that was found with M.
-    `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`.
+    `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`, `scatter`
+    before `join`.
     """
 
     sphere_dpt: float
@@ -80,11 +94,20 @@ class Refraction:
     edge: FieldEdge
     missing_sd_dpt: float
     cylinder: Cylinder | None = None
+    scatter: FrameScatter | None = None
 
     @property
     def in_doubt(self) -> bool:
         """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 `sd_dpt`)."""
         return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
+
+    @property
+    def psf_wavefront(self) -> Wavefront | None:
+        """Wavefront of the PSF of the picture, with the cylinder if it is not in doubt; None for the stored PSF."""
+        cylinder = self.cylinder
+        if cylinder is not None and not cylinder.in_doubt:
+            return Wavefront(self.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt)
+        return None if self.in_doubt else Wavefront(self.sphere_dpt)
 
 
 @dataclass(frozen=True)
@@ -173,6 +196,32 @@ class RefractionEstimator:
         except np.linalg.LinAlgError:  # an information matrix without full rank
             return NoRefraction("the frame does not determine a cylinder")
 
+    def join(self, found: Refraction, frames: Sequence[Pixels], dark: Pixels | None) -> Refraction | NoRefraction:
+        """Return the refraction of a burst whose first frame gave `found`, and the scatter between its frames.
+
+        `frames` (rows, cols) in counts begin with the first one. The sd of M grows to the scatter, if that is larger.
+        `found` is returned without a refined cylinder, and for less than LEAST_FRAMES.
+        """
+        cylinder = found.cylinder
+        if cylinder is None or len(frames) < LEAST_FRAMES or not self._is_refined:
+            return found
+        eye_dpt = np.array([found.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt])
+        cleaned = [(counts, dark, self.defects(counts, dark)) for counts in frames]
+        steps_dpt = self._refinement.steps(eye_dpt, found.edge, cleaned)
+        scatter = FrameScatter.of(steps_dpt[:, 0], found.sd_dpt)
+        if scatter.sd_dpt > MOST_SCATTER_DPT:
+            return NoRefraction(f"the refractions of the frames scatter by {scatter.sd_dpt:.1f} dpt")
+        m_dpt, j0_dpt, j45_dpt = (eye_dpt + (steps_dpt - steps_dpt[0]).mean(axis=0)).tolist()
+        return replace(
+            found, sphere_dpt=m_dpt, sd_dpt=found.sd_dpt * scatter.growth, psf_scale=self.scale(m_dpt),
+            cylinder=replace(cylinder, j0_dpt=j0_dpt, j45_dpt=j45_dpt), scatter=scatter,
+        )  # fmt: skip
+
+    @property
+    def _is_refined(self) -> bool:
+        """True if the samples are fine enough for the refinement."""
+        return self._edges.grid.n * self.geometry.pitch_um <= MOST_SAMPLE_UM
+
     def _with_cylinder(self, found: Refraction) -> Refraction | NoRefraction:
         model = find_cylinder(self._edges, found.sphere_dpt, self._blocks)
         if model is None:
@@ -181,7 +230,7 @@ class RefractionEstimator:
         if sds_dpt.max() > MOST_SD_DPT:
             return NoRefraction(f"the standard deviation with a cylinder would be {sds_dpt.max():.1f} dpt")
         eye_dpt = model.minimum
-        if self._edges.grid.n * self.geometry.pitch_um <= MOST_SAMPLE_UM:
+        if self._is_refined:
             refined = self._refinement(eye_dpt)
             if not refined.is_valid:
                 return NoRefraction("no retina explains the frame with this PSF")
@@ -222,10 +271,10 @@ class RefractionEstimator:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
         return 1 - self.geometry.scale_per_dpt * m_dpt
 
-    def otf(self, grid: Grid, m_dpt: float) -> Spectrum:
-        """Return the OTF of an eye with mean sphere M on a grid, complex64 (rows, cols//2 + 1)."""
+    def otf(self, grid: Grid, eye: Wavefront) -> Spectrum:
+        """Return the OTF of an eye on a grid, complex64 (rows, cols//2 + 1)."""
         otf = self._edges.likelihood.interpolated_otf
-        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, m_dpt))
+        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, *eye))
 
 
 class Search:

@@ -12,13 +12,16 @@ is fitted before the detail, give the score of the true eye a mean that is not 0
 the cost of six more solves, where the sensor crops the blurred field; elsewhere it is small, and b = 0.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.estimation.refraction_burst import BurstFrame, frame_steps
 from device.recon.estimation.refraction_crop_model import CropModel, Fit
 from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.estimation.refraction_field import FieldEdge
 from device.recon.model.fft_plans import Planner
 
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
@@ -63,6 +66,10 @@ class CropRefinement:
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
         self._edges, self._model = edges, CropModel(edges, planner, psf_radius_px)
+
+    def steps(self, eye_dpt: Floats, edge: FieldEdge, frames: Sequence[BurstFrame]) -> Floats:
+        """Return the step of each frame of a burst from an eye, as `frame_steps` does."""
+        return frame_steps(self._edges, self._model, eye_dpt, edge, frames)
 
     def __call__(self, eye_dpt: Floats) -> Refined:
         """Return the refinement of an eye (M, J0, J45) of the frame that `edges` was started with."""

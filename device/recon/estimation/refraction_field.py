@@ -103,6 +103,11 @@ class EdgePrior:
         away = np.abs(edge.vector - self.calibrated.vector)[:3]
         return bool(away.max() > 0.99 * self._reach)
 
+    def in_samples(self, edge: FieldEdge) -> Edge:
+        """Return an edge in samples; the inverse of `in_degrees`."""
+        parts = edge.diameter_deg / 2, edge.down_deg, edge.right_deg, edge.width_deg
+        return Edge(*(part * self._per_deg for part in parts))
+
     def in_degrees(self, edge: Edge, radius_sd_samples: float) -> FieldEdge:
         """Return an edge in degrees, with the standard deviation of its diameter."""
         radius, down, right, width = (edge.vector / self._per_deg).tolist()

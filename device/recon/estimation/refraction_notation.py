@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from device.recon.estimation.refraction import NoRefraction, Refraction
 
+SCATTER_KEYS = ("frames", "sd_dpt", "stated_sd_dpt", "chi2")
 REFRACTION_KEYS = (
     "sphere", "sd", "j0", "j0_sd", "j45", "j45_sd", "sphere_sc", "cylinder", "axis_deg", "field_deg", "field_deg_sd",
     "refused",
@@ -54,3 +55,11 @@ def report_of(found: Refraction | NoRefraction) -> dict[str, float | str | None]
             "sphere_sc": lens.sphere_dpt, "cylinder": lens.cylinder_dpt, "axis_deg": lens.axis_deg,
         }  # fmt: skip
     return report
+
+
+def scatter_of(found: Refraction | NoRefraction | None) -> dict[str, float] | None:
+    """Return `refraction_scatter` of a report; None if the refraction is not that of at least three frames."""
+    if not isinstance(found, Refraction) or found.scatter is None:
+        return None
+    scatter = found.scatter
+    return dict(zip(SCATTER_KEYS, (scatter.count, scatter.sd_dpt, scatter.stated_sd_dpt, scatter.chi2), strict=True))

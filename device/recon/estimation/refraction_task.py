@@ -1,6 +1,7 @@
 """Refraction of one frame, estimated in a thread while other work goes on: exposures, or rounds of a solver."""
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from threading import Lock
 
 from device.clock import Clock
@@ -19,25 +20,39 @@ class RefractionTask:
         self, estimator: RefractionEstimator, lock: Lock, clock: Clock,
         frame: tuple[Pixels, Pixels | None, Places | None], with_cylinder: bool,
     ) -> None:  # fmt: skip
-        self._estimator, self._lock, self._clock = estimator, lock, clock
-        self.find_s = self.cylinder_s = 0.0  # durations, once the results are there
+        self._estimator, self._lock, self._clock, self._frame = estimator, lock, clock, frame
+        self.find_s = self.cylinder_s = self.join_s = 0.0  # durations, once the results are there
         aside = ThreadPoolExecutor(1, "refraction")
         self._found = aside.submit(self._find, frame)
-        self._whole = aside.submit(self._finish, with_cylinder)
+        self._whole = self._last = aside.submit(self._finish, with_cylinder)
+        aside.shutdown(wait=False)
+
+    def join(self, others: Sequence[Pixels]) -> None:
+        """Begin to join the refraction with that of the other frames of a burst, once the cylinder is known.
+
+        They have the dark frame of the first one.
+        """
+        aside = ThreadPoolExecutor(1, "refraction-burst")
+        self._last = aside.submit(self._join, others)
         aside.shutdown(wait=False)
 
     @property
     def is_done(self) -> bool:
         """Whether `whole` returns without waiting."""
-        return self._whole.done()
+        return self._last.done()
 
     def found(self) -> Refraction | NoRefraction:
         """Wait for the refraction without its cylinder."""
         return self._found.result()
 
+    def latest(self) -> Refraction | NoRefraction:
+        """Wait for the refraction without its cylinder; return it with what is known beside it."""
+        futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
+        return next((one for one in futures if one.done()), self._found).result()
+
     def whole(self) -> Refraction | NoRefraction:
-        """Wait for the refraction, with its cylinder if the task has one."""
-        return self._whole.result()
+        """Wait for the refraction, with its cylinder if the task has one, and joined if `join` was called."""
+        return self._last.result()
 
     def _find(self, frame: tuple[Pixels, Pixels | None, Places | None]) -> Refraction | NoRefraction:
         self._lock.acquire()  # `_finish` releases it, in the same thread
@@ -57,3 +72,14 @@ class RefractionTask:
             return whole
         finally:
             self._lock.release()
+
+    def _join(self, others: Sequence[Pixels]) -> Refraction | NoRefraction:
+        first = self._whole.result()
+        if not isinstance(first, Refraction):
+            return first
+        counts, dark, _ = self._frame
+        with self._lock:
+            begin_s = self._clock.now_s()
+            joined = self._estimator.join(first, (counts, *others), dark)
+            self.join_s = self._clock.now_s() - begin_s
+        return joined

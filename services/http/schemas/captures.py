@@ -135,11 +135,12 @@ class EyeConfirmationAnswer(StoredPart):
 class ReportAnswer(StoredPart):
     """Report of a capture, with the keys of `report.json`: reconstruction, light, visit, verdict, laterality.
 
-    `seconds`: durations by stage; `budget_s`: time budget. `dose_j_per_cm2`: dose of this exposure;
-    `dose_24h_j_per_cm2`: dose of each eye in 24 h; `dose_high`: eyes above the warning; `limits_unchecked`: light
-    limits that were not compared with the purchased standard. `frames`: one entry per frame of the burst.
-    `channels`: one entry per colour, also for one that could not be taken; not for a grey picture by design. `moved`:
-    corrections of the eye, `confirmed`: its confirmation; both only where they exist.
+    `seconds`: durations by stage; `budget_s`: time budget. `psf_cylinder`: cylinder of the PSF of the picture and its
+    predicted gain; only if the PSF has one. `refraction_scatter`: scatter of the refraction between the frames of a
+    burst. `dose_j_per_cm2`: dose of this exposure; `dose_24h_j_per_cm2`: dose of each eye in 24 h; `dose_high`: eyes
+    above the warning; `limits_unchecked`: light limits that were not compared with the purchased standard. `frames`:
+    one entry per frame of the burst. `channels`: one entry per colour, also for one that could not be taken; not for a
+    grey picture by design. `moved`: corrections of the eye, `confirmed`: its confirmation; both only where they exist.
     """
 
     method: str
@@ -149,7 +150,9 @@ class ReportAnswer(StoredPart):
     seconds: dict[str, Number]
     psf_index: int
     psf_scale: Number
+    psf_cylinder: OmittedIfNone[dict[str, Number | None]] = None
     refraction_dpt: dict[str, Number | str | None] | None
+    refraction_scatter: OmittedIfNone[dict[str, Number]] = None
     regularisation: dict[str, JsonValue]
     noise_dn: Number | None
     residual: Number | None
