@@ -40,17 +40,17 @@ CHART_AWAY: dict[str, Offset] = {
 }  # fmt: skip
 OBLIQUE = View((-0.60, 0.52, 0.24))
 FROM_FRONT = View((-0.60, 0.45, -0.45))
-STEPS: dict[str, tuple[View, dict[str, Offset]]] = {  # each step of the guide: what joins what, and from where
-    "iris": (OBLIQUE, {"diffuser cell": (0, 0, 0), "iris": (0, 0, 22), "diffuser": (0, 0, 34),
+STEPS: dict[str, tuple[int, View, dict[str, Offset]]] = {  # a step of the guide: its number, what joins what
+    "iris": (2, OBLIQUE, {"diffuser cell": (0, 0, 0), "iris": (0, 0, 22), "diffuser": (0, 0, 34),
                        "retaining ring": (0, 0, 48)}),
-    "sensor": (OBLIQUE, {"diffuser cell": (0, 0, 0), "sensor spacer": (0, 0, 22), "camera": (0, 0, 44),
+    "sensor": (3, OBLIQUE, {"diffuser cell": (0, 0, 0), "sensor spacer": (0, 0, 22), "camera": (0, 0, 44),
                          "camera cover": (0, 0, 66)}),
-    "splitter": (OBLIQUE, {"splitter block": (0, 0, 0), "beam splitter": (-48, 0, 0), "plate lid": (-78, 0, 0)}),
-    "polariser": (FROM_FRONT, {"diffuser cell": (0, 0, 0), "polariser film": (0, 0, -20), "polariser ring": (0, 0, -34),
-                               "lever": (0, 16, 0), "splitter block": (0, 0, -62)}),
-    "ring": (OBLIQUE, {"splitter block": (0, 0, 0), "LED film": (0, 14, 0), "LED cap": (0, 34, 0),
+    "splitter": (4, OBLIQUE, {"splitter block": (0, 0, 0), "beam splitter": (-48, 0, 0), "plate lid": (-78, 0, 0)}),
+    "polariser": (5, FROM_FRONT, {"diffuser cell": (0, 0, 0), "polariser film": (0, 0, -20),
+                                  "polariser ring": (0, 0, -34), "lever": (0, 16, 0), "splitter block": (0, 0, -62)}),
+    "ring": (7, OBLIQUE, {"splitter block": (0, 0, 0), "LED film": (0, 14, 0), "LED cap": (0, 34, 0),
                        "LED matrix": (0, 54, 0), "LED cover": (0, 72, 0)}),
-    "tubes": (FROM_FRONT, {"splitter block": (0, 0, 0), "tube flange": (0, 0, -34), "lens tubes": (0, 0, -66)}),
+    "tubes": (8, FROM_FRONT, {"splitter block": (0, 0, 0), "tube flange": (0, 0, -34), "lens tubes": (0, 0, -66)}),
 }  # fmt: skip
 
 
@@ -82,9 +82,10 @@ def chart_eye(d: Dimensions) -> str:
 
 def step(name: str, d: Dimensions) -> str:
     """One step of the guide: its parts on their way to where they belong."""
-    view, away = STEPS[name]
+    number, view, away = STEPS[name]
     shapes = {part: one.shape for part, one in assembly.printed().items()} | bought.HEAD
-    return _exploded(f"Step: {name}", {part: shapes[part](d) for part in away}, away, 3.6, view)
+    parts = {part: shapes[part](d) for part in away}
+    return _exploded(f"Step {number}, {name}", parts, away, 3.6, view, beside=90 if UPRIGHT & set(away) else 0)
 
 
 def relay(d: Dimensions) -> str:
@@ -93,7 +94,7 @@ def relay(d: Dimensions) -> str:
     faces, half = traced.lamp_surfaces, d.path.relay.lens_mm / 2
     lenses = [_lens(faces[first : first + 3], half) for first in range(0, len(faces), 3)]
     planes = [Drawn("", z, -half, z, half) for z in (0.0, traced.iris_at_mm)]
-    sheet = Sheet("The lenses in their tubes, from the eye to the iris", [*lenses, *planes], 4.0)
+    sheet = Sheet("Step 1, relay: the lenses cut along their axis", [*lenses, *planes], 4.0)
     last, second = len(faces) // 2 - 1, len(faces) // 2
     spans = [(0.0, faces[0].at_mm), (faces[last].at_mm, faces[second].at_mm), (faces[-1].at_mm, traced.iris_at_mm)]
     over = []
@@ -121,11 +122,12 @@ def _lens(faces: Sequence[Surface], half_mm: float) -> Drawn:
 
 
 def _exploded(
-    title: str, parts: dict[str, Part], away: dict[str, Offset], px_per_mm: float, view: View = OBLIQUE
+    title: str, parts: dict[str, Part], away: dict[str, Offset], px_per_mm: float, view: View = OBLIQUE, beside: int = 0
 ) -> str:
+    """Parts away from their places, with names; `beside` px of room for names to the right of all parts."""
     drawn = {name: view.seen(part, _kind(name), away.get(name, (0, 0, 0))) for name, part in parts.items()}
     behind = sorted(drawn, key=lambda name: drawn[name].depth)
-    sheet = Sheet(title, drawn.values(), px_per_mm)
+    sheet = Sheet(title, drawn.values(), px_per_mm, beside=beside)
     body = [drawn[name].svg for name in behind]
     return sheet.document(body, labels(sheet, drawn, frozenset(parts) & UPRIGHT))
 
