@@ -64,6 +64,7 @@ pi: ## On a Raspberry Pi: install the drivers, let .venv see them, switch SPI an
 
 # KiCad 9 comes from Debian 13 in a chroot of 1.5 GB, which only root can make; nothing of the tests needs it.
 GATE_ROOT := out/kicad
+GERBERS := F.Cu,B.Cu,F.Mask,B.Mask,F.Paste,B.Paste,F.SilkS,B.SilkS,Edge.Cuts
 
 $(GATE_ROOT)/ready:
 	@[ "$$(id -u)" = 0 ] || { echo "make gate makes a chroot, which only root can: sudo make gate"; exit 1; }
@@ -72,12 +73,21 @@ $(GATE_ROOT)/ready:
 		trixie $(GATE_ROOT) http://deb.debian.org/debian
 	@touch $@
 
-gate: $(GATE_ROOT)/ready ## Check the schematic of the gate with KiCad 9 (ERC), and write netlist and drawing to out/gate; needs root.
-	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p out/gate
+gate: $(GATE_ROOT)/ready ## Check schematic (ERC) and boards (DRC) of gate and ring with KiCad 9, write what a maker of boards needs to out/gate; needs root.
+	@rm -rf $(GATE_ROOT)/gate out/gate && cp -r hardware/gate $(GATE_ROOT)/gate && mkdir -p $(GATE_ROOT)/gate/out
 	@chroot $(GATE_ROOT) sh -c 'cd /gate && export HOME=/ && kicad-cli version && \
-		kicad-cli sch erc --severity-all --exit-code-violations -o erc.rpt gate.kicad_sch && \
-		kicad-cli sch export netlist -o gate.net gate.kicad_sch && kicad-cli sch export svg -o . gate.kicad_sch'
-	@cp $(GATE_ROOT)/gate/erc.rpt $(GATE_ROOT)/gate/gate.net $(GATE_ROOT)/gate/gate.svg out/gate && cat out/gate/erc.rpt
+		kicad-cli sch erc --severity-all --exit-code-violations -o out/erc.rpt gate.kicad_sch && \
+		kicad-cli sch export netlist -o out/gate.net gate.kicad_sch && kicad-cli sch export svg -o out gate.kicad_sch && \
+		for board in gate ring; do \
+			kicad-cli pcb drc --severity-all --exit-code-violations -o out/$$board-drc.rpt $$board.kicad_pcb && \
+			kicad-cli pcb export gerbers -l $(GERBERS) -o out/$$board/ $$board.kicad_pcb && \
+			kicad-cli pcb export drill -o out/$$board/ $$board.kicad_pcb && \
+			kicad-cli pcb export pos --format csv --units mm -o out/$$board/places.csv $$board.kicad_pcb && \
+			for side in top bottom; do \
+				kicad-cli pcb render --side $$side -w 900 --height 640 -o out/$$board-$$side.png $$board.kicad_pcb || exit 1; \
+			done || exit 1; \
+		done' >$(GATE_ROOT)/log 2>&1 || { cat $(GATE_ROOT)/log $(GATE_ROOT)/gate/out/*.rpt; exit 1; }
+	@cp -r $(GATE_ROOT)/gate/out out/gate && cat out/gate/*.rpt
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py

@@ -142,9 +142,7 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
     its buffers (None: the library's own). HeadMismatch if the head's memory contradicts the calibration. After an error
     all opened parts are dark and closed.
     """
-    if spec.calibration is not None:
-        kept = Archive(spec.calibration.archive).load()
-        spec = with_led_radiometry(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
+    spec = with_calibrated_light(spec)
     if spec.light.backend == "none":
         raise SpecError(
             f"{spec.name} has no lamp, so it takes no pictures of eyes",
@@ -156,6 +154,36 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
         head = _replayed(opening, ledger) if spec.camera.backend == "replay" else _opened(opening, ledger)
         refuse_mismatched_head(head)
         return replace(head, resources=opening.resources.pop_all())
+
+
+def with_calibrated_light(spec: InstrumentSpec) -> InstrumentSpec:
+    """Return the head with the LED readings of its calibration; unchanged without an archive or readings."""
+    if spec.calibration is None:
+        return spec
+    kept = Archive(spec.calibration.archive).load()
+    return with_led_radiometry(spec, dict(kept.provenance.figures), f"calibration {kept.calibration.id}")
+
+
+def refuse_without_lamp(spec: InstrumentSpec) -> None:
+    """Raise SpecError for a head without a lamp of its own."""
+    if spec.light.backend in ("none", "replay"):
+        raise SpecError(f"{spec.name} has no lamp of its own", "Give the file of a head with LEDs.")
+
+
+@contextmanager
+def open_light(spec: InstrumentSpec, clock: Clock, ledger: Ledger) -> Iterator[GuardedLight]:
+    """Open the guarded lamp of a head alone, without camera and calibration; it is dark and closed on exit.
+
+    With heartbeat and guardian process as in `open_head`, and limits by the radiometry of `spec`. SpecError for a head
+    without a lamp of its own, LightFault.
+    """
+    refuse_without_lamp(spec)
+    with HeadOpener(spec, clock) as opening:
+        light = GuardedLight(opening.lamp(), clock, spec.light.max_on_s, hazard_of(spec), ledger)
+        try:
+            yield light
+        finally:
+            light.off()
 
 
 class HeadOpener:

@@ -277,15 +277,46 @@ def take_frame(
     typer.echo(f"{output}: {summary(counts)}")
 
 
+@app.command("meter")
+def light_for_meter(
+    head: Annotated[Path, typer.Option(help="Head file whose ring is measured; no camera is opened.")],
+    colour: Annotated[str, typer.Option(help="Of the light; by default the picture's.")] = "",
+    seconds: Annotated[float, typer.Option(min=0.1, max=120, help="Of pulses and pauses together.")] = 20,
+    level: Annotated[
+        float | None, typer.Option(min=0.001, max=1, help="Share of full drive; by default all that is permitted.")
+    ] = None,
+    mean: Annotated[bool, typer.Option("--mean", help="The meter shows the mean over pulses and pauses.")] = False,
+    data: Annotated[Path | None, typer.Option(help="Where the dose is counted, as of an eye.")] = None,
+) -> None:
+    """Light the ring for a power meter in pulses, ask for its reading, and compare it with the limits.
+
+    No person looks in. The light guard permits no continuous light: half of the time is dark. The exit status is 1 if
+    the ring is brighter than the guard counts, or than an eye may see.
+    """
+    from services.lab import measured_light, power_meter
+
+    spec = load_head(head)
+    spec = measured_light.in_colour(spec, colour) if colour else spec
+    run = power_meter.run_of(spec, level, seconds)
+    typer.echo(power_meter.announcement(run))
+    typer.confirm("A power meter stands at the pupil, and no person looks in?", abort=True)
+    power_meter.give_pulses(run, data or _default_data(), SystemClock(), _progress)
+    shown_mw = typer.prompt("Reading in mW", type=float)
+    verdict = power_meter.judge_reading(run, shown_mw, mean=mean)
+    typer.echo(power_meter.words(head, run, verdict))
+    raise typer.Exit(0 if verdict.is_go else 1)
+
+
 @app.command("light")
 def judge_light(
     head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
-    power_mw: Annotated[float, typer.Option(min=0, help="Into a pupil of 7 mm, whole ring, full drive, one colour.")],
+    power_mw: Annotated[float, typer.Option(min=0, help="Into a pupil of 7 mm, whole ring, one colour, while lit.")],
     waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
     peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
     meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],
     colour: Annotated[str, typer.Option(help="Of the reading; by default the picture's.")] = "",
     guard_factor: Annotated[float, typer.Option(min=1.3, max=10, help="For the meter's error.")] = 1.3,
+    level: Annotated[float, typer.Option(min=0.001, max=1, help="Share of full drive, as diffuscope meter says.")] = 1,
 ) -> None:
     """Judge a power meter's reading of a ring: its shares of the limits, GO or NO GO, and the lines for the head file.
 
@@ -297,6 +328,7 @@ def judge_light(
     if colour:
         spec = measured_light.in_colour(spec, colour)
     reading = measured_light.MeterReading(spec.light.colour, power_mw, waist_mw_per_cm2, peak_nm, meter, guard_factor)
+    reading = reading.scaled(level)
     found = measured_light.judge(spec, optics_report.design_of(spec), reading)
     typer.echo(measured_light.words(reading, found))
     raise typer.Exit(0 if found.is_go else 1)

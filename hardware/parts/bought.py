@@ -59,7 +59,7 @@ def _led(d: Dimensions, at: tuple[float, float]) -> Part:
 def beam_splitter(d: Dimensions) -> Part:
     """The plate; its coated face looks to lenses and LEDs."""
     plane = Plane((0, *along_plate(d, 0, 0)), z_dir=(0, -1, 1))
-    return Part() + Solid.make_cylinder(d.path.relay.splitter_mm / 2, d.bought.plate_thick_mm, plane)
+    return Part() + Solid.make_cylinder(d.path.relay.splitter_mm / 2, d.plate_thick_mm, plane)
 
 
 def lens_tube(d: Dimensions) -> Part:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from math import cos, radians, sin, sqrt, tan
 from pathlib import Path
 
+from device.errors import SpecError
+from device.optics.lens_data import LayoutSpec, named_glass
 from device.optics.light_path import LightPath, load_light_path, relay_of
 from device.optics.matrix import led_positions_mm, ring
 
@@ -31,8 +33,6 @@ class Bought:
     cover_glass_mm: float = 0.5  # measure, or the sensor's data sheet
     cover_glass_index: float = 1.5
     cover_to_image_mm: float = 0.4
-    plate_thick_mm: float = 3.0  # measure
-    plate_index: float = 1.46  # fused silica
     film_mm: float = 20.0  # polariser, cut to a disc
     film_thick_mm: float = 0.3
     led_mm: float = 2.0  # APA102-2020
@@ -105,10 +105,23 @@ class Dimensions:
         return -self.path.relay.splitter_to_iris_mm
 
     @property
+    def plate_thick_mm(self) -> float:
+        """Thickness of the beam splitter."""
+        return self._layout.plate_mm
+
+    @property
+    def _layout(self) -> LayoutSpec:
+        if self.path.layout is None:
+            raise SpecError("the light path has no table [layout], which says how thick the beam splitter is",
+                            "Copy [layout] from hardware/optics.toml, with the thickness of your plate.")  # fmt: skip
+        return self.path.layout
+
+    @property
     def lens_y_mm(self) -> float:
         """How far the lenses' axis lies above the iris's: the tilted plate moves what passes it sideways."""
-        part, tilt = self.bought, radians(45)
-        return part.plate_thick_mm * sin(tilt) * (1 - cos(tilt) / sqrt(part.plate_index**2 - sin(tilt) ** 2))
+        tilt, glass = radians(45), named_glass(self.path.glass, self._layout.plate_glass, "the beam splitter")
+        index = glass.index(self.path.optics.wavelength_um)
+        return self.plate_thick_mm * sin(tilt) * (1 - cos(tilt) / sqrt(index**2 - sin(tilt) ** 2))
 
     @property
     def led_y_mm(self) -> float:
@@ -175,9 +188,16 @@ class Dimensions:
         return -9.0
 
     @property
+    def slot_mm(self) -> float:
+        """Width of the slot in which the beam splitter lies."""
+        return self.plate_thick_mm + self.fit.slide_mm
+
+    @property
     def spigot_z_mm(self) -> float:
-        """End of the cell's spigot in the block."""
-        return self.cell_front_z_mm - 2.4
+        """End of the cell's spigot in the block: 2.4 mm deep, or what the slot of a thick plate leaves of that."""
+        half = self.path.relay.splitter_mm / 2 + self.fit.slide_mm
+        slot_end = self.plate_z_mm + (half + self.slot_mm) * sin(radians(45))
+        return max(self.cell_front_z_mm - 2.4, slot_end + self.fit.wall_mm + self.fit.press_mm)
 
     @property
     def cell_rear_z_mm(self) -> float:

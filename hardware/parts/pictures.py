@@ -1,17 +1,22 @@
 """The pictures of the assembly guide, drawn from the models that are printed: `make part-pictures`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from math import copysign, sqrt
 from pathlib import Path
 
 from build123d import Part
 
 from device.optics import field_extent
 from device.optics.light_path import relay_of
-from hardware.parts import assembly
+from device.optics.ray_trace import Surface
+from device.optics.traced_relay import traced_relay
+from hardware.parts import assembly, bought
 from hardware.parts.dimensions import Dimensions
 from hardware.parts.sheet import MEASURE, Sheet, labels
 from hardware.parts.view import Drawn, Offset, View, cut
-from services.lab.plot import text
+from services.lab.plot import line, text
 
 BESIDE = {"LED cap", "LED cover", "LED matrix"}  # cut where LEDs of the ring are
 UPRIGHT = {"LED film", *BESIDE}  # taken apart upwards
@@ -34,6 +39,19 @@ CHART_AWAY: dict[str, Offset] = {
     "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "retina chart": (0, 0, -56), "chart piston": (0, 0, -70),
 }  # fmt: skip
 OBLIQUE = View((-0.60, 0.52, 0.24))
+FROM_FRONT = View((-0.60, 0.45, -0.45))
+STEPS: dict[str, tuple[int, View, dict[str, Offset]]] = {  # a step of the guide: its number, what joins what
+    "iris": (2, OBLIQUE, {"diffuser cell": (0, 0, 0), "iris": (0, 0, 22), "diffuser": (0, 0, 34),
+                       "retaining ring": (0, 0, 48)}),
+    "sensor": (3, OBLIQUE, {"diffuser cell": (0, 0, 0), "sensor spacer": (0, 0, 22), "camera": (0, 0, 44),
+                         "camera cover": (0, 0, 66)}),
+    "splitter": (4, OBLIQUE, {"splitter block": (0, 0, 0), "beam splitter": (-48, 0, 0), "plate lid": (-78, 0, 0)}),
+    "polariser": (5, FROM_FRONT, {"diffuser cell": (0, 0, 0), "polariser film": (0, 0, -20),
+                                  "polariser ring": (0, 0, -34), "lever": (0, 16, 0), "splitter block": (0, 0, -62)}),
+    "ring": (7, OBLIQUE, {"splitter block": (0, 0, 0), "LED film": (0, 14, 0), "LED cap": (0, 34, 0),
+                       "LED matrix": (0, 54, 0), "LED cover": (0, 72, 0)}),
+    "tubes": (8, FROM_FRONT, {"splitter block": (0, 0, 0), "tube flange": (0, 0, -34), "lens tubes": (0, 0, -66)}),
+}  # fmt: skip
 
 
 def pictures(d: Dimensions, folder: Path) -> list[Path]:
@@ -49,23 +67,67 @@ def pictures(d: Dimensions, folder: Path) -> list[Path]:
 def exploded(d: Dimensions) -> str:
     """Every part of the head beside its place, along the axes on which it is put together."""
     parts = {name: part for name, part in assembly.head(d).items() if name != "dust cap"}
-    return _exploded("The head, taken apart", parts, AWAY)
+    return _exploded("The head, taken apart", parts, AWAY, 4.2)
 
 
 def eye(d: Dimensions) -> str:
     """The calibration's eye."""
-    return _exploded("The eye for the calibration, taken apart", assembly.eye(d), EYE_AWAY)
+    return _exploded("The eye for the calibration, taken apart", assembly.eye(d), EYE_AWAY, 4.2)
 
 
 def chart_eye(d: Dimensions) -> str:
     """The model eye with its retina chart."""
-    return _exploded("The model eye with its retina chart, taken apart", assembly.chart_eye(d), CHART_AWAY)
+    return _exploded("The model eye with its retina chart, taken apart", assembly.chart_eye(d), CHART_AWAY, 4.2)
 
 
-def _exploded(title: str, parts: dict[str, Part], away: dict[str, Offset]) -> str:
-    drawn = {name: OBLIQUE.seen(part, _kind(name), away.get(name, (0, 0, 0))) for name, part in parts.items()}
+def step(name: str, d: Dimensions) -> str:
+    """One step of the guide: its parts on their way to where they belong."""
+    number, view, away = STEPS[name]
+    shapes = {part: one.shape for part, one in assembly.printed().items()} | bought.HEAD
+    parts = {part: shapes[part](d) for part in away}
+    return _exploded(f"Step {number}, {name}", parts, away, 3.6, view, beside=90 if UPRIGHT & set(away) else 0)
+
+
+def relay(d: Dimensions) -> str:
+    """The lenses cut along their axis, as they stand in the tubes: which face looks where, and distances of glass."""
+    traced = traced_relay(d.path)
+    faces, half = traced.lamp_surfaces, d.path.relay.lens_mm / 2
+    lenses = [_lens(faces[first : first + 3], half) for first in range(0, len(faces), 3)]
+    planes = [Drawn("", z, -half, z, half) for z in (0.0, traced.iris_at_mm)]
+    sheet = Sheet("Step 1, relay: the lenses cut along their axis", [*lenses, *planes], 4.0)
+    last, second = len(faces) // 2 - 1, len(faces) // 2
+    spans = [(0.0, faces[0].at_mm), (faces[last].at_mm, faces[second].at_mm), (faces[-1].at_mm, traced.iris_at_mm)]
+    over = []
+    for begin, end in spans:
+        over.append(sheet.measure((begin, 0), (end, 0)))
+        x, y = sheet.at(((begin + end) / 2, 0))
+        over.append(text(x, y - 8, f"{end - begin:.1f} mm", MEASURE, "middle"))
+    for words, z in (("pupil of the eye", 0.0), ("iris", traced.iris_at_mm)):
+        (x, top), (_, bottom) = sheet.at((z, half)), sheet.at((z, -half))
+        over += [line(x, top, x, bottom, "measure"), text(x, top - 8, words, "small name", "middle")]
+    for words, first, end in (("doublets 75 mm", 0, last), ("doublets 100 mm", second, -1)):
+        x, y = sheet.at(((faces[first].at_mm + faces[end].at_mm) / 2, half))
+        over.append(text(x, y - 26, words, "small name", "middle"))
+    return sheet.document([one.svg for one in lenses], over)
+
+
+def _lens(faces: Sequence[Surface], half_mm: float) -> Drawn:
+    """One cemented doublet: outlines of its two glasses between three faces."""
+    curves = [[(face.at_mm + face.radius_mm - copysign(sqrt(face.radius_mm**2 - y**2), face.radius_mm), y)
+               for y in (half_mm * k / 24 for k in range(-24, 25))] for face in faces]  # fmt: skip
+    outlines = [_outline([*left, *reversed(right)]) for left, right in pairwise(curves)]
+    ends = [z for curve in curves for z, _ in curve]
+    svg = "".join(f'<path class="glass" d="{outline}"/>' for outline in outlines)
+    return Drawn(svg, min(ends), -half_mm, max(ends), half_mm)
+
+
+def _exploded(
+    title: str, parts: dict[str, Part], away: dict[str, Offset], px_per_mm: float, view: View = OBLIQUE, beside: int = 0
+) -> str:
+    """Parts away from their places, with names; `beside` px of room for names to the right of all parts."""
+    drawn = {name: view.seen(part, _kind(name), away.get(name, (0, 0, 0))) for name, part in parts.items()}
     behind = sorted(drawn, key=lambda name: drawn[name].depth)
-    sheet = Sheet(title, drawn.values(), 4.2)
+    sheet = Sheet(title, drawn.values(), px_per_mm, beside=beside)
     body = [drawn[name].svg for name in behind]
     return sheet.document(body, labels(sheet, drawn, frozenset(parts) & UPRIGHT))
 
@@ -155,4 +217,5 @@ def _kind(name: str) -> str:
 
 PICTURES: dict[str, Callable[[Dimensions], str]] = {
     "exploded": exploded, "section": section, "eye": eye, "chart-eye": chart_eye, "printed": printed,
+    "step-relay": relay, **{f"step-{name}": partial(step, name) for name in STEPS},
 }  # fmt: skip

@@ -27,11 +27,11 @@ MEASURE = "small label s3"
 class Sheet:
     """From mm to the pixels of one document."""
 
-    def __init__(self, title: str, drawn: Iterable[Drawn], px_per_mm: float, top: int = 90) -> None:
+    def __init__(self, title: str, drawn: Iterable[Drawn], px_per_mm: float, top: int = 90, beside: int = 0) -> None:
         every = list(drawn)
         self.title, self.scale, self.top = title, px_per_mm, top
         self.left, self.high = min(one.left for one in every), max(one.high for one in every)
-        self.wide = round((max(one.right for one in every) - self.left) * px_per_mm) + 2 * MARGIN
+        self.wide = round((max(one.right for one in every) - self.left) * px_per_mm) + 2 * MARGIN + beside
         self.tall = round((self.high - min(one.low for one in every)) * px_per_mm) + 2 * MARGIN + top
 
     def at(self, place: tuple[float, float]) -> tuple[float, float]:

@@ -1,7 +1,6 @@
 """Power meter's reading of a ring: its plausibility, its shares of the limits, and the lines of the head file."""
 
-from dataclasses import dataclass
-from math import pi, radians, tan
+from dataclasses import dataclass, replace
 from typing import get_args
 
 from device.config.head_file import InstrumentSpec
@@ -13,7 +12,7 @@ from device.optics.illumination import TRANSMISSION_TO_EYE
 from device.optics.light_budget import chain, product
 from device.optics.matrix import lamps_of
 from device.values import Colour
-from services.lab.light_report import LimitShare, limit_shares, permitted_level
+from services.lab.light_report import LimitShare, limit_shares, lit_area_cm2, permitted_level
 
 PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
 
@@ -22,7 +21,8 @@ PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
 class MeterReading:
     """Reading of the whole ring in one colour at full drive: power into a pupil of 7 mm, mW, and in the waist.
 
-    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date.
+    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date. `scaled` makes it
+    of a reading at less than full drive.
     """
 
     colour: Colour
@@ -31,6 +31,10 @@ class MeterReading:
     peak_nm: float
     meter: str
     guard_factor: float = 1.3
+
+    def scaled(self, level: float) -> "MeterReading":
+        """Return the reading at full drive of one that was taken at `level` (0 to 1] of it: the drive is a PWM."""
+        return replace(self, power_mw=self.power_mw / level, waist_mw_per_cm2=self.waist_mw_per_cm2 / level)
 
 
 @dataclass(frozen=True)
@@ -66,11 +70,8 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> Metere
     lamp = (lamps_of(spec) or {}).get(reading.colour)
     if lamp is None:
         raise SpecError(f"{spec.name} has no {reading.colour} LEDs", "Give the head file whose ring was measured.")
-    factors = chain(design)
-    names = [factor.name for factor in factors]
-    expected_mw = product(factors[: names.index("lit retina")])
-    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw)
-    lit_cm2 = pi * (design.eye_mm / 10 * tan(radians(design.optics.field_deg / 2))) ** 2
+    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw(design))
+    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.eye_mm)
     beam = BeamSpec(
         wavelength_um=reading.peak_nm / 1000, retina_mw_per_cm2=reading.power_mw / lit_cm2,
         waist_mw_per_cm2=reading.waist_mw_per_cm2,
@@ -84,12 +85,18 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> Metere
     return MeteredLight(found, shares, permitted_level(shares))
 
 
-def _refuse_implausible(reading: MeterReading, wavelength_um: float, expected_mw: float) -> None:
-    most_mw = expected_mw * LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE
-    if not expected_mw / 1000 < reading.power_mw <= most_mw:
+def expected_mw(design: Design) -> float:
+    """Return the power that the light budget expects in the eye's pupil at full drive, mW."""
+    factors = chain(design)
+    return product(factors[: [factor.name for factor in factors].index("lit retina")])
+
+
+def _refuse_implausible(reading: MeterReading, wavelength_um: float, usual_mw: float) -> None:
+    most_mw = usual_mw * LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE
+    if not usual_mw / 1000 < reading.power_mw <= most_mw:
         raise SettingError(
-            f"{reading.power_mw:g} mW are not between {expected_mw / 1000:.2g} and {most_mw:.2g} mW, which such a ring "
-            f"can give; {expected_mw:.2g} mW are expected",
+            f"{reading.power_mw:g} mW are not between {usual_mw / 1000:.2g} and {most_mw:.2g} mW, which such a ring "
+            f"can give; {usual_mw:.2g} mW are expected",
             "Check the meter's range and wavelength, that the lamp was on in this colour, and the head file.",
         )
     if reading.waist_mw_per_cm2 * WAIST_CM2 > 1.3 * reading.power_mw:

@@ -246,6 +246,17 @@ def test_iris_diameter_determines_the_hole(changed: Change) -> None:
     assert hole_mm(solid(iris(other)), -0.1) == pytest.approx(1.6, abs=0.02)
 
 
+def test_plate_determines_slot_lid_and_axis(d: Dimensions, changed: Change) -> None:
+    """A thinner plate fits its own slot without play, and moves the lenses' axis less."""
+    other = changed("plate_mm = 5.0", "plate_mm = 3.0")
+    assert other.lens_y_mm == pytest.approx(0.6 * d.lens_y_mm)
+    plate, parts = solid(bought.beam_splitter(other)), assembly.printed()
+    for name in ("splitter block", "plate lid"):
+        assert common_mm3(plate, solid(parts[name].shape(other))) < NOTHING_MM3, name
+    deeper = plate.translate((0, -0.3, 0.3))  # 0.42 mm square to the plate: more than the slot leaves
+    assert common_mm3(deeper, solid(parts["splitter block"].shape(other))) > NOTHING_MM3
+
+
 @pytest.mark.parametrize(
     ("was", "becomes"),
     [

@@ -52,7 +52,7 @@ def test_guide_has_the_figures_of_the_models(d: Dimensions) -> None:
         f"edge of the field {sum(leds) / len(leds) / 8:.2f} of it",
         f"film**, {d.bought.film_mm:g} mm,",
         f"the diffuser ({d.bought.diffuser_mm:g} mm, {d.bought.diffuser_thick_mm:g} mm",
-        f"the plate ({d.bought.plate_thick_mm:g} mm", f"over its board ({d.bought.image_above_board_mm:g} mm)",
+        f"the plate ({d.plate_thick_mm:g} mm", f"over its board ({d.bought.image_above_board_mm:g} mm)",
     ]  # fmt: skip
     guide = " ".join(text("hardware/assembly.md").split())
     assert [figure for figure in figures if figure not in guide] == []

@@ -13,7 +13,7 @@ OVERLAP_MM = 2.0
 
 def plate_lid(d: Dimensions) -> Part:
     """A lid with a tongue as long as the room beside the plate, less a film of foam."""
-    fit, glass = d.fit, d.bought.plate_thick_mm
+    fit, glass = d.fit, d.plate_thick_mm
     plate, around = d.path.relay.splitter_mm / 2, LID_SCREW_MM + 2 * OVERLAP_MM
     x = (-HALF_MM - THICK_MM, -HALF_MM)
     body = slab(d, x, plate + OVERLAP_MM, (glass / 2 - around, glass / 2 + around))

@@ -39,7 +39,7 @@ def slab(d: Dimensions, x_mm: tuple[float, float], half_mm: float, deep_mm: tupl
 
 def lid_screws_mm(d: Dimensions) -> list[tuple[float, float]]:
     """(y, z) of the two M2 of the plate's lid."""
-    middle = d.bought.plate_thick_mm / 2
+    middle = d.plate_thick_mm / 2
     return [along_plate(d, 0, middle - LID_SCREW_MM), along_plate(d, 0, middle + LID_SCREW_MM)]
 
 
@@ -56,7 +56,7 @@ def splitter_block(d: Dimensions) -> Part:
     body -= rod(bore, (front, rear), lens) + cone(bore, d.light_mm(front), (d.plate_z_mm, front), lens)
     body -= rod_y(bore, (FLOOR_Y_MM + TRAP_MM, top), (0, d.plate_z_mm))
     body -= rod(diffuser_cell.SPIGOT_MM + fit.slide_mm, (d.spigot_z_mm - fit.press_mm, rear))
-    body -= slab(d, (-HALF_MM, plate), plate, (0, d.bought.plate_thick_mm + fit.slide_mm))
+    body -= slab(d, (-HALF_MM, plate), plate, (0, d.slot_mm))
     x, y = diffuser_cell.SCREWS_MM
     holes = [rod(fit.insert_mm, (rear - fit.insert_deep_mm, rear), (i * x, j * y)) for i, j in FOUR]
     holes += [rod(fit.insert_mm, (front, front + fit.insert_deep_mm), at) for at in tube_screws_mm(d)]

@@ -1,0 +1,107 @@
+"""`diffuscope meter`: pulses within the guard's limits, counted in the ledger, and a reading above a limit refused."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from device.clock import VirtualClock
+from device.config.head_file import InstrumentSpec, load_head
+from device.errors import LightLimit, SettingError, SpecError
+from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.hazard import light_limits
+from services.cli import app
+from services.lab.measured_light import MeterReading, judge
+from services.lab.optics_report import design_of
+from services.lab.power_meter import judge_reading, pulse, run_of, words
+from tests.simulated import small_head_toml
+
+HEADS = Path(__file__).parents[2] / "hardware" / "heads"
+POWER = load_head(HEADS / "imx296_power.toml")
+SIM = InstrumentSpec.model_validate(tomllib.loads(small_head_toml("small")))
+
+
+def test_an_unmeasured_ring_shines_no_brighter_than_the_guard_permits() -> None:
+    run = run_of(POWER, None, 20)
+    assert run.glow.level == pytest.approx(0.126)
+    assert run.count * run.on_s == pytest.approx(10, abs=run.on_s), "half of 20 s are lit"
+    assert run.on_s < POWER.light.max_on_s
+    with pytest.raises(LightLimit, match="brighter than an eye may see"):
+        run_of(POWER, 0.2, 20)
+
+
+def test_the_train_passes_the_guard_and_is_counted_for_both_eyes() -> None:
+    """Two minutes of pulses: no pulse is cut, none comes before its darkness is due."""
+    clock, lit_s = VirtualClock(), []
+    ledger = MemoryLedger(clock)
+    run = run_of(SIM, 0.1, 120)
+    pulse(run, ledger, clock, lambda _: lit_s.append(clock.now_s()))
+    assert len(lit_s) == run.count == 75
+    assert clock.now_s() == pytest.approx(120)
+    doses = {eye: ledger.spent_j_per_cm2(eye) for eye in ("OD", "OS")}  # type: ignore[arg-type]
+    assert doses["OD"] == doses["OS"] > 0
+
+
+def test_a_spent_ledger_ends_the_train() -> None:
+    """The limit of light that belongs to no visit holds here too."""
+    clock, pulses = VirtualClock(), list[str]()
+    limits = light_limits()
+    ledger = MemoryLedger(clock)
+    run = run_of(SIM, None, 120)
+    ledger.reserve(("OS",), 0.99 * limits.stop_without_visit_j_per_cm2, limits.stop_j_per_cm2)
+    with pytest.raises(LightLimit):
+        pulse(run, ledger, clock, pulses.append)
+    assert 0 < len(pulses) < run.count
+
+
+@pytest.mark.parametrize(("head", "why"), [("bench", "no lamp of its own"), ("imx296_power", "no blue LEDs")])
+def test_a_head_without_such_leds_is_refused(head: str, why: str) -> None:
+    spec = load_head(HEADS / f"{head}.toml")
+    if head != "bench":
+        spec = spec.model_copy(update={"light": spec.light.model_copy(update={"colour": "blue"})})
+    with pytest.raises(SpecError, match=why):
+        run_of(spec, None, 20)
+
+
+def test_a_reading_above_a_limit_is_no_go_and_says_which() -> None:
+    run = run_of(POWER, None, 20)
+    assert run.permitted_mw < run.assumed_mw
+    head = Path("head.toml")
+    for shown_mw, go, says in [
+        (run.expected_mw, True, "1 times"), (3 * run.expected_mw, True, "look at polarisers"),
+        (1.01 * run.permitted_mw, False, "an eye may have"),
+    ]:  # fmt: skip
+        verdict = judge_reading(run, shown_mw)
+        assert verdict.is_go == go
+        assert says in words(head, run, verdict)
+    measured = replace(run, assumed_mw=0.2)
+    assert "the guard counts for this level" in words(head, measured, judge_reading(measured, 0.21))
+    with pytest.raises(SettingError, match="no light"):
+        judge_reading(run, 1e-5)
+
+
+def test_a_slow_meter_shows_half() -> None:
+    run = run_of(POWER, None, 20)
+    assert judge_reading(run, 0.1, mean=True).power_mw == pytest.approx(0.2)
+
+
+def test_a_reading_at_a_level_is_judged_as_at_full_drive() -> None:
+    full = MeterReading("green", 1.3, 43.0, 525.0, "meter X, 2026-11-25")
+    dim = replace(full, power_mw=0.126 * full.power_mw, waist_mw_per_cm2=0.126 * full.waist_mw_per_cm2).scaled(0.126)
+    shares = [judge(POWER, design_of(POWER), one).shares for one in (full, dim)]
+    assert [one.value for one in shares[1]] == pytest.approx([one.value for one in shares[0]])
+
+
+@pytest.mark.parametrize(("shown", "status", "says"), [("0.14", 0, "GO at this level"), ("9", 1, "NO GO")])
+def test_the_command_asks_lights_and_judges(tmp_path: Path, shown: str, status: int, says: str) -> None:
+    text = small_head_toml("small", exposure_s=0.05).replace("[light]", "[light]\nmax_on_s = 0.1")
+    (head := tmp_path / "head.toml").write_text(text)
+    arguments = ["meter", "--head", str(head), "--seconds", "0.1", "--data", str(tmp_path / "data")]
+    made = CliRunner().invoke(app, arguments, input=f"y\n{shown}\n")
+    assert made.exit_code == status, made.output
+    assert says in made.output
+    refused = CliRunner().invoke(app, arguments, input="n\n")
+    assert refused.exit_code == 1
+    assert "pulse" not in refused.stderr
