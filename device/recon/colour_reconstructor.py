@@ -13,7 +13,7 @@ import numpy as np
 from device.clock import Deadline
 from device.errors import FrameError
 from device.recon.colour import ColourPicture, join_colours
-from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, transform
+from device.recon.estimation.psf_warp import InterpolatedOtf, Wavefront, picture_otf, transform
 from device.recon.model.field_of_view import field_box, field_radius_px
 from device.recon.model.grid import disc
 from device.recon.model.kernels import Pixels
@@ -122,9 +122,7 @@ class ColourReconstructor:
         stage = self.others[colour].stages[-1]
         otf = stage.model.stored
         if eye is not None and self._calibration.geometry is not None:
-            otf = self._otfs[colour].on_grid(
-                stage.grid.shape, stage.grid.n, transform(self._calibration.geometry, *eye)
-            )
+            otf = picture_otf(self._otfs[colour], stage.model, transform(self._calibration.geometry, *eye))
         stage.refocus(otf, eye)
 
 

@@ -338,7 +338,7 @@ class Reconstructor:
             return
         begin_s = self.clock.now_s()
         for stage in self._refracted:
-            stage.refocus(stage.model.stored if eye is None else self.refractor.otf(stage.grid, eye), eye)
+            stage.refocus(stage.model.stored if eye is None else self.refractor.otf(stage.model, eye), eye)
         if eye is not None:
             self._refocus_cost.add(self.clock.now_s() - begin_s)
 
@@ -393,7 +393,7 @@ class Reconstructor:
         figures, noise_dn = run.solved.diagnostics.regularisation, run.solved.diagnostics.noise_dn
         log_power, slope, gain_db = figures.get("prior_log_power"), figures.get("prior_slope"), None
         if log_power is not None and slope is not None and noise_dn:
-            other = self.refractor.otf(stage.grid, Wavefront(eye.m_dpt))
+            other = self.refractor.otf(stage.model, Wavefront(eye.m_dpt))
             gain_db = self._gain(stage.model.otf, other, PowerLaw(log_power, slope), noise_dn)
         return {"j0_dpt": -eye.j0_dpt, "j45_dpt": eye.j45_dpt, "gain_db": gain_db}
 

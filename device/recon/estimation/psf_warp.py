@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Spectrum
-from device.recon.model.forward_model import dirichlet
+from device.recon.model.forward_model import Model, dirichlet
 from device.recon.model.grid import Pair, support_radius_px
 from device.recon.model.kernels import Series
 from device.recon.model.resolution import working_bin
@@ -100,6 +100,18 @@ class InterpolatedOtf:
         otf = np.empty(rows.size, np.complex64)
         fused_kernels.stretched_at(self._table, transform * (self.pixels / n), rows, cols, share, otf)
         return otf
+
+
+def picture_otf(interpolated: InterpolatedOtf, model: Model, transform: Transform) -> Spectrum:
+    """Return the OTF of the stretched PSF on the grid of a model: the stored one plus what the stretch changes.
+
+    Light beyond the support stays as it was calibrated. Without a stretch the result is the stored OTF.
+    """
+    grid = model.grid
+    change = interpolated.on_grid(grid.shape, grid.n, transform)
+    change -= interpolated.on_grid(grid.shape, grid.n, np.eye(2))
+    change += model.stored
+    return change
 
 
 def _supported(psf: Psf) -> tuple[NDArray[np.float64], Pair]:

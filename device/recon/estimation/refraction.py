@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
-from device.recon.estimation.psf_warp import Wavefront, transform
+from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
 from device.recon.estimation.refraction_burst import LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
 from device.recon.estimation.refraction_crop import CropRefinement
 from device.recon.estimation.refraction_cylinder import find_cylinder
@@ -30,7 +30,8 @@ from device.recon.estimation.refraction_likelihood import RefractionLikelihood
 from device.recon.estimation.refraction_uncertainty import block_of_frequency, quadratic_model
 from device.recon.model.fft_plans import Planner, Spectrum
 from device.recon.model.field_of_view import field_radius_px
-from device.recon.model.grid import Grid, Pair, support_radius_px
+from device.recon.model.forward_model import Model
+from device.recon.model.grid import Pair, support_radius_px
 from device.recon.model.kernels import Pixels, Places
 from device.values import Calibration
 
@@ -271,10 +272,9 @@ class RefractionEstimator:
         """Return the scale factor of the PSF for mean sphere M in dpt: 1 for M = 0, below 1 for myopia."""
         return 1 - self.geometry.scale_per_dpt * m_dpt
 
-    def otf(self, grid: Grid, eye: Wavefront) -> Spectrum:
-        """Return the OTF of an eye on a grid, complex64 (rows, cols//2 + 1)."""
-        otf = self._edges.likelihood.interpolated_otf
-        return otf.on_grid(grid.shape, grid.n, transform(self.geometry, *eye))
+    def otf(self, model: Model, eye: Wavefront) -> Spectrum:
+        """Return the OTF of an eye for a picture on the grid of a model, complex64 (rows, cols//2 + 1)."""
+        return picture_otf(self._edges.likelihood.interpolated_otf, model, transform(self.geometry, *eye))
 
 
 class Search:
