@@ -50,6 +50,31 @@ def test_layer_metadata_has_the_fields_of_rpi_image_gen(name: str) -> None:
         assert re.fullmatch(RULES, about["Valid"]), f"{variable}: {about['Valid']}"
 
 
+def test_every_checked_file_system_has_its_checker_on_the_card() -> None:
+    """systemd skips the check of a file system whose fsck is missing."""
+    packages = yaml.safe_load(text(f"{CARD}/layer/diffuscope.yaml"))["mmdebstrap"]["packages"]
+    rows = [line.split() for line in text("systemd/image/fstab").splitlines() if line and line[0] != "#"]
+    checked = {row[2] for row in rows if len(row) == 6 and row[5] != "0"}
+    assert {"ext4": "e2fsprogs", "vfat": "dosfstools"}.keys() == checked
+    assert {"e2fsprogs", "dosfstools"} <= set(packages)
+
+
+def test_boot_that_fails_before_the_health_check_restarts() -> None:
+    """Otherwise a tried version waits in an emergency shell, which no password opens, and does not go back."""
+    words = text(f"{CARD}/cmdline.txt").split()
+    assert {"rd.shell=0", "rd.emergency=reboot", "panic=10"} <= set(words)
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.read_string(text("systemd/image/emergency.conf"))
+    assert unit["Service"]["ExecStart"].endswith("systemctl --force reboot'")
+    assert "emergency.conf etc/systemd/system/emergency.service.d/" in text("systemd/image/release")
+
+
+def test_first_boot_may_take_longer_than_the_default_timeout_of_a_device() -> None:
+    """/data appears only when systemd-repart has made it."""
+    [row] = [line.split() for line in text("systemd/image/fstab").splitlines() if line.startswith("LABEL=data ")]
+    assert "x-systemd.device-timeout=5min" in row[3].split(",")
+
+
 def test_layer_hooks_name_existing_scripts_and_variables() -> None:
     fields = metadata("layer/diffuscope.yaml")
     body = yaml.safe_load(text(f"{CARD}/layer/diffuscope.yaml"))
