@@ -1,7 +1,7 @@
 """Facts of Debian's kernel that image, units and the boots in QEMU depend on: trixie, linux 6.12.118-1.
 
 They are copied from /boot/config-6.12.118+deb13-ARCH of linux-image-ARCH; "y" is built in, "m" a module, "n" absent.
-`make test-boot` compares them with the kernel that it boots.
+
 """
 
 _BOTH = {
