@@ -252,7 +252,7 @@ class Reconstructor:
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
         sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
         use the PSF of the picture before; `refraction` is the task of this frame, if it has begun, and `others` are the
-        other frames of its burst, which join the refraction if time is left. FrameError for another shape than that of
+        other frames of its burst, which join the refraction if there is no `deadline`. FrameError for another shape than that of
         the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
@@ -305,7 +305,7 @@ class Reconstructor:
             with_cylinder = run.fits(cost_s + self._cylinder_s)
             task = task or self.begin_refraction(*run.brightest(), with_cylinder=with_cylinder)
             assert task is not None
-            if others and with_cylinder:
+            if others and run.deadline is None:
                 task.join([plane(one, 0) for one in others])
             run.refraction = found = task.found()
             self._find_cost.add(task.find_s)
