@@ -252,7 +252,7 @@ class Reconstructor:
         called with `quick`. With `joined` the later stages solve this frame, linear DN above dark with the gain of the
         sensor and NaN for missing pixels (the sum of a burst), instead of `counts`. Without `refract` the later stages
         use the PSF of the picture before; `refraction` is the task of this frame, if it has begun, and `others` are the
-        other frames of its burst, which join the refraction if there is no `deadline`. FrameError for another shape than
+        other frames of its burst, which join the refraction without a `deadline`. FrameError for another shape than
         that of the sensor, or if too many pixels are missing (`Preprocessor`).
         """
         self._refuse_other_shapes(counts)
