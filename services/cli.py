@@ -310,7 +310,9 @@ def light_for_meter(
 @app.command("light")
 def judge_light(
     head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
-    power_mw: Annotated[float, typer.Option(min=0, help="Into a pupil of 7 mm, whole ring, one colour, while lit.")],
+    power_mw: Annotated[
+        float, typer.Option(min=0, help="Of the whole ring, one colour, as diffuscope meter asks.")
+    ],
     waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
     peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
     meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],

@@ -1,7 +1,8 @@
 """White card before the head: what the ring's light of each colour gives on a surface that is white.
 
 The card is lit by the head itself, so that its light has the spectrum of a picture's: a screen that shines by itself
-has not. Only the ratio of the colours is used; where the card stands and how even its light is do not matter.
+has not. Only the ratio of the colours is used, so the evenness of its light does not matter. It stands behind the place
+of the eye's pupil: at the pupil itself the spots of the LEDs lie outside what the iris sees.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,8 @@ MOST_ROOM_SHARE = 0.3  # of room light in a frame: it may change between two fra
 MOST_SPREAD = 0.02  # of the frames of one colour, over their mean: the same as a just noticeable shade of a colour
 MOST_SATURATED = 0.001  # share of pixels at full scale
 MOST_RATIO = 20.0  # between two colours: LEDs of a ring and quantum efficiencies differ by less
-CARD_REMEDY = "Put a matt white card where the eye would be, so that the ring lights it, and start again."
+CARD_PLACE = "40 to 60 mm behind the place of the eye's pupil, square to the axis"
+CARD_REMEDY = f"Put a matt white card, 60 mm wide, {CARD_PLACE}, and start again."
 
 
 @dataclass(frozen=True)

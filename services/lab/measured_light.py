@@ -1,6 +1,7 @@
 """Power meter's reading of a ring: its plausibility, its shares of the limits, and the lines of the head file."""
 
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import get_args
 
 from device.config.head_file import InstrumentSpec
@@ -10,16 +11,17 @@ from device.light_safety.hazard import LED_POWER_UNCERTAINTY, Hazard, light_limi
 from device.optics.budget import Design
 from device.optics.illumination import TRANSMISSION_TO_EYE
 from device.optics.light_budget import chain, product
-from device.optics.matrix import lamps_of
+from device.optics.matrix import lamps_of, ring_at_pupil_mm
 from device.values import Colour
 from services.lab.light_report import LimitShare, limit_shares, lit_area_cm2, permitted_level
 
 PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
+HOLE_MARGIN_MM = 0.3  # of the meter's hole, so that it need not be centred to better than 0.15 mm
 
 
 @dataclass(frozen=True)
 class MeterReading:
-    """Reading of the whole ring in one colour at full drive: power into a pupil of 7 mm, mW, and in the waist.
+    """Reading of the whole ring in one colour at full drive: power through `meter_hole_mm`, mW, and in the waist.
 
     `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date. `scaled` makes it
     of a reading at less than full drive.
@@ -52,11 +54,16 @@ class MeteredLight:
 
 
 def in_colour(spec: InstrumentSpec, colour: str) -> InstrumentSpec:
-    """Return the head with another colour for its pictures; SettingError for a word that is no colour."""
+    """Return the head with another colour for its pictures; SettingError for a word that is no colour.
+
+    SpecError for a head without LEDs of that colour.
+    """
     known: tuple[Colour, ...] = get_args(Colour)
     found = next((one for one in known if one == colour), None)
     if found is None:
         raise SettingError(f"no colour is called {colour!r}", f"Choose one of {', '.join(known)}.")
+    if found not in (lamps := lamps_of(spec) or {found: None}):
+        raise SpecError(f"{spec.name} has no {found} LEDs", f"Choose one of {', '.join(lamps)}.")
     return spec.model_copy(update={"light": spec.light.model_copy(update={"colour": found})})
 
 
@@ -85,9 +92,19 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> Metere
     return MeteredLight(found, shares, permitted_level(shares))
 
 
+def meter_hole_mm(design: Design) -> float:
+    """Return the diameter of the hole before a power meter at the eye's pupil, mm: the whole ring shines through it.
+
+    A smaller one, such as a pupil of 7 mm, cuts the spots of the LEDs off, and the meter would miss most of the light.
+    """
+    magnification = design.relay.angular_magnification
+    ring_mm = ring_at_pupil_mm(design.chain, magnification) + magnification * design.emitter_mm
+    return float(ceil(ring_mm + HOLE_MARGIN_MM))
+
+
 def expected_mw(design: Design) -> float:
-    """Return the power that the light budget expects in the eye's pupil at full drive, mW."""
-    factors = chain(design)
+    """Return the power that the light budget expects behind the meter's hole at full drive, mW."""
+    factors = chain(replace(design, pupil_mm=meter_hole_mm(design)))
     return product(factors[: [factor.name for factor in factors].index("lit retina")])
 
 

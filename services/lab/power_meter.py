@@ -22,7 +22,7 @@ from device.light_safety.dose_ledger import Ledger
 from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
 from device.values import Illumination
 from services.lab.light_report import GUARD, lit_area_cm2
-from services.lab.measured_light import expected_mw
+from services.lab.measured_light import expected_mw, meter_hole_mm
 from services.lab.optics_report import design_of
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -34,7 +34,7 @@ LAMP_OFF_SHARE = 1e-3  # of the expected power: below, the meter saw no lamp
 
 @dataclass(frozen=True)
 class MeterRun:
-    """What shines in pulses of `on_s` with equal pauses, and powers in a pupil of 7 mm while it is lit, mW.
+    """What shines in pulses of `on_s` with equal pauses, and powers behind a hole of `hole_mm` while it is lit, mW.
 
     `expected_mw` is that of the light budget. No reading may exceed `assumed_mw`, which the guard counts for this
     level, or `permitted_mw`, with which an eye has the instrument's limit, by the LEDs' wavelength and with a factor of
@@ -45,6 +45,7 @@ class MeterRun:
     glow: Illumination
     on_s: float
     count: int
+    hole_mm: float
     expected_mw: float
     assumed_mw: float
     permitted_mw: float
@@ -77,6 +78,7 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     on_s = ON_SHARE * spec.light.max_on_s
     return MeterRun(
         spec, glow, on_s, ceil(seconds * DUTY / on_s),
+        hole_mm=meter_hole_mm(design),
         expected_mw=glow.level * expected_mw(design),
         assumed_mw=glow.level * 1000 * beam.retina_w_per_cm2 * lit_cm2,
         permitted_mw=1000 * most_w_per_cm2 * lit_cm2 / GUARD,
@@ -122,6 +124,7 @@ def announcement(run: MeterRun) -> str:
     return "\n".join([
         f"{run.spec.name}: {run.glow.colour} at {run.glow.level:g} of full drive, {run.count} pulses of {run.on_s:g} s "
         "with equal pauses",
+        f"through a hole of {run.hole_mm:g} mm at the eye's pupil, the sensor as wide and within 1 mm of it:",
         f"expected {run.expected_mw:.3g} mW within a factor of two; the guard counts {run.assumed_mw:.3g} mW; "
         f"an eye may have {run.permitted_mw:.3g} mW",
     ])  # fmt: skip

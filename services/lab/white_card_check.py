@@ -12,7 +12,7 @@ import numpy as np
 from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.procedure.calibration_sequence import TARGET_FILL_SHARE
 from device.calibration.procedure.step_exposures import SHORTEST_S
-from device.calibration.white_card import CardFrames, white_reference
+from device.calibration.white_card import CARD_PLACE, CardFrames, white_reference
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SpecError
@@ -26,7 +26,7 @@ from services.records.capture_target import OTHER_COLOURS
 FRAMES = 4  # of each colour: their spread shows a card that moves
 SEARCHES = 6  # exposures in search of one that fills the pixels
 BRIGHTEST = 99.9  # percentile that is filled to TARGET_FILL_SHARE
-PROMPT = "Put a matt white card where the eye would be, in a dark room, so that the ring lights it."
+PROMPT = f"Put a matt white card, 60 mm wide, {CARD_PLACE}, in a dark room."
 
 
 def measure_white_card(
@@ -42,6 +42,8 @@ def measure_white_card(
         raise SpecError(f"{spec.name} names no archive of calibrations", "Give one with --archive.")
     if spec.light.colour != "green":
         raise SpecError(f"{spec.name} takes its pictures in {spec.light.colour}", "Colours are joined to green ones.")
+    if len(colours := _colours(spec)) == 1:
+        raise SpecError(f"{spec.name} takes no colour pictures", "Its ring has neither red nor blue LEDs.")
     archive = Archive(spec.calibration.archive)
     with closing(open_head(spec, clock, MemoryLedger(clock))) as head:
         head.check()
@@ -50,7 +52,7 @@ def measure_white_card(
         else:
             ask(PROMPT)
         frames: dict[Colour, CardFrames] = {}
-        for colour in _colours(spec):
+        for colour in colours:
             progress(f"measuring the card in {colour} light")
             frames[colour] = _frames(head, clock, colour)
         kept = archive.load(head.calibration.id)

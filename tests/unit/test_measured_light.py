@@ -11,9 +11,18 @@ from typer.testing import CliRunner
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, SettingError, SpecError
 from device.head import hazard_of
+from device.optics.matrix import share_in_pupil
 from device.values import Illumination
 from services.cli import app
-from services.lab.measured_light import MeteredLight, MeterReading, in_colour, judge, words
+from services.lab.measured_light import (
+    MeteredLight,
+    MeterReading,
+    expected_mw,
+    in_colour,
+    judge,
+    meter_hole_mm,
+    words,
+)
 from services.lab.optics_report import design_of
 
 HEADS = Path(__file__).parents[2] / "hardware" / "heads"
@@ -84,3 +93,24 @@ def test_the_command_fails_for_no_go() -> None:
     assert (go.exit_code, no_go.exit_code) == (0, 1)
     assert "GO: full drive" in go.stdout
     assert "NO GO" in no_go.stdout
+
+
+@pytest.mark.parametrize("name", ["imx296", "imx296_power", "imx477"])
+def test_the_hole_before_the_meter_passes_the_whole_ring(name: str) -> None:
+    """A pupil of 7 mm passes none of the light of one head and a tenth of that of another."""
+    design = design_of(load_head(HEADS / f"{name}.toml"))
+    magnification = design.relay.angular_magnification
+
+    def passed(hole_mm: float) -> float:
+        return share_in_pupil(design.chain, magnification, design.emitter_mm, hole_mm)
+
+    assert passed(meter_hole_mm(design)) == pytest.approx(1.0)
+    assert passed(7.0) < 0.1
+    assert expected_mw(design) >= expected_mw(replace(design, pupil_mm=7.0)), "it does not depend on an eye's pupil"
+
+
+def test_a_colour_that_the_ring_does_not_have_is_refused() -> None:
+    with pytest.raises(SpecError, match="has no amber LEDs"):
+        in_colour(load_head(HEADS / "imx296.toml"), "amber")
+    with pytest.raises(SettingError, match="no colour is called 'mauve'"):
+        in_colour(load_head(HEADS / "imx296.toml"), "mauve")

@@ -174,6 +174,12 @@ def test_the_archive_keeps_a_white_reference_and_refuses_a_damaged_one(tmp_path:
         parse_calibration({**files, "manifest.toml": sealed(text.replace("2500.0", "-2500.0"))})
 
 
+def test_a_head_without_red_or_blue_leds_is_refused(tmp_path: Path) -> None:
+    power = with_archive(load_head(SIM.with_name("imx296_power.toml")), tmp_path)
+    with pytest.raises(SpecError, match="takes no colour pictures"):
+        measure_white_card(power, SystemClock(), lambda _: None, lambda _: None)
+
+
 def test_a_head_file_without_an_archive_is_refused() -> None:
     with pytest.raises(SpecError, match="no archive"):
         measure_white_card(load_head(SIM), SystemClock(), lambda _: None, lambda _: None)
