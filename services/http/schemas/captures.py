@@ -103,7 +103,7 @@ class ChannelAnswer(StoredPart):
     """One colour of light: its shift from green (rows, cols; pixels), whether it is predicted, not measured.
 
     `reason`: why the picture has not this colour; null for one that it has. `white_ratio`: its light over that of a
-    white card; null without a white reference, when the hue is that of photographs. File `raw-red.tiff` is the raw
+    white card; only with a white reference, else the hue is that of photographs. File `raw-red.tiff` is the raw
     frame of red.
     """
 
@@ -111,7 +111,7 @@ class ChannelAnswer(StoredPart):
     shift_px: tuple[Number, Number] | None
     predicted: bool
     reason: str | None
-    white_ratio: Number | None
+    white_ratio: OmittedIfNone[Number] = None
 
 
 class EyeCorrectionAnswer(StoredPart):
