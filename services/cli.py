@@ -285,7 +285,9 @@ def light_for_meter(
     level: Annotated[
         float | None, typer.Option(min=0.001, max=1, help="Share of full drive; by default all that is permitted.")
     ] = None,
-    mean: Annotated[bool, typer.Option("--mean", help="The meter shows the mean over pulses and pauses.")] = False,
+    peak: Annotated[
+        bool, typer.Option("--peak", help="The reading is the highest of a pulse; else the mean, half of it, is taken.")
+    ] = False,
     data: Annotated[Path | None, typer.Option(help="Where the dose is counted, as of an eye.")] = None,
 ) -> None:
     """Light the ring for a power meter in pulses, ask for its reading, and compare it with the limits.
@@ -302,7 +304,7 @@ def light_for_meter(
     typer.confirm("A power meter stands at the pupil, and no person looks in?", abort=True)
     power_meter.give_pulses(run, data or _default_data(), SystemClock(), _progress)
     shown_mw = typer.prompt("Reading in mW", type=float)
-    verdict = power_meter.judge_reading(run, shown_mw, mean=mean)
+    verdict = power_meter.judge_reading(run, shown_mw, peak=peak)
     typer.echo(power_meter.words(head, run, verdict))
     raise typer.Exit(0 if verdict.is_go else 1)
 
@@ -310,9 +312,7 @@ def light_for_meter(
 @app.command("light")
 def judge_light(
     head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
-    power_mw: Annotated[
-        float, typer.Option(min=0, help="Of the whole ring, one colour, as diffuscope meter asks.")
-    ],
+    power_mw: Annotated[float, typer.Option(min=0, help="Of the whole ring, one colour, as diffuscope meter asks.")],
     waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
     peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
     meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],

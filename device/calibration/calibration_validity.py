@@ -1,11 +1,11 @@
-"""Validity of a calibration before the first picture: validity period and sensor mode."""
+"""Validity of a calibration before the first picture, and of what would change it: period, sensor mode, simulation."""
 
 from datetime import datetime, timedelta
 
 from device.calibration.archive import Provenance
 from device.calibration.monitoring.finding import Finding
 from device.config.head_file import CameraSpec
-from device.errors import CalibrationExpired, CalibrationModeMismatch
+from device.errors import CalibrationExpired, CalibrationModeMismatch, CalibrationRefused
 from device.values import Calibration
 
 # The calibration monitor finds slow drift in ordinary pictures (`head_check.py`); the age limit catches the rest.
@@ -98,3 +98,12 @@ def _other_exposure(calibration: Calibration, known: Provenance, camera: CameraS
             f"was dark at {level_dn:.1f} DN, {off_dn:+.1f} DN from what {camera.exposure_s:g} s make: another exposure"
         )
     return None
+
+
+def refuse_simulated_change(calibration: Calibration, *, is_simulated: bool) -> None:
+    """Raise CalibrationRefused if what a simulated head shows would change the calibration of a real one."""
+    if is_simulated and not calibration.simulated:
+        raise CalibrationRefused(
+            "this head is simulated, and its archive holds the calibration of a real one",
+            "Give the archive of the simulated head, or the file of the real one.",
+        )

@@ -274,6 +274,7 @@ class Reconstructor:
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
         if task is not None and isinstance(run.refraction, Refraction):
             self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
+        if task is not None:
             seconds["cylinder"] = run.cylinder_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
@@ -307,10 +308,10 @@ class Reconstructor:
             assert task is not None
             if others and run.deadline is None:
                 task.join([plane(one, 0) for one in others])
-            run.refraction = found = task.found()
+            run.refraction = task.found()
             self._find_cost.add(task.find_s)
             self._take_cylinder(run, task, wait=run.deadline is None)
-            best = run.refraction if isinstance(run.refraction, Refraction) else found
+            best = run.refraction if isinstance(run.refraction, Refraction) else task.best()
             eye = best.psf_wavefront if isinstance(best, Refraction) else None
         self._refocus(eye)
         run.refraction_s = self.clock.now_s() - begin_s - run.cylinder_s

@@ -5,6 +5,7 @@ colour. The card divides them out. Without one, the hue is that of photographs. 
 """
 
 from collections.abc import Mapping
+from math import nan
 
 import numpy as np
 
@@ -20,13 +21,17 @@ def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration
     """Return the mean light of a frame over the sensor at full drive, DN per second, without bad pixels.
 
     `counts` (rows, cols); `dark`: dark frame of the same exposure, None: that of the calibration, else its black level.
-    `full_drive_s` is the exposure in seconds times the level of the lamp.
+    `full_drive_s` is the exposure in seconds times the level of the lamp. NaN for a frame of another shape than that of
+    the calibration's maps, which no solver takes either.
     """
     level: Pixels | Image | float = calibration.sensor.black_dn
     if dark is not None:
         level = dark
     elif calibration.dark_dn is not None:
         level = calibration.dark_dn
+    maps = (level, calibration.bad)
+    if any(not isinstance(one, float | int) and one is not None and one.shape != counts.shape for one in maps):
+        return nan
     if calibration.bad is None:
         return (_mean(counts) - _mean(level)) / full_drive_s
     good = ~calibration.bad

@@ -51,8 +51,9 @@ class SimCamera:
         return Frame(counts, shot.exposure_s, world.frames, world.illumination, simulated=True)
 
     def prepare(self, shot: ExposureSettings) -> None:
-        """Compute the light of a moving eye for frames of this length, not later while the lamp is lit."""
-        self.world.eyes.render_burst(self.world.eye, shot.exposure_s)
+        """Compute the light of the eye for frames of this length, not later while the lamp is lit."""
+        if self.world.target is None:
+            self.world.eyes.render_burst(self.world.eye, shot.exposure_s)
 
     def close(self) -> None:
         """Close the camera, so that later exposures raise CameraMissing; idempotent."""

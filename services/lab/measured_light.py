@@ -62,7 +62,8 @@ def in_colour(spec: InstrumentSpec, colour: str) -> InstrumentSpec:
     found = next((one for one in known if one == colour), None)
     if found is None:
         raise SettingError(f"no colour is called {colour!r}", f"Choose one of {', '.join(known)}.")
-    if found not in (lamps := lamps_of(spec) or {found: None}):
+    lamps = lamps_of(spec)
+    if lamps is not None and found not in lamps:
         raise SpecError(f"{spec.name} has no {found} LEDs", f"Choose one of {', '.join(lamps)}.")
     return spec.model_copy(update={"light": spec.light.model_copy(update={"colour": found})})
 

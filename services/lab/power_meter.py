@@ -105,12 +105,13 @@ def pulse(run: MeterRun, ledger: Ledger, clock: Clock, progress: Callable[[str],
             clock.sleep(clock.now_s() - begin_s)  # as long as the lamp took in fact: no light is left to repay
 
 
-def judge_reading(run: MeterRun, shown_mw: float, *, mean: bool = False) -> MeterVerdict:
-    """Return the judgement of a meter's reading, mW; `mean`: it is that over pulses and pauses.
+def judge_reading(run: MeterRun, shown_mw: float, *, peak: bool = False) -> MeterVerdict:
+    """Return the judgement of a meter's reading, mW; `peak`: it is that while the ring is lit, else the mean.
 
-    SettingError for a reading of a lamp that was off.
+    The mean over pulses and pauses is half of it: what a slow meter shows must not pass for the whole. SettingError for
+    a reading of a lamp that was off.
     """
-    power_mw = shown_mw / DUTY if mean else shown_mw
+    power_mw = shown_mw if peak else shown_mw / DUTY
     if power_mw <= LAMP_OFF_SHARE * run.expected_mw:
         raise SettingError(
             f"{shown_mw:g} mW is no light: {run.expected_mw:.2g} mW are expected",

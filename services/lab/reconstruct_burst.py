@@ -103,7 +103,7 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
 def with_scatter(report: Report, estimator: RefractionEstimator, used: Sequence[Pixels]) -> Report:
     """Return the report of a joined frame with the scatter of the refraction between its frames `used`, in counts.
 
-    The sd of M grows by the scatter, and frames that differ too much refuse the refraction. Less than three frames, or
+    The sd of M grows to the scatter, and frames that differ too much refuse the refraction. Less than three frames, or
     a first one that has no refraction by itself, leave the report as it is.
     """
     stated = report.refraction_dpt
@@ -116,8 +116,8 @@ def with_scatter(report: Report, estimator: RefractionEstimator, used: Sequence[
     joined = estimator.join(whole, used, None)
     if isinstance(joined, NoRefraction):
         return replace(report, refraction_dpt=report_of(joined))
-    growth = 1.0 if joined.scatter is None else joined.scatter.growth
-    grown = stated | {"sd": float(stated["sd"] or 0.0) * growth}
+    scatter_dpt = 0.0 if joined.scatter is None else joined.scatter.sd_dpt
+    grown = stated | {"sd": max(float(stated["sd"] or 0.0), scatter_dpt)}
     return replace(report, refraction_dpt=grown, refraction_scatter=scatter_of(joined))
 
 

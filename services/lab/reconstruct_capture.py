@@ -219,7 +219,7 @@ class _Plan:
         )  # fmt: skip
         if self._colours is not None:
             solved = {name: counts for name, counts in others.items() if name not in self._missing}
-            lights = self._lights_dn_per_s({**solved, "green": lit[0]}, dark, others_dark, full_drive_s)
+            lights = self._lights_dn_per_s({**solved, "green": lit[order[0]]}, dark, others_dark, full_drive_s)
             steps = self._colours.steps(
                 steps, solved, others_dark, simulated=False, deadline=deadline, missing=self._missing,
                 lights_dn_per_s=lights,

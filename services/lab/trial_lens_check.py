@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from device.calibration.archive import Archive, Provenance, StoredCalibration
+from device.calibration.calibration_validity import refuse_simulated_change
 from device.calibration.trial_lenses import (
     TRIAL_LENSES,
     LensReading,
@@ -67,8 +68,10 @@ def calibrate_with_lenses(
     head = open_head(spec, clock, MemoryLedger(clock))
     try:
         head.check()
+        stored = archive.load(head.calibration.id)
+        refuse_simulated_change(stored.calibration, is_simulated=head.kind == "simulated")
         readings = _readings(head, bench, ask, progress)
-        done = keep_offset(archive, archive.load(head.calibration.id), readings, bench, progress)
+        done = keep_offset(archive, stored, readings, bench, progress)
         if head.chips.memory is not None:
             head.chips.memory.write(HeadIdentity(done.stored.provenance.serial, done.stored.calibration.id))
         return done

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from device.calibration.archive import Archive, StoredCalibration
+from device.calibration.calibration_validity import refuse_simulated_change
 from device.calibration.procedure.calibration_sequence import TARGET_FILL_SHARE
 from device.calibration.procedure.step_exposures import SHORTEST_S
 from device.calibration.white_card import CARD_PLACE, CardFrames, white_reference
@@ -56,6 +57,7 @@ def measure_white_card(
             progress(f"measuring the card in {colour} light")
             frames[colour] = _frames(head, clock, colour)
         kept = archive.load(head.calibration.id)
+        refuse_simulated_change(kept.calibration, is_simulated=head.kind == "simulated")
         calibration = replace(kept.calibration, white=white_reference(frames, head.calibration))
         archive.add_and_activate(calibration, kept.provenance)
         if head.chips.memory is not None:

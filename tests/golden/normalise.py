@@ -26,7 +26,7 @@ COUNTS = {
 }
 TIMED = {"pareto", "dominated", "within_budget", "chosen"}  # conclusions of the explorer from times of the computer
 MACHINE = {"cpu", "cores", "system"}  # description of the computer in a measured frontier
-OF_THE_LOAD = {"psf_cylinder", "refraction_scatter"}  # parts of a report that only an estimate in time has
+OF_THE_LOAD = {"psf_cylinder"}  # parts of a report that only an estimate in time has
 OF_THE_COMPUTER = {"clock", "heat", "speed"}  # health checks whose value depends on the computer
 
 

@@ -49,6 +49,10 @@ class KnownRefraction:
     def latest(self) -> Refraction | NoRefraction:
         return self.whole() if self.is_done else self.found()
 
+    def best(self) -> Refraction | NoRefraction:
+        known = self.latest()
+        return known if isinstance(known, Refraction) else self.found()
+
     def whole(self) -> Refraction | NoRefraction:
         return self.whole_refraction
 

@@ -18,7 +18,7 @@ from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics.retina_chart import PAPER_REFLECTANCE
 from device.recon.colour_reconstructor import ColourReconstruction
-from device.recon.white_balance import OVER_GREEN, RGB, balanced, white_ratios
+from device.recon.white_balance import OVER_GREEN, RGB, balanced, light_dn_per_s, white_ratios
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Colour, Frame, Illumination, Psf, Sensor, WhiteReference
 from services.instrument.capture_pipeline import expose, plan_pipeline
@@ -64,7 +64,10 @@ def test_a_card_makes_a_new_calibration_in_force(measured: Measured) -> None:
 
 
 def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tmp_path: Path) -> None:
-    """Lamp, sensor and diffuser cancel: what is left is the reflectance of the drawn retina over that of the card."""
+    """Exposures, levels of the lamp and dark frames cancel: what is left is the reflectance of the retina over the card.
+
+    The simulated card is lit as the simulated eye is, so that nothing is said of lamp, sensor and diffuser.
+    """
     clock = SystemClock()
     head = open_head(measured.spec, clock, MemoryLedger(clock))
     try:
@@ -85,9 +88,9 @@ def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tm
     assert isinstance(made, ColourReconstruction)
     shares = {one.name: one.white_ratio for one in made.report.channels}
     planes = {colour: retina.plane(colour) for colour in lights}
-    # 3 %: the PSF carries light past the edge of the sensor, and another share of it in each colour
+    # 1 %: a dark level that is off by 0.2 DN under the mean of 30 DN of the eye
     assert shares == {
-        **{c: pytest.approx(plane[plane > 0].mean() / PAPER_REFLECTANCE, rel=0.03) for c, plane in planes.items()},
+        **{c: pytest.approx(plane[plane > 0].mean() / PAPER_REFLECTANCE, rel=0.01) for c, plane in planes.items()},
         "blue": None,
     }
 
@@ -172,6 +175,21 @@ def test_the_archive_keeps_a_white_reference_and_refuses_a_damaged_one(tmp_path:
     assert text.count("2500.0") == 1
     with pytest.raises(CalibrationDamaged, match="no light"):
         parse_calibration({**files, "manifest.toml": sealed(text.replace("2500.0", "-2500.0"))})
+
+
+def test_a_simulated_card_does_not_change_the_calibration_of_a_real_head(tmp_path: Path) -> None:
+    spec, archive = with_archive(coarse(load_head(SIM), 2), tmp_path), Archive(tmp_path)
+    before = archive.add_and_activate(replace(simulated_calibration(world(spec)), simulated=False), WHO)
+    with pytest.raises(CalibrationRefused, match="holds the calibration of a real one"):
+        measure_white_card(spec, SystemClock(), lambda _: None, lambda _: None)
+    assert archive.active_id() == before
+
+
+def test_a_frame_of_another_shape_has_no_ratio() -> None:
+    """The solver refuses it with its own error; what is measured beside must not end the process."""
+    bad = np.zeros((20, 30), np.bool_)
+    light = light_dn_per_s(np.ones((10, 15), np.uint16), None, replace(CALIBRATION, bad=bad), 0.1)
+    assert white_ratios(replace(CALIBRATION, white=WHITE), {"green": light}) == {}
 
 
 def test_a_head_without_red_or_blue_leds_is_refused(tmp_path: Path) -> None:

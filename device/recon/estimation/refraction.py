@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from device.errors import SettingError
 from device.recon.estimation.defective_pixels import DefectFinder
 from device.recon.estimation.psf_warp import Wavefront, picture_otf, transform
-from device.recon.estimation.refraction_burst import LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
+from device.recon.estimation.refraction_burst import LARGEST_STEP_DPT, LEAST_FRAMES, MOST_SCATTER_DPT, FrameScatter
 from device.recon.estimation.refraction_crop import CropRefinement
 from device.recon.estimation.refraction_cylinder import find_cylinder
 from device.recon.estimation.refraction_edge import EdgeLikelihood
@@ -99,8 +99,9 @@ class Refraction:
 
     @property
     def in_doubt(self) -> bool:
-        """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 `sd_dpt`)."""
-        return abs(self.sphere_dpt) < max(0.12, 2 * self.sd_dpt)
+        """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 sd), without the scatter between frames."""
+        sd_dpt = self.sd_dpt if self.scatter is None else self.scatter.stated_sd_dpt
+        return abs(self.sphere_dpt) < max(0.12, 2 * sd_dpt)
 
     @property
     def psf_wavefront(self) -> Wavefront | None:
@@ -208,7 +209,12 @@ class RefractionEstimator:
             return found
         eye_dpt = np.array([found.sphere_dpt, cylinder.j0_dpt, cylinder.j45_dpt])
         cleaned = [(counts, dark, self.defects(counts, dark)) for counts in frames]
-        steps_dpt = self._refinement.steps(eye_dpt, found.edge, cleaned)
+        try:
+            steps_dpt = self._refinement.steps(eye_dpt, found.edge, cleaned)
+        except np.linalg.LinAlgError:
+            return NoRefraction("a frame of the burst does not determine the refraction")
+        if not np.abs(steps_dpt).max() < LARGEST_STEP_DPT:  # also for NaN
+            return NoRefraction("a frame of the burst has another refraction than the first one")
         scatter = FrameScatter.of(steps_dpt[:, 0], found.sd_dpt)
         if scatter.sd_dpt > MOST_SCATTER_DPT:
             return NoRefraction(f"the refractions of the frames scatter by {scatter.sd_dpt:.1f} dpt")

@@ -53,7 +53,7 @@ def frame_steps(
 ) -> Floats:
     """Return the step of each frame from an eye (M, J0, J45), within an edge that is held, (frames, 3) in dpt.
 
-    Likelihood and model then hold the state of the last frame.
+    Likelihood and model then hold the state of the last frame. LinAlgError if a frame determines nothing.
     """
     steps: list[Floats] = []
     for counts, dark, defects in frames:
@@ -67,4 +67,4 @@ def frame_steps(
         if not steps:
             covariance = model.covariance(fit.derivatives)
         steps.append(covariance @ fit.score)
-    return np.clip(np.array(steps), -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
+    return np.array(steps)

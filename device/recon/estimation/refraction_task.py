@@ -50,6 +50,12 @@ class RefractionTask:
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
         return next((one for one in futures if one.done()), self._found).result()
 
+    def best(self) -> Refraction | NoRefraction:
+        """Return the last refraction of those that are known; that without a cylinder if there is no other."""
+        futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
+        known = (one.result() for one in futures if one.done())
+        return next((one for one in known if isinstance(one, Refraction)), self._found.result())
+
     def whole(self) -> Refraction | NoRefraction:
         """Wait for the refraction, with its cylinder if the task has one, and joined if `join` was called."""
         return self._last.result()
