@@ -64,7 +64,7 @@ def test_a_card_makes_a_new_calibration_in_force(measured: Measured) -> None:
 
 
 def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tmp_path: Path) -> None:
-    """Exposures, levels of the lamp and dark frames cancel: what is left is the reflectance of the retina over the card.
+    """Exposures, levels of the lamp and dark frames cancel: what is left is the reflectance of the retina over white.
 
     The simulated card is lit as the simulated eye is, so that nothing is said of lamp, sensor and diffuser.
     """
