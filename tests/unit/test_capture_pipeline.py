@@ -1,6 +1,6 @@
 """Capture pipeline by itself, in virtual time: exposure, verdict, steps of the reconstruction, record, live picture."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from device.clock import VirtualClock
+from device.clock import Deadline, VirtualClock
 from device.config.head_file import load_head
 from device.errors import CameraMissing, CameraStalled, FrameError, LightFault
 from device.head import Head, hazard_of
@@ -23,7 +23,7 @@ from device.sim.camera import SimCamera
 from device.sim.light import SimLight
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import Colour, ExposureSettings, Frame, Illumination, Reconstruction
+from device.values import Colour, ExposureSettings, Frame, Illumination, Reconstruction, WhiteReference
 from services.instrument.capture import ExposedCapture, Press, split_notes
 from services.instrument.capture_pipeline import NO_PSF, CapturePipeline, expose
 from services.records.capture_target import CaptureTarget
@@ -257,3 +257,51 @@ def test_a_colour_without_a_psf_is_not_lit_and_its_reason_kept(bench: Bench) -> 
     assert (dict(exposure.colours), exposure.missing) == ({}, {"red": NO_PSF})
     assert bench.pipeline.expose("OD", colours=["red"]).missing == {}, "a pipeline of one colour by design"
     assert bench.world.frames == 4
+
+
+class SeesLights(RedOnly):
+    """Colours that keep the light they were given and solve nothing."""
+
+    def __init__(self) -> None:
+        self.lights_dn_per_s: Mapping[Colour, float] = {}
+
+    def steps(
+        self, green: Iterator[Step], frames: Mapping[Colour, Pixels], dark: Pixels | None = None, *, simulated: bool,
+        deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
+        lights_dn_per_s: Mapping[Colour, float] | None = None,
+    ) -> Iterator[Step]:  # fmt: skip
+        self.lights_dn_per_s = lights_dn_per_s or {}
+        return green
+
+
+def seen_lights(bench: Bench, *, white: bool, spoil: bool = False) -> Mapping[Colour, float]:
+    """Return the light that the colours of one press were given; `spoil`: its frames have every other row only."""
+    reference = WhiteReference((("green", 1.0), ("red", 1.0))) if white else None
+    bad = np.zeros(bench.head.camera.shape, np.bool_)
+    head = replace(bench.head, calibration=replace(bench.head.calibration, white=reference, bad=bad))
+    reconstructor, colours = bench.pipeline.reconstructor, SeesLights()
+    pipeline = CapturePipeline(head, bench.clock, reconstructor, reconstructor, PlainFeedback(), colours=colours)
+    taken = expose(head, ("OD",), bench.clock, colours=["red"])
+    shot = replace(bench.exposed(), frames=taken.lit, dark=taken.dark, colours=taken.colours)
+    if spoil:
+        cut = {colour: replace(one, counts=one.counts[::2]) for colour, one in taken.colours.items()}
+        shot = replace(shot, frames=tuple(replace(one, counts=one.counts[::2]) for one in taken.lit), colours=cut)
+    assert isinstance(list(pipeline.reconstruct(shot, budget_s=5.0))[-1], Reconstruction)
+    frames = {"green": taken.lit[0], "red": taken.colours["red"]}
+    assert taken.dark is not None
+    if white and not spoil:
+        dark_dn = float(taken.dark.counts.mean())
+        assert colours.lights_dn_per_s == {
+            colour: pytest.approx((float(one.counts.mean()) - dark_dn) / one.exposure_s)
+            for colour, one in frames.items()
+        }
+    return colours.lights_dn_per_s
+
+
+def test_the_colours_get_the_light_of_each_frame_where_there_is_a_white_reference(bench: Bench) -> None:
+    assert set(seen_lights(bench, white=True)) == {"green", "red"}
+    assert seen_lights(bench, white=False) == {}
+
+
+def test_a_frame_in_another_mode_keeps_its_capture_also_with_a_white_reference(bench: Bench) -> None:
+    assert all(np.isnan(light) for light in seen_lights(bench, white=True, spoil=True).values())
