@@ -66,7 +66,7 @@ def test_a_card_makes_a_new_calibration_in_force(measured: Measured) -> None:
 def test_the_card_gives_a_press_the_colours_of_the_retina(measured: Measured, tmp_path: Path) -> None:
     """Exposures, levels of the lamp and dark frames cancel: what is left is the reflectance of the retina over white.
 
-    The simulated card is lit as the simulated eye is, so that nothing is said of lamp, sensor and diffuser.
+    The simulated card is lit as the simulated eye is, so that lamp, sensor and diffuser are not tested.
     """
     clock = SystemClock()
     head = open_head(measured.spec, clock, MemoryLedger(clock))
