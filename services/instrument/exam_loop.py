@@ -31,6 +31,7 @@ from services.instrument.exam_state import ExamEvent
 from services.instrument.frame_feedback import FAILED_VERDICT
 from services.instrument.frame_sink import FrameSink
 from services.instrument.live_pictures import LivePictures
+from services.instrument.press_colours import colours_of_lamp
 from services.instrument.resumption import ResumedPress, resumed_frames
 from services.instrument.watchdog import BEAT_S, Watchdog
 from services.records.capture import Capture
@@ -133,7 +134,8 @@ class ExamLoop:
         entry = press.journal_entry(id)
         split = self._pipeline.choose_split(target.frames)
         planned = target.frames * split.parts
-        writer = self._parts.capture_journal.begin(entry, press.key, planned, target.colours)
+        colours = colours_of_lamp(head.spec, target.colours)
+        writer = self._parts.capture_journal.begin(entry, press.key, planned, colours)
         shared = RawMetadata(id, press.eye, taken_at, calibration_id=head.calibration.id, head=head.spec.name)
         self._events.stage(press, id, "expose")
         exposure = self._pipeline.expose(
@@ -141,7 +143,7 @@ class ExamLoop:
             in_visit=target.visit is not None,
             count=target.frames,
             split=split,
-            colours=target.colours,
+            colours=colours,
             field=target.field,
             taken=FrameSink(writer, shared, head.spec.light.colour),
             looked=partial(self._events.quick_look, press, id, is_exposing=True),

@@ -44,7 +44,7 @@ def measure_white_card(
     if spec.light.colour != "green":
         raise SpecError(f"{spec.name} takes its pictures in {spec.light.colour}", "Colours are joined to green ones.")
     if len(colours := _colours(spec)) == 1:
-        raise SpecError(f"{spec.name} takes no colour pictures", "Its ring has neither red nor blue LEDs.")
+        raise SpecError(f"{spec.name} takes no colour pictures", "Its ring has green LEDs only.")
     archive = Archive(spec.calibration.archive)
     with closing(open_head(spec, clock, MemoryLedger(clock))) as head:
         head.check()
@@ -67,9 +67,11 @@ def measure_white_card(
 
 def _colours(spec: InstrumentSpec) -> tuple[Colour, ...]:
     """Return the colours of a press that the head's lamp has, green first."""
-    colours: tuple[Colour, ...] = ("green", *OTHER_COLOURS)
     lamps = lamps_of(spec)
-    return colours if lamps is None else tuple(colour for colour in colours if colour in lamps)
+    if lamps is None:  # a simulated lamp
+        return "green", "red", "blue"
+    colours: tuple[Colour, ...] = ("green", *OTHER_COLOURS)
+    return tuple(colour for colour in colours if colour in lamps)
 
 
 def _frames(head: Head, clock: Clock, colour: Colour) -> CardFrames:

@@ -10,7 +10,7 @@ from services.records.json_values import JsonObject
 
 NO_METHOD = "none"  # method in the report of a capture without a reconstruction
 COLOUR = "colour.png"  # file of the picture in colour, which not every capture has
-OtherColour = Literal["red", "blue"]  # of light, besides the green one of the picture
+OtherColour = Literal["red", "blue", "amber"]  # of light, besides the green one of the picture
 BUDGET_S = 5.0  # standard time budget, also of captures of earlier releases, whose report has none
 
 

@@ -192,8 +192,11 @@ def test_a_frame_of_another_shape_has_no_ratio() -> None:
     assert white_ratios(replace(CALIBRATION, white=WHITE), {"green": light}) == {}
 
 
-def test_a_head_without_red_or_blue_leds_is_refused(tmp_path: Path) -> None:
+def test_a_head_with_green_leds_only_is_refused(tmp_path: Path) -> None:
     power = with_archive(load_head(SIM.with_name("imx296_power.toml")), tmp_path)
+    assert power.light.sinks is not None
+    green = power.light.sinks.model_copy(update={"amber": None})
+    power = power.model_copy(update={"light": power.light.model_copy(update={"sinks": green})})
     with pytest.raises(SpecError, match="takes no colour pictures"):
         measure_white_card(power, SystemClock(), lambda _: None, lambda _: None)
 

@@ -18,8 +18,8 @@ from services.lab.reconstruct_file import write_or_raise
 from services.records.capture import OtherColour
 
 FORMAT = 1
-Role = Literal["psf", "psf-red", "psf-blue", "dark", "flat", "archive"]
-COLOUR_ROLES: dict[OtherColour, Role] = {"red": "psf-red", "blue": "psf-blue"}
+Role = Literal["psf", "psf-red", "psf-blue", "psf-amber", "dark", "flat", "archive"]
+COLOUR_ROLES: dict[OtherColour, Role] = {"red": "psf-red", "blue": "psf-blue", "amber": "psf-amber"}
 
 
 class _Part(BaseModel):

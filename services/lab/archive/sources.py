@@ -185,8 +185,8 @@ def _stored_frames(place: Path, digests: Mapping[str, str], report: CaptureRepor
 def further_frames(stem: str, images: Mapping[str, Path]) -> tuple[FoundFrame, ...]:
     """Return the frames that belong to a first frame by their names, as the instrument writes them.
 
-    `<stem>-1`, `<stem>-2` and so on without a gap are those of its burst, `<stem>-red` and `<stem>-blue` those in other
-    colours of light. `images` are the files of the folder by stem.
+    `<stem>-1`, `<stem>-2` and so on without a gap are those of its burst, `<stem>-red`, `-blue` and `-amber` those in
+    other colours of light. `images` are the files of the folder by stem.
     """
     burst = takewhile(lambda name: name in images, (f"{stem}-{k}" for k in count(1)))
     frames = [FoundFrame(images[name]) for name in burst]
@@ -263,7 +263,7 @@ def _of_entry(folder: Path, entry: Entry, aligned: bool) -> FoundCapture:
 
 
 def _colour_psfs(folder: Path) -> tuple[tuple[OtherColour, Path], ...]:
-    """Return the PSFs of other colours in a folder, `psf-red` and `psf-blue`, by colour."""
+    """Return the PSFs of other colours in a folder, `psf-red` and so on, by colour."""
     found = ((colour, _beside(folder, role)) for colour, role in COLOUR_ROLES.items())
     return tuple((colour, path) for colour, path in found if path is not None)
 
