@@ -15,7 +15,7 @@ from device.recon.white_balance import light_dn_per_s
 from device.values import Calibration, Colour, Frame, WhiteReference
 
 LEAST_DN = 20.0  # mean light of a frame above the dark one: with 1 % of error from a dark level that drifts by 0.2 DN
-MOST_ROOM_SHARE = 0.3  # of room light in a frame: it may change between two frames
+MOST_ROOM_SHARE = 0.3  # of room light, and dark current, over the lamp's light: it may change between two frames
 MOST_SPREAD = 0.02  # of the frames of one colour, over their mean: the same as a just noticeable shade of a colour
 MOST_SATURATED = 0.001  # share of pixels at full scale
 MOST_RATIO = 20.0  # between two colours: LEDs of a ring and quantum efficiencies differ by less
@@ -57,7 +57,7 @@ def _light_dn_per_s(colour: Colour, frames: CardFrames, calibration: Calibration
         raise CalibrationRefused(
             f"in {colour} light {saturated:.1%} of the pixels are saturated", "Move the card away from the head."
         )
-    if mean_dn < LEAST_DN:
+    if not mean_dn >= LEAST_DN:  # also NaN, of frames in another mode than the calibration
         raise CalibrationRefused(
             f"in {colour} light the card returns {mean_dn:.1f} DN (at least {LEAST_DN:.0f})", CARD_REMEDY
         )

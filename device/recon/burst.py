@@ -75,7 +75,8 @@ class BurstJoiner:
     """Joining of bursts of one calibration and sensor shape with PSF `index`; planned at construction.
 
     With `single`, a reconstructor of this calibration, its quick looks are registered instead of final pictures, where
-    they have at least LEAST_COARSE samples: in half the time, with 0.12 instead of 0.09 pixels rms (NUMERICS.md 9.1).
+    they have at least LEAST_COARSE samples and the field is calibrated: in half the time, with 0.12 instead of 0.09
+    pixels rms (NUMERICS.md 9.1).
 
     It holds 8 bytes per pixel of each frame, and some arrays of one frame while it joins: 4 frames of 2.07 MP take 160
     MB at the most, 16 frames 370 MB (measured). Not thread-safe.
@@ -112,8 +113,9 @@ class BurstJoiner:
 
         Yields ROUND_DONE after the picture of each frame that is not `ready` (by index, with the same dark frame), then
         the joined frame. `unusable` holds the reason of each frame that is known to be unusable, by index. A frame that
-        does not show what most of the others show, that has no light or too many missing pixels is left out, with its
-        reason. With one frame left the result is that frame. FrameError if none can be used.
+        does not show what most of the others show, that is blurred by motion, that has no light or too many missing
+        pixels is left out, with its reason. With one frame left the result is that frame. FrameError if none can be
+        used.
         """
         reasons = dict(unusable or {})
         seen = {k: one for k, one in (ready or {}).items() if k not in reasons}
@@ -192,7 +194,7 @@ class BurstJoiner:
 def joined_calibration(calibration: Calibration, light: float, count: int) -> Calibration:
     """Return the calibration of a joined frame of `count` frames with `light` times the light of the reference.
 
-    Averaged counts hold `light` times the electrons per count; the read noise adds up in electrons.
+    Averaged counts hold `light` times the electrons per count; the read noise is sqrt(`count`) times that of one.
     """
     linear = without_sensor(calibration)
     gain, read_e = linear.sensor.gain_e_per_dn, linear.sensor.read_noise_e

@@ -29,7 +29,7 @@ LEAST_CERTAIN = 0.5  # of the correlation itself: in a small picture the surface
 # photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3).
 BLUE_FROM_RED_GREEN = (-0.133, 0.274, 0.862)
 BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green of these photographs, 0.42 to 0.72
-MOST_OF_MEAN = 3.0  # of red and green: the photographs hold nothing brighter
+MOST_OF_MEAN = 3.0  # of red and green over their means: the photographs reach 1.3 and 3.2
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def join_colours(pictures: Mapping[Colour, Image], field: Image, n: int) -> Colo
 
     `field` is the lit field, (rows, cols) in 0..1; `n` the pixels per sample at which the pictures were solved. The
     reference is green, else the first. Amber stands for a missing red. A missing blue is predicted from red and green;
-    a missing red repeats the reference, a missing green repeats red. Both count as predicted.
+    a missing red repeats the reference, a missing green repeats red. All three count as predicted.
     """
     reference: Colour = "green" if "green" in pictures else next(iter(pictures))
     shifts, doubtful = register_colours(pictures, reference, field, n)

@@ -21,8 +21,8 @@ def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration
     """Return the mean light of a frame over the sensor at full drive, DN per second, without bad pixels.
 
     `counts` (rows, cols); `dark`: dark frame of the same exposure, None: that of the calibration, else its black level.
-    `full_drive_s` is the exposure in seconds times the level of the lamp. NaN for a frame of another shape than that of
-    the calibration's maps, which no solver takes either.
+    `full_drive_s` is the exposure in seconds times the level of the lamp. NaN if the dark frame in
+    use or the map of bad pixels has another shape: no solver takes such a frame either.
     """
     level: Pixels | Image | float = calibration.sensor.black_dn
     if dark is not None:
@@ -48,7 +48,8 @@ def balanced(picture: Image, field: Image, ratios: Mapping[Colour, float]) -> Im
     """Return a picture (rows, cols, 3) whose red and blue have the mean over the field that the white card gives them.
 
     `field` is the lit field, (rows, cols) in 0..1. The mean of green stays. A colour without a value in `ratios`,
-    or any without one of green, has that of photographs. A channel without light stays as it is.
+    or any without one of green, has that of photographs. A channel without light stays as it is;
+    without light in green, red and blue become 0.
     """
     green = ratios.get("green")
     hue = [OVER_GREEN[colour] if not green else _share(colour, ratios, green) for colour in RGB]

@@ -19,7 +19,7 @@ from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
-MOST_PARTS = 4  # into which an exposure of a moving eye is split
+MOST_PARTS = 4  # of an exposure that are told apart; a split into more moves the eye too far in each
 FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 Pair = tuple[float, float]
@@ -101,9 +101,10 @@ class RenderedEyes:
 
     @cached_property
     def drift_px(self) -> float:
-        """Movement of the retina to the right from one frame of a burst to the next, in pixels; 0 if it is too small.
+        """Movement of the retina to the right from one frame of a burst to the next, in pixels.
 
-        The eye drifts by `drift_deg_per_s` for the time of one exposure, up to FASTEST_DRIFT_DEG_PER_S.
+        The eye drifts by `drift_deg_per_s` for the time of one exposure. 0 if that is too small to be seen, or faster
+        than FASTEST_DRIFT_DEG_PER_S: a saccade.
         """
         speed = self.scene.sim.eye.drift_deg_per_s
         step_deg = (speed if speed <= FASTEST_DRIFT_DEG_PER_S else 0.0) * self.scene.spec.camera.exposure_s

@@ -33,7 +33,7 @@ PROMPT = f"Put a matt white card, 60 mm wide, {CARD_PLACE}, in a dark room."
 def measure_white_card(
     spec: InstrumentSpec, clock: Clock, ask: Callable[[str], None], progress: Callable[[str], None]
 ) -> StoredCalibration:
-    """Measure the light of a white card in each colour of a press; return the calibration with it, now in force.
+    """Measure the light of a white card in each colour of the lamp; return the calibration with it, now in force.
 
     `ask` prompts the operator of a real head and returns once the card is there. CalibrationRefused with the reason if
     the frames show no white card; the calibration in force then stays. SpecError for a head file without an archive or
@@ -68,7 +68,7 @@ def measure_white_card(
 def _colours(spec: InstrumentSpec) -> tuple[Colour, ...]:
     """Return the colours of a press that the head's lamp has, green first."""
     lamps = lamps_of(spec)
-    if lamps is None:  # a simulated lamp
+    if lamps is None:  # no LEDs of its own: a simulated head
         return "green", "red", "blue"
     colours: tuple[Colour, ...] = ("green", *OTHER_COLOURS)
     return tuple(colour for colour in colours if colour in lamps)

@@ -1,4 +1,4 @@
-"""Split of an exposure into shorter ones while the eye moves: the same light in more frames, which are registered.
+"""Split of an exposure into shorter ones while the eye moves: no more light, in more frames, which are registered.
 
 Loss of a picture against one exposure of a still eye, in dB, for m frames that share the light of a press:
 
@@ -9,8 +9,9 @@ The first term is the motion blur of one frame, the second the displacement betw
 registration. D: motion of the eye over the light of the press, degrees; L: light of the press, mean electrons per um^2
 of the sensor. Fitted to twelve pictures of one photograph (one exposure, 4 and 8 frames; none to 12 pixels of 0.064
 degrees; 22 and 220 electrons per um^2), at most 0.16 dB off. The lamp stays on during the overhead of a frame (its
-read-out, the wait for its begin), and a press must not have more light than without a split: the parts are shorter by
-this overhead. Lost light counts at 0.7 dB per halving. NUMERICS.md 9.3.
+read-out, the wait for its begin), and a press must not have more light than without a split: parts and their
+overheads fill the time of one exposure and one overhead, so that each of m parts lasts (T + o) / m - o. Lost light
+counts at 0.7 dB per halving. NUMERICS.md 9.3.
 """
 
 from dataclasses import dataclass
