@@ -274,7 +274,7 @@ class Reconstructor:
         seconds = {"solve": solve_s, "refract": run.refraction_s, "upsample": finished_s - solved_s}
         if task is not None and isinstance(run.refraction, Refraction):
             self._take_cylinder(run, task, wait=run.fits(self._cylinder_s))
-        if task is not None:
+        if isinstance(run.refraction, Refraction) or run.cylinder_s > 0:
             seconds["cylinder"] = run.cylinder_s
         yield Reconstruction(picture, self._report(run, seconds), simulated)
 
@@ -331,7 +331,8 @@ class Reconstructor:
         run.refraction = task.whole() if wait else task.latest()
         if task.is_done and task.cylinder_s > 0:
             self._cylinder_cost.add(task.cylinder_s + task.join_s)
-        run.cylinder_s += self.clock.now_s() - begin_s
+        if wait:
+            run.cylinder_s += self.clock.now_s() - begin_s
 
     def _refocus(self, eye: Wavefront | None) -> None:
         """Set the OTF of the later stages to that of an eye; None selects the stored PSF."""
