@@ -19,7 +19,7 @@ from device.values import Colour, Eye, Image
 
 STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
-MOST_PARTS = 4  # of an exposure that are told apart; a split into more moves the eye too far in each
+MOST_PARTS = 4  # of an exposure; a split into more moves the eye too far in each frame
 FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 Pair = tuple[float, float]
