@@ -21,8 +21,8 @@ def light_dn_per_s(counts: Pixels, dark: Pixels | None, calibration: Calibration
     """Return the mean light of a frame over the sensor at full drive, DN per second, without bad pixels.
 
     `counts` (rows, cols); `dark`: dark frame of the same exposure, None: that of the calibration, else its black level.
-    `full_drive_s` is the exposure in seconds times the level of the lamp. NaN if the dark frame in
-    use or the map of bad pixels has another shape: no solver takes such a frame either.
+    `full_drive_s` is the exposure in seconds times the level of the lamp. NaN if the dark frame in use or the map of
+    bad pixels has another shape: no solver takes such a frame either.
     """
     level: Pixels | Image | float = calibration.sensor.black_dn
     if dark is not None:

@@ -12,6 +12,7 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, SettingError, SpecError
 from device.light_safety.dose_ledger import MemoryLedger
 from device.light_safety.hazard import light_limits
+from device.values import EYES
 from services.cli import app
 from services.lab.measured_light import MeterReading, judge
 from services.lab.optics_report import design_of
@@ -40,7 +41,7 @@ def test_the_train_passes_the_guard_and_is_counted_for_both_eyes() -> None:
     pulse(run, ledger, clock, lambda _: lit_s.append(clock.now_s()))
     assert len(lit_s) == run.count == 75
     assert clock.now_s() == pytest.approx(120)
-    doses = {eye: ledger.spent_j_per_cm2(eye) for eye in ("OD", "OS")}  # type: ignore[arg-type]
+    doses = {eye: ledger.spent_j_per_cm2(eye) for eye in EYES}
     assert doses["OD"] == doses["OS"] > 0
 
 

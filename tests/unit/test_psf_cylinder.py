@@ -82,7 +82,7 @@ def picture(
 ) -> Reconstruction:
     *_, made = reconstruct.steps(
         counts, simulated=True, deadline=deadline, rounds=ROUNDS,
-        refraction=task,  # type: ignore[arg-type]
+        refraction=task,  # type: ignore[arg-type]  # a stand-in, whose results need no thread
     )  # fmt: skip
     assert isinstance(made, Reconstruction)
     return made
@@ -161,7 +161,10 @@ def test_a_cylinder_alone_needs_its_psf_and_no_refraction_the_stored_one() -> No
 def test_the_other_frames_of_a_burst_join_the_refraction(reconstruct: Reconstructor, counts: Counts) -> None:
     scatter = FrameScatter(3, 0.12, 0.05)
     task = KnownRefraction(replace(refraction(cylinder()), scatter=scatter))
-    *_, made = reconstruct.steps(counts, simulated=True, rounds=1, refraction=task, others=[counts, counts])  # type: ignore[arg-type]
+    *_, made = reconstruct.steps(
+        counts, simulated=True, rounds=1, others=[counts, counts],
+        refraction=task,  # type: ignore[arg-type]  # a stand-in, whose results need no thread
+    )  # fmt: skip
     assert isinstance(made, Reconstruction)
     assert len(task.others) == 2
     stated = made.report.refraction_scatter
