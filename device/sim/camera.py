@@ -31,20 +31,23 @@ class SimCamera:
     def expose(self, shot: ExposureSettings, into: NDArray[np.uint16] | None = None) -> Frame:
         """Return one frame whose exposure began after this call; `into` (rows, cols) is filled if given.
 
-        Sleeps for the exposure time. Raises CameraMissing, CameraStalled, or FrameError if `into` does not fit. With
+        Returns when the exposure time is over: what the simulation computes falls within it, as a sensor takes none of
+        the processor's time. A lamp that changed meanwhile counts as it is at the end. Raises CameraMissing, CameraStalled, or FrameError if `into` does not fit. With
         the fault "camera.mode" the counts are a new array of every other row and column.
         """
         self._check()
         if into is not None and (into.shape != self.shape or into.dtype != np.uint16):
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
         world = self.world
-        world.clock.sleep(shot.exposure_s)
+        begin_s, lamp = world.clock.now_s(), world.illumination
         if world.has_fault("camera.stalled"):
-            world.clock.sleep(STALL_S)
+            world.clock.sleep(shot.exposure_s + STALL_S)
             raise CameraStalled(f"the simulated camera gave no frame within {shot.exposure_s + STALL_S:.2g} s")
         world.frames += 1
-        seed = (world.scene.seed, world.frames)
-        counts = world.sensor.read(world.electrons(shot.exposure_s), seed, into)
+        counts = self._read(shot, begin_s, into)
+        world.clock.sleep(begin_s + shot.exposure_s - world.clock.now_s())
+        if world.illumination != lamp:
+            counts = self._read(shot, begin_s, into)
         world.lit_frames += world.illumination is not None
         if world.has_fault("camera.mode"):
             counts = counts[::2, ::2].copy()
@@ -54,6 +57,11 @@ class SimCamera:
         """Compute the light of the eye for frames of this length, not later while the lamp is lit."""
         if self.world.target is None:
             self.world.eyes.render_burst(self.world.eye, shot.exposure_s)
+
+    def _read(self, shot: ExposureSettings, begin_s: float, into: NDArray[np.uint16] | None) -> NDArray[np.uint16]:
+        """Return the counts of the present frame, whose exposure began at `begin_s` of the clock."""
+        world = self.world
+        return world.sensor.read(world.electrons(shot.exposure_s, begin_s), (world.scene.seed, world.frames), into)
 
     def close(self) -> None:
         """Close the camera, so that later exposures raise CameraMissing; idempotent."""

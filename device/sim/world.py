@@ -134,8 +134,11 @@ class World:
         """
         return self.eyes.electrons_per_s(self.eye, colour)
 
-    def electrons(self, exposure_s: float) -> Image:
-        """Return the expected electrons of an exposure, (rows, cols): of the target, else of eye, lamp and ambient."""
+    def electrons(self, exposure_s: float, begin_s: float | None = None) -> Image:
+        """Return the expected electrons of an exposure, (rows, cols): of the target, else of eye, lamp and ambient.
+
+        `begin_s`: when it began, seconds of the clock; by default, it ends now.
+        """
         if self.target is not None:
             target = np.roll(self.target, self.shake_px, axis=1) if self.frames % 2 else self.target
             return (target + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
@@ -148,7 +151,7 @@ class World:
         if glow.colour == self.spec.light.colour:
             step, parts = self.lit_frames if self.eyes.moves else 0, self.eyes.parts(exposure_s)
         returned: Image | float = self.eyes.electrons_per_s(self.eye, glow.colour, step, parts)
-        begin_s = self.clock.now_s() - exposure_s
+        begin_s = self.clock.now_s() - exposure_s if begin_s is None else begin_s
         closed = 1.0 if self.has_fault("eye.closed") else lid_share(self.scene, max(begin_s, 0.0), exposure_s)
         if closed > 0:
             lid = np.full(self.shape, np.mean(returned), np.float32)
