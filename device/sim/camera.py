@@ -32,8 +32,9 @@ class SimCamera:
         """Return one frame whose exposure began after this call; `into` (rows, cols) is filled if given.
 
         Returns when the exposure time is over: what the simulation computes falls within it, as a sensor takes none of
-        the processor's time. A lamp that changed meanwhile counts as it is at the end. Raises CameraMissing, CameraStalled, or FrameError if `into` does not fit. With
-        the fault "camera.mode" the counts are a new array of every other row and column.
+        the processor's time. A lamp that changed meanwhile counts as it is at the end. Raises CameraMissing,
+        CameraStalled, or FrameError if `into` does not fit. With the fault "camera.mode" the counts are a new array of
+        every other row and column.
         """
         self._check()
         if into is not None and (into.shape != self.shape or into.dtype != np.uint16):

@@ -9,7 +9,7 @@ frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
 b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
 is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7). It is computed, at
-the cost of six more solves, where the sensor crops the blurred field; elsewhere it is small, and b = 0.
+the cost of four more solves, where the sensor crops the blurred field; elsewhere it is small, and b = 0.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.recon.estimation.refraction_burst import BurstFrame, frame_steps
-from device.recon.estimation.refraction_crop_model import CropModel, Fit
+from device.recon.estimation.refraction_crop_model import COVARIANCE_ITERATIONS, CropModel, Fit
 from device.recon.estimation.refraction_edge import EdgeLikelihood
 from device.recon.estimation.refraction_field import FieldEdge
 from device.recon.model.fft_plans import Planner
@@ -29,7 +29,7 @@ VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the
 MOST_STEPS = 12  # 2 to 4 are usual
 BIAS_STEPS = 2  # first steps, for which the bias of a noise-free frame is computed
 FULL_STEPS = 3  # first steps; later ones are halved: some frames overshoot by a factor of two
-NOISE_PAIRS = 2  # draws for the bias by noise: their scatter adds 3 % to the sd
+NOISE_DRAWS = 2  # for the bias by noise: their scatter adds 3 % to the sd
 SETTLED_SDS = 0.2
 MOST_MISFIT = 1.2
 LARGEST_STEP_DPT = 0.7
@@ -85,7 +85,7 @@ class CropRefinement:
             if done == 0:
                 covariance = model.covariance(fit.derivatives)
             if is_cropped and done == 0:
-                by_noise = self._score_with_noise(fit) - without_noise
+                by_noise = self._score_of_noise(fit)
                 by_noise[1:] = 0  # J0 and J45 have none by symmetry; what the draws would give them only scatters
             step = covariance @ (fit.score - without_noise - by_noise)
             if done >= FULL_STEPS:
@@ -97,15 +97,15 @@ class CropRefinement:
         self._edges.fit_smooth(eye_dpt)
         return Refined(eye_dpt, covariance, model.misfit(light, fit), has_settled)
 
-    def _score_with_noise(self, fit: Fit) -> Floats:
-        """Return the mean score (3,) of the expected frame of a fit with noise of the sensor.
+    def _score_of_noise(self, fit: Fit) -> Floats:
+        """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.
 
-        Each noise is used with both signs, so that the parts of odd order cancel.
+        The fit is linear and its score a bilinear form of the frame with itself. What noise adds to it on the average
+        over both of its signs is therefore the score of the noise alone.
         """
         noise, random, total = self._edges.noise, np.random.default_rng(0), np.zeros(3)
         sd_dn = np.sqrt(noise.per_dn * np.maximum(fit.expected, 0) + noise.floor_dn2).astype(np.float32)
-        for _ in range(NOISE_PAIRS):
+        for _ in range(NOISE_DRAWS):
             noise_dn = random.standard_normal(sd_dn.shape, np.float32) * sd_dn
-            for light in (fit.expected + noise_dn, fit.expected - noise_dn):
-                total += self._model.fit(light, fit.detail).score
-        return total / (2 * NOISE_PAIRS)
+            total += self._model.fit(noise_dn, None, COVARIANCE_ITERATIONS).score
+        return total / NOISE_DRAWS

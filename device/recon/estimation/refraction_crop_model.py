@@ -18,6 +18,7 @@ from scipy import ndimage
 from device.recon.estimation.noise import Noise
 from device.recon.estimation.psf_warp import transform
 from device.recon.estimation.refraction_edge import EdgeLikelihood
+from device.recon.model import fused_kernels
 from device.recon.model.fft_plans import Planner, RealFft, Spectrum
 from device.recon.model.preprocessing import LEAST_GOOD, Linear
 from device.values import Image
@@ -28,8 +29,8 @@ REFERENCE = 0.1  # cycles per sample, at which the level of P is fitted to the r
 FLATTEST = 0.02  # cycles per sample, below which P is constant
 FITTED_RINGS = 10
 MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
-MOST_ITERATIONS = 40  # of conjugate gradients; with 80 the errors are the same
-COVARIANCE_ITERATIONS = 20  # for the covariance: its sds change by 1 % at the most
+MOST_ITERATIONS = 30  # of conjugate gradients; 40, 80 and 300 move an estimate by up to 0.3 sd, and not its error
+COVARIANCE_ITERATIONS = 20  # for covariance and bias: the sds change by 1 % at the most
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
 DARK_SHARE = 0.1  # of the mean
 NEAR_SAMPLES = 5  # side of the square of the local mean
@@ -135,11 +136,11 @@ class CropModel:
         self._slopes = [self._slope(eye_dpt, axis) for axis in np.eye(3) * DERIVATIVE_STEP_DPT]
         self._preconditioner = (1 / (1 + self._mean_weight * power)).astype(np.float32)
 
-    def fit(self, light: Image, start: Spectrum | None) -> Fit:
+    def fit(self, light: Image, start: Spectrum | None, most: int = MOST_ITERATIONS) -> Fit:
         """Return the fit of a frame for the eye in focus, with a smooth part of its own, from the detail `start` on."""
         smooth = self._edges.field.fit(replace(self._edges.frame, y=light), self._otf, self._edges.edge).image
         seen = self._seen(self._spectrum(smooth))
-        detail, weighted, fitted = self._solve((light - seen).astype(np.float32), start)
+        detail, weighted, fitted = self._solve((light - seen).astype(np.float32), start, most)
         spectrum = self._spectrum(smooth + self._object(detail))
         return Fit(detail, weighted, seen + fitted, [self._seen(spectrum, slope) for slope in self._slopes])
 
@@ -166,7 +167,8 @@ class CropModel:
         self._root = (self._root_shape * np.exp(logs.mean() / 2) / np.sqrt(lit * share)).astype(np.float32)
         radius = np.hypot(self._rows - np.float32(edge.down_samples), self._cols - np.float32(edge.right_samples))
         reach = edge.radius_samples + edge.width_samples / 2 + MARGIN_SAMPLES
-        self._reach = np.clip((np.float32(reach) - radius) / 2, 0, 1).astype(np.float32)
+        within = np.clip((np.float32(reach) - radius) / 2, 0, 1).astype(np.float32)
+        self._reach = within / np.float32(self._grid.size)  # with the scale of an inverse FFT
         self._mean_weight = float(self._weighting.weights.mean()) * min(seen, 1.0)
 
     def _slope(self, eye_dpt: Floats, step_dpt: Floats) -> Spectrum:
@@ -190,9 +192,9 @@ class CropModel:
 
     def _object(self, detail: Spectrum) -> Image:
         """Return the detail of the object (a view) that a whitened spectrum stands for."""
-        np.multiply(detail, self._root, out=self._fft.spectrum)
+        fused_kernels.filtered(detail, self._root, self._fft.spectrum)
         space = self._fft.inverse()
-        space *= self._reach / np.float32(self._grid.size)
+        space *= self._reach
         return space
 
     def _blurred(self, detail: Spectrum) -> Image:
@@ -202,45 +204,44 @@ class CropModel:
         spectrum *= self._otf
         return self._fft.inverse()[self._grid.slices] / np.float32(self._grid.size)
 
-    def _adjoint(self, frame: Image) -> Spectrum:
-        """Return the adjoint of `_blurred`, a new array."""
+    def _adjoint_in_fft(self, frame: Image) -> Spectrum:
+        """Return the adjoint of `_blurred` before the whitening, in the array of the FFT."""
         space = self._fft.space
         space[:] = 0
         space[self._grid.slices] = frame
-        spectrum = self._fft.forward()
-        np.multiply(spectrum, self._otf.conj(), out=spectrum)
+        fused_kernels.multiply_conjugate(self._fft.forward(), self._otf)
         space = self._fft.inverse()
-        space *= self._reach / np.float32(self._grid.size)
-        return np.asarray(self._fft.forward() * self._root, np.complex64)
+        space *= self._reach
+        return self._fft.forward()
+
+    def _adjoint(self, frame: Image) -> Spectrum:
+        """Return the adjoint of `_blurred`, a new array."""
+        adjoint = np.empty_like(self._otf)
+        fused_kernels.filtered(self._adjoint_in_fft(frame), self._root, adjoint)
+        return adjoint
 
     def _solve(
         self, frame: Image, start: Spectrum | None, most: int = MOST_ITERATIONS
     ) -> tuple[Spectrum, Image, Image]:
         """Return the whitened spectrum of a frame's detail, K^-1 times the frame, and the frame of the detail."""
-        detail = np.zeros(self._otf.shape, np.complex64) if start is None else start
+        detail = np.zeros_like(self._otf) if start is None else start.copy()
         fitted = np.zeros(self._grid.window, np.float32) if start is None else self._blurred(detail)
         rest = self._adjoint(self._weighting(frame - fitted)) - detail
-        first = self._dot(self._adjoint(self._weighting(frame)), self._preconditioner)
-        direction = rest * self._preconditioner
-        size = self._dot(rest, self._preconditioner)
+        first = fused_kernels.squared_length(self._adjoint(self._weighting(frame)), self._preconditioner, self._twice)
+        direction, moved = np.zeros_like(rest), np.empty_like(rest)
+        size, ratio = fused_kernels.squared_length(rest, self._preconditioner, self._twice), 0.0
         for _ in range(most):
             if size <= RESIDUAL_SHARE * first:
                 break
+            fused_kernels.next_direction(ratio, rest, self._preconditioner, direction)
             seen = self._blurred(direction)
-            moved = self._adjoint(self._weighting(seen)) + direction
-            length = np.float32(size / self._dot(direction, 1, moved))
-            detail = detail + length * direction
-            fitted += length * seen
-            rest -= length * moved
-            before, size = size, self._dot(rest, self._preconditioner)
-            direction *= np.float32(size / before)
-            direction += rest * self._preconditioner
+            normal = self._adjoint_in_fft(self._weighting(seen))
+            curvature = fused_kernels.add_normal_part(normal, self._root, direction, self._twice, moved)
+            factor, before = size / curvature, size
+            size = fused_kernels.step_along(factor, direction, moved, self._preconditioner, self._twice, detail, rest)
+            fitted += np.float32(factor) * seen
+            ratio = size / before
         return detail, self._weighting(frame - fitted), fitted
-
-    def _dot(self, a: Spectrum, weight: Image | int, b: Spectrum | None = None) -> float:
-        """Return the inner product of two images with these spectra, weighted per frequency, times their size."""
-        product = a.real * (a if b is None else b).real + a.imag * (a if b is None else b).imag
-        return float((product * weight).sum(axis=0, dtype=np.float64) @ self._twice)
 
 
 def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:

@@ -263,3 +263,80 @@ def negative_log_likelihood(
         s = power[m] * levels[ring[m]] + s2
         total += np.log(s) + energy[m] / s
     return total
+
+
+@_jit
+def filtered(spectrum: Spectrum, weight: Image, out: Spectrum) -> None:
+    """Evaluate out = weight * spectrum, for real weights of the frequencies."""
+    rows, cols = spectrum.shape
+    for i in range(rows):
+        for j in range(cols):
+            out[i, j] = weight[i, j] * spectrum[i, j]
+
+
+@_jit
+def multiply_conjugate(spectrum: Spectrum, otf: Spectrum) -> None:
+    """Multiply a spectrum by the conjugate of an OTF, in place."""
+    rows, cols = spectrum.shape
+    for i in range(rows):
+        for j in range(cols):
+            a, h = spectrum[i, j], otf[i, j]
+            spectrum[i, j] = complex(a.real * h.real + a.imag * h.imag, a.imag * h.real - a.real * h.imag)
+
+
+@_jit
+def squared_length(spectrum: Spectrum, weight: Image, twice: Series) -> float:
+    """Return the sum of weight * |spectrum|^2 over all frequencies; `twice` counts those that an rfft leaves out."""
+    rows, cols = spectrum.shape
+    total = 0.0
+    for i in range(rows):
+        for j in range(cols):
+            a = spectrum[i, j]
+            total += twice[j] * weight[i, j] * (a.real * a.real + a.imag * a.imag)
+    return total
+
+
+@_jit
+def add_normal_part(spectrum: Spectrum, root: Image, direction: Spectrum, twice: Series, moved: Spectrum) -> float:
+    """Evaluate moved = root * spectrum + direction, the normal operator of conjugate gradients on their direction.
+
+    Return the inner product of direction and moved.
+    """
+    rows, cols = spectrum.shape
+    total = 0.0
+    for i in range(rows):
+        for j in range(cols):
+            d = direction[i, j]
+            m = root[i, j] * spectrum[i, j] + d
+            moved[i, j] = m
+            total += twice[j] * (d.real * m.real + d.imag * m.imag)
+    return total
+
+
+@_jit
+def step_along(
+    factor: float, direction: Spectrum, moved: Spectrum, weight: Image, twice: Series, x: Spectrum, rest: Spectrum
+) -> float:
+    """Take a step of conjugate gradients: x += factor * direction, rest -= factor * moved.
+
+    Return the sum of weight * |rest|^2, as `squared_length` does.
+    """
+    rows, cols = x.shape
+    total, along = 0.0, np.float32(factor)
+    for i in range(rows):
+        for j in range(cols):
+            x[i, j] += along * direction[i, j]
+            r = rest[i, j] - along * moved[i, j]
+            rest[i, j] = r
+            total += twice[j] * weight[i, j] * (r.real * r.real + r.imag * r.imag)
+    return total
+
+
+@_jit
+def next_direction(ratio: float, rest: Spectrum, weight: Image, direction: Spectrum) -> None:
+    """Evaluate direction = weight * rest + ratio * direction, in place."""
+    rows, cols = rest.shape
+    b = np.float32(ratio)
+    for i in range(rows):
+        for j in range(cols):
+            direction[i, j] = weight[i, j] * rest[i, j] + b * direction[i, j]
