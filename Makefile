@@ -210,8 +210,8 @@ bench: .venv/ready browser ## Print figures of speed and truth, measured on this
 
 COUNT ?= 2000
 
-bench-archive: .archive-venv/ready ## Print captures a minute on Dask and in bare processes, memory, and results after kills; COUNT=200.
-	@.archive-venv/bin/python -m tests.bench.archive $(COUNT)
+bench-archive: .archive-venv/ready ## Print captures a minute on Dask and in bare processes, memory, and results after kills; COUNT=200, DATA=folder has recordings.
+	@.archive-venv/bin/python -m tests.bench.archive $(COUNT) $(DATA)
 
 bench-attacks: .venv/ready ## Measure status and press while clients hold connections that they do not use.
 	@$(BIN)/python -m tests.bench.attacks

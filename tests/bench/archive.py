@@ -1,6 +1,7 @@
-"""`python -m tests.bench.archive COUNT`: reprocessing on Dask against bare processes, memory, and results after kills.
+"""`python -m tests.bench.archive COUNT DATA`: reprocessing on Dask against bare processes, memory, kills, and quality.
 
-Frames of the small simulated head (270 x 480 pixels) at three light levels, every tenth with a defect, as own pairs.
+Frames of the small simulated head (270 x 480 pixels) at three light levels, every tenth with a defect, as own pairs;
+and the recordings in DATA/lensless, if given. The earlier pictures are those of the quick look's method.
 """
 
 import json
@@ -24,14 +25,17 @@ from device.config.head_file import load_head
 from device.sim.render import crop_or_pad
 from services.lab.archive import cluster
 from services.lab.archive.plan import Plan, read_plan
-from services.lab.archive.result import ResultFolder
+from services.lab.archive.report import LOSS_DB
+from services.lab.archive.result import TABLE, ResultFolder
 from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from tests.simulated import expected_electrons, small_head_toml, world
 
 COMMAND = str(Path(sys.executable).parent / "diffuscope")
 ROUNDS = 10
 LIGHT = (1.0, 0.2, 0.04)  # of 15,000 electrons in the brightest pixel
+EARLIER_METHOD = "gradient"
 EVERY = 10  # a hard frame among so many: clipped, half covered, or without signal
+REPORT = Path("out/archive-bench.html")
 SPAWNED = get_context("spawn")
 
 
@@ -50,18 +54,18 @@ def write_archive(folder: Path, count: int) -> None:
         electrons = rng.poisson(expected * LIGHT[k % 3]) + rng.normal(0, 2, expected.shape)
         frame = np.clip(electrons / 4 + 64, 0, 4095)
         if k % EVERY == EVERY - 1:
-            frame = hard(frame, k // EVERY % 3)
+            frame = hard(frame, k // EVERY % 3, rng)
         tifffile.imwrite(source / "raw" / f"eye{k:05d}.tiff", frame.round().astype(np.uint16))
         (source / "truth" / f"eye{k:05d}.npy").symlink_to(folder / "truth.npy")
 
 
-def hard(frame: np.ndarray, kind: int) -> np.ndarray:
+def hard(frame: np.ndarray, kind: int, rng: np.random.Generator) -> np.ndarray:
     """Return a frame that is clipped, half covered by a lid, or without any signal."""
     if kind == 0:
         return np.clip(4 * frame, 0, 4095)
     if kind == 1:
         return np.where(np.arange(frame.shape[0])[:, None] < frame.shape[0] // 2, 64, frame)
-    return np.full_like(frame, 64)
+    return rng.normal(64, 0.5, frame.shape)
 
 
 def command(*words: object) -> list[str]:
@@ -171,15 +175,52 @@ def with_kills(plan_file: Path, root: Path, worker_kills: int, run_kills: int) -
                 return killed, ended
 
 
+def planned(sources: list[Path], plan_file: Path, *options: object) -> Plan:
+    """Return the plan of some sources, by the command."""
+    subprocess.run(command("plan", *sources, "-o", plan_file, *options), check=True, stdout=subprocess.DEVNULL)
+    return read_plan(plan_file)
+
+
+def add_earlier_pictures(source: Path, folder: Path) -> None:
+    """Reconstruct the frames of a folder by EARLIER_METHOD, and put the pictures where a plan finds earlier ones."""
+    plan = planned([source], folder / "earlier.toml", "--method", EARLIER_METHOD)
+    on_dask(folder / "earlier.toml", folder / "earlier", 2)
+    results = ResultFolder(folder / "earlier")
+    (source / "before").mkdir()
+    for one in plan.captures:
+        if results.has(one.result):
+            (source / "before" / f"{Path(one.raw).stem}.tiff").symlink_to(results.place(one.result) / "picture.tiff")
+
+
+def judge_quality(root: Path) -> None:
+    """Print PSNR and correlation before and after, and every capture that got worse, with its messages."""
+    rows = pd.read_parquet(root / TABLE)
+    both = rows.dropna(subset=["psnr_db", "before_psnr_db"])
+    for name, unit in (("psnr_db", "dB"), ("pcc", "")):
+        print(
+            f"{name}: {len(both)} captures, mean {both[f'before_{name}'].mean():.3f} -> {both[name].mean():.3f} {unit}"
+        )
+    worse = both[both["psnr_db"] - both["before_psnr_db"] < LOSS_DB]
+    print(f"worse by more than {-LOSS_DB} dB: {len(worse)}")
+    for _, row in worse.iterrows():
+        loss_db = row["before_psnr_db"] - row["psnr_db"]
+        print(
+            f"  {row['id']}: -{loss_db:.2f} dB of {row['before_psnr_db']:.1f}, {row['method']}; {list(row['messages'])}"
+        )
+
+
 def main() -> None:
     """Print all figures."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
+    recordings = sorted((Path(sys.argv[2]) / "lensless").iterdir()) if len(sys.argv) > 2 else []
     with TemporaryDirectory(prefix="archive-") as place:
         folder = Path(place)
         write_archive(folder, count)
-        plan_file = folder / "plan.toml"
-        subprocess.run(command("plan", folder / "recording", "-o", plan_file, "--rounds", ROUNDS), check=True)
-        plan, seconds = read_plan(plan_file), {}
+        add_earlier_pictures(folder / "recording", folder)
+        plan_file, seconds = folder / "plan.toml", {}
+        plan = planned([folder / "recording", *recordings], plan_file, "--rounds", ROUNDS)
+        count = len(plan.captures)
+        print(f"{count} captures, {len(plan.left_out)} left out, {len(plan.calibrations)} calibrations", flush=True)
         for processes in (1, 2):
             used_s = [children_s()]
             seconds[f"bare {processes}"] = bare(plan_file, folder / f"bare{processes}", processes)
@@ -200,6 +241,8 @@ def main() -> None:
         print(f"kills of workers and runs: {killed}; rows {len(rows)}, states {dict(rows['state'].value_counts())}")
         for other in ("bare1", "bare2", "dask1", "dask2"):
             print(f"same bytes as {other}: {same_results(plan, folder / 'killed', folder / other)}")
+        judge_quality(folder / "killed")
+        subprocess.run(command("report", folder / "killed", "-o", REPORT), check=True)
         print(json.dumps(seconds))
 
 
