@@ -4,7 +4,7 @@ import json
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from pathlib import Path
 
@@ -20,7 +20,9 @@ from device.calibration.archive import Archive as Calibrations
 from device.calibration.archive import Provenance
 from device.clock import VirtualClock
 from device.values import Sensor
-from services.lab.archive.plan import read_plan
+from services.lab.archive.plan import InputFile, PlannedCalibration, read_plan
+from services.lab.archive.result import ResultFolder
+from services.lab.archive.solve import CalibrationFiles, Solvers, Task, local_names
 from tests.archive.conftest import COMMAND, FRAMES, Archive, result_digests, write_recording
 from tests.datasets import Scene
 from tests.scenes import calibration
@@ -191,7 +193,31 @@ def test_a_plan_of_other_versions_is_refused(whole: tuple[Path, Path], archive: 
     (tmp_path / "old.toml").write_text(whole[0].read_text().replace(code, "0" * 12))
     done = archive("run", tmp_path / "old.toml", "-o", tmp_path / "out")
     assert done.returncode == 2
-    assert f"code {'0' * 12} here, {code} there" in done.stderr
+    assert f"code {'0' * 12} expected, {code} found" in done.stderr
+
+
+def test_a_worker_that_outlives_a_plan_takes_the_settings_of_the_next_one(
+    recording: Path, archive: Archive, tmp_path: Path
+) -> None:
+    rounds, solvers = [], None
+    for wanted in (3, 1):
+        path = tmp_path / f"plan-{wanted}.toml"
+        assert archive("plan", recording, "-o", path, "--rounds", wanted).returncode == 0
+        plan, results = read_plan(path), ResultFolder(tmp_path / f"out-{wanted}")
+        results.prepare(plan)
+        (calibration,), first = plan.calibrations, plan.captures[0]
+        if solvers is None:
+            files = {name: Path(one.path).read_bytes() for (_, name), one in named_files(calibration)}
+            calibrations = CalibrationFiles(tmp_path / "calibrations")
+            calibrations.add(calibration.digest, files)
+            solvers = Solvers(calibrations)
+        solvers.solve(Task(first, calibration, plan.settings, plan.software), results, "worker")
+        rounds.append(results.read(first.result).report["report"]["rounds"])  # type: ignore[index, call-overload]
+    assert rounds == [3, 1]
+
+
+def named_files(calibration: PlannedCalibration) -> Iterable[tuple[tuple[str, str], InputFile]]:
+    return zip(local_names(calibration), calibration.files, strict=True)
 
 
 def test_an_archive_of_none_gives_an_empty_table(archive: Archive, tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def test_a_name_depends_on_capture_calibration_versions_and_settings() -> None:
 
 def test_versions_of_another_machine_are_named() -> None:
     assert different_versions(software(), software()) == ""
-    assert different_versions({"numpy": "2", "code": "a"}, {"numpy": "3", "code": "a"}) == "numpy 2 here, 3 there"
+    assert different_versions({"numpy": "2", "code": "a"}, {"numpy": "3", "code": "a"}) == "numpy 2 expected, 3 found"
 
 
 def test_a_frame_of_equal_content_is_planned_once(scene: Scene, tmp_path: Path) -> None:

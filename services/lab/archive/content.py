@@ -35,9 +35,9 @@ def software() -> dict[str, str]:
 
 
 def different_versions(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
-    """Return the differing versions as `name 1 here, 2 there; ...`; empty if all are equal."""
+    """Return the differing versions as `name 1 expected, 2 found; ...`; empty if all are equal."""
     names = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
-    return "; ".join(f"{name} {expected.get(name, 'none')} here, {found.get(name, 'none')} there" for name in names)
+    return "; ".join(f"{name} {expected.get(name, 'none')} expected, {found.get(name, 'none')} found" for name in names)
 
 
 def file_digest(path: Path) -> str:

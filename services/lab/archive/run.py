@@ -20,7 +20,7 @@ PROGRESS_S = 2.0
 
 @dataclass(frozen=True)
 class Ran:
-    """Numbers of captures after a run: with a result, in quarantine, left out; computed now, and in how many s."""
+    """Numbers of captures after a run: with a result, in quarantine, left out; tasks run now, and their time in s."""
 
     done: int
     quarantined: int
@@ -33,14 +33,16 @@ def run_plan(
     plan: Plan, root: Path, clock: Clock, progress: Callable[[str], None], workers: int | None = None,
     scheduler: str | None = None,
 ) -> Ran:  # fmt: skip
-    """Compute every capture of a plan that has no result yet, and write the table; idempotent.
+    """Compute every capture without a result, except those in quarantine that cannot succeed; write the table.
 
-    `workers` and `scheduler` as of `cluster.connected`. `progress` gets lines of text. SettingError for a folder of
-    another plan or another run, and for a plan of other versions; StoreFull or StoreError if the disk refuses;
-    DiffuscopeError if the scheduler or a source is gone: results so far stay.
+    Idempotent. `workers` and `scheduler` as of `cluster.connected`. `progress` gets lines of text. SettingError for a
+    folder of another plan or another run, and for a plan of other versions; StoreFull or StoreError if the disk
+    refuses; DiffuscopeError if the scheduler or a source is gone: results so far stay.
     """
     if found := different_versions(plan.software, software()):
-        raise SettingError(f"the plan was made with other versions (plan, here): {found}", "Make a new plan.")
+        raise SettingError(
+            f"the plan was made with other versions than those of this machine: {found}", "Make a new plan."
+        )
     results = ResultFolder(root)
     write_or_raise(root, lambda: atomic_io.make_folder(root))
     try:

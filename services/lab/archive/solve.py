@@ -22,7 +22,7 @@ from device.recon.model.fft_plans import Planner
 from device.values import Colour, Image
 from services.imaging.picture_files import read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
-from services.lab.archive.content import different_versions, file_digest, software
+from services.lab.archive.content import different_versions, digest_of, file_digest, software
 from services.lab.archive.plan import COLOUR_ROLES, PlannedCalibration, PlannedCapture, PlanSettings, Role
 from services.lab.archive.result import (
     COLOUR_PICTURE,
@@ -102,12 +102,12 @@ def local_names(calibration: PlannedCalibration) -> list[tuple[Role, str]]:
 
 
 class Solvers:
-    """Planned solvers of one worker by calibration, and the reconstruction of captures with them. Not thread-safe."""
+    """Planned solvers of one worker by calibration and settings, and reconstruction with them. Not thread-safe."""
 
     def __init__(self, calibrations: CalibrationFiles, clock: Clock | None = None) -> None:
         self._calibrations, self._clock = calibrations, clock or SystemClock()
         self._planner = Planner(None, effort=EFFORT)
-        self._kept: OrderedDict[str, CaptureReconstructor] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str], CaptureReconstructor] = OrderedDict()
 
     def solve(self, task: Task, results: ResultFolder, worker: str) -> Outcome:
         """Reconstruct a capture and store its result; a result that is there already stays.
@@ -159,7 +159,7 @@ class Solvers:
         return _Made(replace(solved, made=made), _facts(stated), scores)
 
     def _solver(self, task: Task) -> CaptureReconstructor:
-        key = task.calibration.digest
+        key = task.calibration.digest, digest_of(task.settings.model_dump())  # a worker may outlive a plan
         if key not in self._kept:
             options = self._calibrations.options(task.calibration, task.settings)
             colour_psfs: dict[Colour, tuple[Path, ...]] = {}
