@@ -41,14 +41,14 @@ class SimCamera:
             raise FrameError(f"the buffer is {into.dtype} {into.shape}; this sensor fills uint16 {self.shape}")
         world = self.world
         begin_s, lamp = world.clock.now_s(), world.illumination
-        if world.has_fault("camera.stalled"):
-            world.clock.sleep(shot.exposure_s + STALL_S)
-            raise CameraStalled(f"the simulated camera gave no frame within {shot.exposure_s + STALL_S:.2g} s")
-        world.frames += 1
         counts = self._read(shot, begin_s, into)
         world.clock.sleep(begin_s + shot.exposure_s - world.clock.now_s())
+        if world.has_fault("camera.stalled"):
+            world.clock.sleep(STALL_S)
+            raise CameraStalled(f"the simulated camera gave no frame within {shot.exposure_s + STALL_S:.2g} s")
         if world.illumination != lamp:
             counts = self._read(shot, begin_s, into)
+        world.frames += 1
         world.lit_frames += world.illumination is not None
         if world.has_fault("camera.mode"):
             counts = counts[::2, ::2].copy()
@@ -60,9 +60,9 @@ class SimCamera:
             self.world.eyes.render_burst(self.world.eye, shot.exposure_s)
 
     def _read(self, shot: ExposureSettings, begin_s: float, into: NDArray[np.uint16] | None) -> NDArray[np.uint16]:
-        """Return the counts of the present frame, whose exposure began at `begin_s` of the clock."""
+        """Return the counts of the next frame, whose exposure began at `begin_s` of the clock."""
         world = self.world
-        return world.sensor.read(world.electrons(shot.exposure_s, begin_s), (world.scene.seed, world.frames), into)
+        return world.sensor.read(world.electrons(shot.exposure_s, begin_s), (world.scene.seed, world.frames + 1), into)
 
     def close(self) -> None:
         """Close the camera, so that later exposures raise CameraMissing; idempotent."""

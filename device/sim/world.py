@@ -140,7 +140,7 @@ class World:
         `begin_s`: when it began, seconds of the clock; by default, it ends now.
         """
         if self.target is not None:
-            target = np.roll(self.target, self.shake_px, axis=1) if self.frames % 2 else self.target
+            target = np.roll(self.target, self.shake_px, axis=1) if self.frames % 2 == 0 else self.target
             return (target + np.float32(self.dark_e_per_s)) * np.float32(exposure_s)
         unlit_e_per_s = self.dark_e_per_s + self._ambient_light_e_per_s + self.ambient_e_per_s
         unlit_e = np.asarray(unlit_e_per_s * exposure_s, np.float32)

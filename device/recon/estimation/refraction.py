@@ -239,7 +239,9 @@ class RefractionEstimator:
         eye_dpt = model.minimum
         if self._is_refined:
             refined = self._refinement(eye_dpt)
-            if not refined.is_valid:
+            if not refined.has_settled:
+                return NoRefraction("the refinement of the refraction does not converge")
+            if not refined.is_explained:
                 return NoRefraction("no retina explains the frame with this PSF")
             distance = np.abs(refined.eye_dpt - eye_dpt) / np.hypot(sds_dpt, refined.sds_dpt)
             if distance.max() > MOST_DISTANCE_SDS:

@@ -9,7 +9,8 @@ frame at the posterior mean s + a t with respect to T = (M, J0, J45), a step is
 
 b is the mean of the score D' K^-1 r over frames that are drawn from the fit itself: the noise, and the smooth part that
 is fitted before the detail, give the score of the true eye a mean that is not 0 (NUMERICS.md 7.7). It is computed, at
-the cost of four more solves, where the sensor crops the blurred field; elsewhere it is small, and b = 0.
+the cost of four more solves, where the window is smaller than the blurred field (areas); elsewhere it is small, and
+b = 0. The field edge is held.
 """
 
 from collections.abc import Sequence
@@ -39,9 +40,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Refined:
-    """Eye (M, J0, J45) in dpt as wavefront, its covariance in dpt^2, and the misfit.
+    """Eye (M, J0, J45) in dpt as wavefront, and the misfit; `covariance` is (D' K^-1 D)^-1 of the first step, dpt^2.
 
-    `misfit` is the squared residual over its noise per sample: 0.3 to 0.7 where the model explains the frame.
+    `misfit` is the squared residual over its noise per sample: 0.4 to 0.8 where the model explains the frame.
     """
 
     eye_dpt: Floats
@@ -50,9 +51,9 @@ class Refined:
     has_settled: bool
 
     @property
-    def is_valid(self) -> bool:
-        """True if the steps have ended and the model explains the frame."""
-        return self.has_settled and self.misfit < MOST_MISFIT
+    def is_explained(self) -> bool:
+        """True if the model explains the frame."""
+        return self.misfit < MOST_MISFIT
 
     @property
     def sds_dpt(self) -> Floats:
@@ -86,7 +87,9 @@ class CropRefinement:
                 covariance = model.covariance(fit.derivatives)
             if is_cropped and done == 0:
                 by_noise = self._score_of_noise(fit)
-                by_noise[1:] = 0  # J0 and J45 have none by symmetry; what the draws would give them only scatters
+                by_noise[1:] = (
+                    0  # small by symmetry (at most 0.3 sd of J0 on four frames); the draws would mostly scatter
+                )
             step = covariance @ (fit.score - without_noise - by_noise)
             if done >= FULL_STEPS:
                 step = step / 2
@@ -100,8 +103,8 @@ class CropRefinement:
     def _score_of_noise(self, fit: Fit) -> Floats:
         """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.
 
-        The fit is linear and its score a bilinear form of the frame with itself. What noise adds to it on the average
-        over both of its signs is therefore the score of the noise alone.
+        The fit is linear, and its score a quadratic form of the frame: over both signs of a noise it grows by the score
+        of the noise alone. Steps by 20 iterations differ from that by up to 0.003 dpt, by 200 by 0.0002.
         """
         noise, random, total = self._edges.noise, np.random.default_rng(0), np.zeros(3)
         sd_dn = np.sqrt(noise.per_dn * np.maximum(fit.expected, 0) + noise.floor_dn2).astype(np.float32)

@@ -28,8 +28,9 @@ DETAIL_EXPONENT = -2.5  # of the spectrum P; exponents from -2 to -3 give the sa
 REFERENCE = 0.1  # cycles per sample, at which the level of P is fitted to the rings
 FLATTEST = 0.02  # cycles per sample, below which P is constant
 FITTED_RINGS = 10
+LEAST_LEVEL = 1e-4  # of the highest one; a ring without detail has a floor instead of a level
 MARGIN_SAMPLES = 4.0  # from the end of the edge to the end of the object
-MOST_ITERATIONS = 30  # of conjugate gradients; 40, 80 and 300 move an estimate by up to 0.3 sd, and not its error
+MOST_ITERATIONS = 30  # of conjugate gradients; 40, 80 and 300 move an estimate by up to 0.3 sd, the RMS error stays
 COVARIANCE_ITERATIONS = 20  # for covariance and bias: the sds change by 1 % at the most
 RESIDUAL_SHARE = 1e-7  # of the first squared residual, at which the iteration ends
 DARK_SHARE = 0.1  # of the mean
@@ -103,7 +104,7 @@ class Fit:
 class CropModel:
     """Model of the frame that an `EdgeLikelihood` was started with, on the same grid, for a PSF with this radius.
 
-    `seen_share`, from `start` on: area of the sensor over that of the blurred field; below 1 the light is cropped.
+    `seen_share`, from `start` on: area of the window over that of the blurred field; below 1 light is cropped.
     """
 
     def __init__(self, edges: EdgeLikelihood, planner: Planner, psf_radius_px: float) -> None:
@@ -245,12 +246,12 @@ class CropModel:
 
 
 def detail_levels(edges: EdgeLikelihood, eye_dpt: Floats) -> tuple[Floats, Floats]:
-    """Return mean frequency (cycles per sample) and level of the retina's detail of each ring that has a level."""
+    """Return mean frequency (cycles per sample) and level of the retina's detail of the first rings with detail."""
     edges(eye_dpt)
     band, count = edges.band, edges.levels.size
     sums = np.bincount(band.ring, np.hypot(band.rows, band.cols), count).astype(np.float64)
     frequency = sums / np.maximum(np.bincount(band.ring, minlength=count), 1)
-    is_known = edges.levels[:FITTED_RINGS] > 0
+    is_known = edges.levels[:FITTED_RINGS] > LEAST_LEVEL * edges.levels[:FITTED_RINGS].max()
     return frequency[:FITTED_RINGS][is_known], edges.levels[:FITTED_RINGS][is_known]
 
 
