@@ -39,6 +39,17 @@ def test_a_table_of_a_hundred_thousand_rows_is_reported_in_time(tmp_path: Path) 
     assert "head-0" in page
     assert "no signal" in page
     assert page.count("<h2>") == 10
+    assert "c19, c39" in page  # the first captures of a reason
+
+
+def test_an_archive_without_earlier_pictures_shows_what_is_least_explained(tmp_path: Path) -> None:
+    rows = [{"id": f"c{k}", "state": "done", "residual": 1.0 + k, "messages": []} for k in range(8)]
+    (tmp_path / "captures.parquet").write_bytes(encoded_table(rows))
+    write_report(tmp_path, tmp_path / "report.html", lambda _: None)
+    page = (tmp_path / "report.html").read_text()
+    assert "Nothing to compare" in page
+    assert "got worse" not in page
+    assert page.index("c7: residual 8") < page.index("c6: residual 7")
 
 
 def test_the_age_of_a_calibration_is_in_days_or_unknown() -> None:

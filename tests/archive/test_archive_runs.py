@@ -163,6 +163,13 @@ def test_bad_input_is_put_into_quarantine_with_its_reason(
     assert "another content" in reasons["eye003"]
     assert "30 x 40" in reasons["small"]
     assert "not a whole" in reasons["text"]
+    assert str(tmp_path / "out" / "quarantine") in done.stdout
+    tifffile.imwrite(raws / "eye001.tiff", scene.raw + 2)
+    assert archive("plan", recording, "-o", tmp_path / "mended.toml", "--rounds", 3).returncode == 0
+    done = archive("run", tmp_path / "mended.toml", "-o", tmp_path / "out", "--workers", 1)
+    assert "2 in quarantine" in done.stdout, done.stderr
+    assert "2 computed" in done.stdout  # the frames that were replaced; the others have a result, or cannot succeed
+    assert len(list((tmp_path / "out" / "earlier-plans").iterdir())) == 1
     (raws / "eye004.tiff").unlink()
     done = archive("run", plan, "-o", tmp_path / "gone", "--workers", 1)
     lost = pd.read_parquet(tmp_path / "gone" / "captures.parquet").set_index("id")
@@ -177,11 +184,7 @@ def test_a_source_that_is_gone_ends_the_run(recording: Path, plan: Path, archive
     assert "Traceback" not in done.stderr
 
 
-def test_two_runs_and_two_plans_in_one_folder_are_refused(
-    whole: tuple[Path, Path], plan: Path, archive: Archive
-) -> None:
-    done = archive("run", plan, "-o", whole[1])
-    assert "holds the results of another plan" in done.stderr
+def test_two_runs_into_one_folder_are_refused(whole: tuple[Path, Path], archive: Archive) -> None:
     with atomic_io.file_lock(whole[1] / ".lock"):
         done = archive("run", whole[0], "-o", whole[1])
     assert done.returncode == 2

@@ -114,6 +114,16 @@ def test_calibrations_of_another_folder_are_used(scene: Scene, tmp_path: Path) -
     assert len(plan_of(tmp_path / "store", tmp_path / "kept").captures) == 1
 
 
+def test_an_empty_frame_is_left_out_and_a_folder_without_psf_says_so(scene: Scene, tmp_path: Path) -> None:
+    folder = recording(tmp_path / "a", scene, 2)
+    (folder / "eye1.tiff").write_bytes(b"")
+    plan = plan_of(folder)
+    assert [one.reason for one in plan.left_out] == ["its raw frame is an empty file"]
+    (folder / "psf.tiff").unlink()
+    with pytest.raises(SettingError, match=r"2 images, but no psf\.tiff"):
+        plan_of(folder)
+
+
 def test_an_archive_of_none_is_a_plan(tmp_path: Path) -> None:
     (tmp_path / "captures").mkdir()
     assert plan_of(tmp_path).captures == ()

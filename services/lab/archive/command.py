@@ -47,6 +47,7 @@ def run(
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, as tcp://host:8786.")] = None,
 ) -> None:
     """Reconstruct what a plan lists and has no result yet; write captures.parquet. Exit status 1 if some failed."""
+    from services.lab.archive.result import QUARANTINE
     from services.lab.archive.run import run_plan  # deferred: imports Dask and pyarrow, of the extra `archive`
 
     if workers is not None and scheduler is not None:
@@ -56,6 +57,8 @@ def run(
         f"{output}: {ran.done} with a result, {ran.quarantined} in quarantine, {ran.left_out} left out; "
         f"{ran.computed} computed in {ran.seconds:.0f} s"
     )
+    if ran.quarantined:
+        typer.echo(f"reasons and remedies: {output / QUARANTINE}")
     raise typer.Exit(1 if ran.quarantined else 0)
 
 

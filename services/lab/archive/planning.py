@@ -35,8 +35,9 @@ def make_plan(
 ) -> Plan:  # fmt: skip
     """Return the plan for all captures of the sources; nothing is written.
 
-    A capture that cannot be planned is in `left_out` with its reason: no raw frame, no calibration, or the content of
-    another capture. Raw frames are read for their SHA-256, those of a store not. `progress` gets lines of text.
+    A capture that cannot be planned is in `left_out` with its reason: no raw frame or an empty one, no calibration, or
+    the content of another capture. Raw frames are read for their SHA-256, those of a store not. `progress` gets lines
+    of text.
     SettingError for a folder that is no source, or for settings that no reconstruction can have.
     """
     _refuse_settings(settings)
@@ -84,6 +85,9 @@ class _Planning:
     def _add(self, found: FoundCapture, source: Path) -> None:
         if found.calibration is None:
             self._leave_out(found, source, found.refused or "it has no calibration")
+            return
+        if found.raw_sha256 is None and found.raw.stat().st_size == 0:
+            self._leave_out(found, source, "its raw frame is an empty file")
             return
         calibration = self._calibration(found.calibration)
         raw_digest = found.raw_sha256 or file_digest(found.raw)

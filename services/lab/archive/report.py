@@ -25,6 +25,7 @@ from services.lab.reconstruct_file import write_or_raise
 
 SHOWN = 6  # pictures of the largest improvements, and of the largest losses
 SIDE_PX = 360
+NAMED = 5  # captures of a message that are named
 MOST_MARKS = 2_000  # of a plot; a larger table is sampled evenly
 LOSS_DB = -0.1  # less is within the fit of intensity
 LOSS_RATIO = 0.98
@@ -160,7 +161,7 @@ def _counted(counts: Counter[str]) -> list[list[str]]:
 
 def _quality(found: list[Change]) -> str:
     if not found:
-        return "<p>No capture has a figure before and after.</p>"
+        return "<p>Nothing to compare: no capture has a figure before and after.</p>"
     rows = []
     for unit in ("dB", "cycles/px"):
         some = [one for one in found if one.unit == unit]
@@ -201,11 +202,28 @@ def _best(found: list[Change]) -> list[Change]:
 
 
 def _losses(folder: Path, columns: Columns, found: list[Change]) -> str:
+    if not found:
+        return "<p>Nothing to compare.</p>" + _least_explained(folder, columns)
     losses = sorted((one for one in found if one.is_loss), key=lambda one: one.gain)
     if not losses:
         return "<p>No capture got worse.</p>"
     words = f"<p>{len(losses)} captures got worse. The largest losses are shown.</p>"
     return words + _pictures(folder, columns, losses[:SHOWN])
+
+
+def _least_explained(folder: Path, columns: Columns) -> str:
+    """Return the pictures with the largest residuals: the frames that PSF and picture explain least."""
+    residuals = columns.numbers("residual")
+    worst = sorted((-value, row) for row, value in enumerate(residuals) if value is not None)[:SHOWN]
+    ids, places, simulated = columns.words("id"), columns.words("picture"), columns.values("simulated")
+    out = []
+    for residual, row in worst:
+        picture = _thumbnail(folder / places[row] if places[row] else None, simulated[row] is True, "after")
+        words = (
+            f"{ids[row]}: residual {-residual:.3g} (rms over the noise; about 1 where the picture explains the frame)"
+        )
+        out.append(f"<figure>{picture}<figcaption>{escape(words)}</figcaption></figure>")
+    return "<h3>Least explained</h3>" + "".join(out) if out else ""
 
 
 def _pictures(folder: Path, columns: Columns, shown: Sequence[Change]) -> str:
@@ -250,10 +268,19 @@ def _frames(columns: Columns) -> str:
 
 
 def _causes(columns: Columns) -> str:
-    messages = Counter(str(one) for many in columns.values("messages") if isinstance(many, list) for one in many)
-    lost = Counter(word for word in columns.words("reason") if word)
-    rows = [*(["message", *row] for row in _counted(messages)), *(["no result", *row] for row in _counted(lost))]
-    return _table(("kind", "words", "captures"), rows) if rows else "<p>No messages, and nothing in quarantine.</p>"
+    """Return messages and reasons with the number of their captures, and the ids of the first ones."""
+    ids, kinds = columns.words("id"), {"quarantine": "quarantine", "left out": "left out", "waiting": "not computed"}
+    found: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for id, many in zip(ids, columns.values("messages"), strict=True):
+        for one in many if isinstance(many, list) else ():
+            found["message", str(one)].append(id)
+    for id, state, reason in zip(ids, columns.words("state"), columns.words("reason"), strict=True):
+        if reason:
+            found[kinds.get(state, state), reason].append(id)
+    ordered = sorted(found.items(), key=lambda one: -len(one[1]))[:40]
+    rows = [[kind, words, str(len(some)), ", ".join(some[:NAMED])] for (kind, words), some in ordered]
+    head = ("kind", "words", "captures", f"the first {NAMED}")
+    return _table(head, rows) if rows else "<p>No messages, and nothing in quarantine.</p>"
 
 
 def _drift(columns: Columns) -> str:
@@ -306,7 +333,7 @@ def _cost(columns: Columns) -> str:
     workers = Counter(word for word in columns.words("worker") if word)
     hours = sum(totals) / 3600
     rows = [
-        ["processor time", f"{hours:.2f} h"], ["median of a capture", f"{median(totals):.2f} s"],
+        ["all captures, one after the other", f"{hours:.3g} h"], ["median of a capture", f"{median(totals):.2f} s"],
         ["of which the solver", f"{median(solving):.2f} s"], ["longest", f"{max(totals):.2f} s"],
         ["workers", str(len(workers))],
     ]  # fmt: skip

@@ -1,13 +1,14 @@
 """Folder of results: one folder for each capture, named by content, and one file for each capture in quarantine.
 
 plan.toml                       the plan that is computed here
+earlier-plans/<digest>.toml     plans that were computed here before it
 results/<ab>/<name>/            one result, renamed into place when it is complete; <ab> are the first two digits
     picture.tiff                linear float32, rows x cols (x 3) of the raw frame
     colour.tiff                 picture in red, green and blue of a capture in several colours of light, cropped to its
                                 field, rows x cols x 3; absent without one
     report.json                 provenance, report and scores: equal for equal input, settings and versions
     run.json                    durations, worker and time, which differ from run to run
-quarantine/<name>.json          a capture that failed, with the reason; tried again by the next run if it may help
+quarantine/<name>.json          a capture that failed, with the reason; the next run tries it again if `retry` is true
 captures.parquet                one row for each capture
 .lock                           held by the run that writes here
 """
@@ -22,22 +23,28 @@ from uuid import uuid4
 
 from device import atomic_io
 from device.errors import SettingError
+from services.lab.archive.content import file_digest
 from services.lab.archive.plan import Plan, encoded, read_plan
 from services.lab.reconstruct_file import write_or_raise
 
 COLOUR_PICTURE = "colour.tiff"
+EARLIER_PLANS, QUARANTINE = "earlier-plans", "quarantine"
 PICTURE, REPORT, RUN, PLAN, TABLE = "picture.tiff", "report.json", "run.json", "plan.toml", "captures.parquet"
 
 
 @dataclass(frozen=True)
 class Quarantined:
-    """A capture without a result: its name, the reason, a remedy, and whether the next run tries it again."""
+    """A capture without a result: name of the result, error code, reason, remedy, and whether the next run retries it.
+
+    `id`: that of the capture in the plan.
+    """
 
     name: str
     code: str
     reason: str
     remedy: str = ""
     retry: bool = False
+    id: str = ""
 
 
 @dataclass(frozen=True)
@@ -79,11 +86,11 @@ class Stored:
 
 
 class ResultFolder:
-    """Results of one plan below a folder; several processes may add the same result, and one of them is kept."""
+    """Results below a folder, named by content; several processes may add the same one, and one of them is kept."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self._results, self._quarantine = root / "results", root / "quarantine"
+        self._results, self._quarantine = root / "results", root / QUARANTINE
 
     @property
     def lock(self) -> Path:
@@ -93,16 +100,15 @@ class ResultFolder:
     def prepare(self, plan: Plan) -> None:
         """Make the folders and store the plan; remove what a killed run left incomplete.
 
-        SettingError if the folder holds another plan; StoreError if it cannot be written.
+        An earlier plan is moved to `earlier-plans`; results that both have stay. StoreError if it cannot be written.
         """
         for folder in (self._results, self._quarantine):
             write_or_raise(folder, lambda folder=folder: atomic_io.make_folder(folder))  # type: ignore[misc]
         kept = self.root / PLAN
         if kept.is_file() and read_plan(kept) != plan:
-            raise SettingError(
-                f"{self.root} holds the results of another plan",
-                f"Choose another folder, or resume with {kept}.",
-            )
+            earlier = self.root / EARLIER_PLANS / f"{file_digest(kept)[:12]}.toml"
+            write_or_raise(earlier, lambda: atomic_io.make_folder(earlier.parent))
+            write_or_raise(earlier, lambda: atomic_io.replace_durably(kept, earlier))
         write_or_raise(kept, lambda: atomic_io.write_atomically(kept, encoded(plan)))
         for part in self._results.glob("*/.*.part"):
             shutil.rmtree(part, ignore_errors=True)

@@ -1,7 +1,7 @@
 """`diffuscope archive run`: compute what a plan still lacks, and write the table of all captures."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from device import atomic_io
@@ -36,7 +36,7 @@ def run_plan(
     """Compute every capture without a result, except those in quarantine that cannot succeed; write the table.
 
     Idempotent. `workers` and `scheduler` as of `cluster.connected`. `progress` gets lines of text. SettingError for a
-    folder of another plan or another run, and for a plan of other versions; StoreFull or StoreError if the disk
+    folder into which another run writes, and for a plan of other versions; StoreFull or StoreError if the disk
     refuses; DiffuscopeError if the scheduler or a source is gone: results so far stay.
     """
     if found := different_versions(plan.software, software()):
@@ -84,7 +84,7 @@ class _Computing:
     def __init__(
         self, plan: Plan, results: ResultFolder, count: int, clock: Clock, progress: Callable[[str], None]
     ) -> None:
-        self._sources = {one.result: one.source for one in plan.captures}
+        self._planned = {one.result: one for one in plan.captures}
         self._results, self._count, self._clock, self._progress = results, count, clock, progress
         self._begin_s = self._shown_s = clock.now_s()
         self._ended = self._failed = 0
@@ -107,8 +107,9 @@ class _Computing:
             )
 
     def _quarantine(self, failure: Quarantined) -> None:
-        source = Path(self._sources[failure.name])
+        capture = self._planned[failure.name]
+        source = Path(capture.source)
         if failure.code == "source" and not source.is_dir():
             raise DiffuscopeError(f"{source} is gone", f"Connect it again. {cluster.RESUME}")
         self._failed += 1
-        write_or_raise(self._results.root, lambda: self._results.quarantine(failure))
+        write_or_raise(self._results.root, lambda: self._results.quarantine(replace(failure, id=capture.id)))

@@ -40,6 +40,7 @@ from services.lab.reconstruct_inputs import ReconstructOptions
 
 KEPT_SOLVERS = 2  # captures come sorted by calibration; a solver takes up to about 300 MB at full sensor size
 EFFORT = "FFTW_ESTIMATE"  # plans by rule, not by measurement: two processes add in the same order
+AGAIN = "After that make a new plan, and run it into the same folder."
 REFUSED = (FrameError, PsfError, CalibrationError, SettingError, SpecError)
 
 
@@ -145,14 +146,15 @@ class Solvers:
         except OSError as error:
             return Quarantined(name, "source", f"{error.filename}: {error.strerror}", "Give the source again.", True)
         except FrameError as error:
-            return Quarantined(name, "changed", error.message, error.remedy)
+            return Quarantined(name, "changed", error.message, error.remedy, retry=True)
         stated = _stated(frames.lit[0])
         light = None if stated is None or stated.illumination is None else stated.illumination.colour
         try:
             solved = self._solver(task)(replace(frames, light=light))
             scores = _scores(solved.made.picture, capture)
         except REFUSED as error:
-            return Quarantined(name, error.code, error.message.replace(f"{spool}/raw/", ""), error.remedy)
+            remedy = f"{error.remedy} {AGAIN}".strip()
+            return Quarantined(name, error.code, error.message.replace(f"{spool}/raw/", ""), remedy)
         report = solved.made.report
         warnings = tuple(one.replace(f"{spool}/raw/", "") for one in report.warnings)  # the copies are temporary
         made = replace(solved.made, report=replace(report, warnings=warnings))
@@ -221,7 +223,9 @@ def _copied(path: str, digest: str, folder: Path) -> Path:
     copy = folder / Path(path).name
     shutil.copyfile(path, copy)
     if file_digest(copy) != digest:
-        raise FrameError(f"{Path(path).name} has another content than when it was planned", "Make a new plan.")
+        raise FrameError(
+            f"{Path(path).name} has another content than when it was planned", "Restore it, or make a new plan."
+        )
     return copy
 
 

@@ -222,7 +222,12 @@ def _of_recording(folder: Path) -> Iterator[FoundCapture]:
     psfs = tuple(path for stem, path in images.items() if "psf" in stem.lower() and path not in dict(coloured).values())
     own = {stem: path for stem, path in images.items() if "psf" not in stem.lower() and stem not in COMPANIONS}
     if not (psfs and own) or "raw" in images:  # a published layout, or a scene of `diffuscope simulate`
-        yield from _of_dataset(folder)
+        try:
+            yield from _of_dataset(folder)
+        except SettingError as error:
+            if own and not psfs and "raw" not in images:
+                raise SettingError(f"{folder} has {len(own)} images, but no psf.tiff", RECORDING_REMEDY) from error
+            raise
         return
     calibration = FoundCalibration(psfs, coloured, images.get("dark"), images.get("flat"))
     for stem, frames in _grouped(own).items():
