@@ -27,6 +27,7 @@ from device.recon.model.fft_plans import Planner
 
 MODEL_SD_DPT = 0.02  # of each component by the model, beside the residual
 VARIANCE_PER_MISFIT = 1.7  # of the misfit: the detail takes up a quarter of the residual; the rest is correlated
+BIAS_SHARE = 0.7  # of b: sd by its own error, as b is taken at the fit and not at the true retina
 MOST_STEPS = 12  # 2 to 4 are usual
 BIAS_STEPS = 2  # first steps, for which the bias of a noise-free frame is computed
 FULL_STEPS = 3  # first steps; later ones are halved: some frames overshoot by a factor of two
@@ -43,10 +44,12 @@ class Refined:
     """Eye (M, J0, J45) in dpt as wavefront, and the misfit; `covariance` is (D' K^-1 D)^-1 of the first step, dpt^2.
 
     `misfit` is the squared residual over its noise per sample: 0.4 to 0.8 where the model explains the frame.
+    `bias_dpt` is what b adds to a step; 0 where b is not computed.
     """
 
     eye_dpt: Floats
     covariance: Floats
+    bias_dpt: Floats
     misfit: float
     has_settled: bool
 
@@ -59,7 +62,7 @@ class Refined:
     def sds_dpt(self) -> Floats:
         """Standard deviations of M, J0 and J45, (3,)."""
         by_residual = VARIANCE_PER_MISFIT * self.misfit * np.diag(self.covariance)
-        return np.asarray(np.sqrt(by_residual + MODEL_SD_DPT**2))
+        return np.asarray(np.sqrt(by_residual + MODEL_SD_DPT**2 + (BIAS_SHARE * self.bias_dpt) ** 2))
 
 
 class CropRefinement:
@@ -90,7 +93,8 @@ class CropRefinement:
                 by_noise[1:] = (
                     0  # small by symmetry (at most 0.3 sd of J0 on four frames); the draws would mostly scatter
                 )
-            step = covariance @ (fit.score - without_noise - by_noise)
+            bias_dpt = covariance @ (without_noise + by_noise)
+            step = covariance @ fit.score - bias_dpt
             if done >= FULL_STEPS:
                 step = step / 2
             eye_dpt = eye_dpt + np.clip(step, -LARGEST_STEP_DPT, LARGEST_STEP_DPT)
@@ -98,7 +102,7 @@ class CropRefinement:
             if has_settled:
                 break
         self._edges.fit_smooth(eye_dpt)
-        return Refined(eye_dpt, covariance, model.misfit(light, fit), has_settled)
+        return Refined(eye_dpt, covariance, bias_dpt, model.misfit(light, fit), has_settled)
 
     def _score_of_noise(self, fit: Fit) -> Floats:
         """Return the mean score (3,) that the sensor's noise adds to that of the expected frame of a fit.
