@@ -7,7 +7,7 @@ results/<ab>/<name>/            one result, renamed into place when it is comple
                                 field, rows x cols x 3; absent without one
     report.json                 provenance, report and scores: equal for equal input, settings and versions
     run.json                    durations, worker and time, which differ from run to run
-quarantine/<name>.json          a capture that failed, with the reason; tried again by the next run if it may help
+quarantine/<name>.json          a capture that failed, with the reason; computed again by the next run if `retry`
 captures.parquet                one row for each capture
 .lock                           held by the run that writes here
 """
@@ -31,7 +31,7 @@ PICTURE, REPORT, RUN, PLAN, TABLE = "picture.tiff", "report.json", "run.json", "
 
 @dataclass(frozen=True)
 class Quarantined:
-    """A capture without a result: its name, the reason, a remedy, and whether the next run tries it again."""
+    """A capture without a result: name of the planned result, code, reason, remedy; `retry`: computed again later."""
 
     name: str
     code: str
