@@ -82,8 +82,8 @@ class PlannedCapture(_Part):
 
     `raw` is the first frame of the burst, `frames` are the others in their order, then those in other colours.
     `device`: name of the folder of its calibration archive; `origin`: UUID of the device that took it; both are empty
-    if unknown. `truth` is a picture to compare with, `before` the earlier one (of a store: the lit field only),
-    `report` the earlier report in the store; each is a path, or empty.
+    if unknown. `truth` is a picture of the rows and columns of the raw frame to compare with, `before` the earlier
+    picture (of a store: the lit field only), `report` the earlier report in the store; each is a path, or empty.
     """
 
     id: str
