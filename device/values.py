@@ -326,7 +326,7 @@ class Report:
     Not in earlier releases."""
 
     refraction_dpt: dict[str, float | str | None] | None = None
-    """Refraction of the eye as spectacle correction in dpt, negative for myopia; null without a known geometry."""
+    """Refraction of the eye as correction at its pupil in dpt, negative for myopia; null without a known geometry."""
 
     refraction_scatter: dict[str, float] | None = None
     """Scatter of the mean sphere between the frames of a burst; null for less than three frames. Not in earlier

@@ -1,8 +1,8 @@
 """White card before the head: what the ring's light of each colour gives on a surface that is white.
 
-The card is lit by the head itself, so that its light has the spectrum of a picture's: a screen that shines by itself
-has not. Only the ratio of the colours is used, so the evenness of its light does not matter. It stands behind the place
-of the eye's pupil: at the pupil itself the spots of the LEDs lie outside what the iris sees.
+The LEDs of the head light the card, so that its light has the spectra of a picture's light; the light of a display has
+others. Only ratios between colours are used: uneven light that is alike in all colours cancels. The card is placed
+behind the plane of the eye's pupil: in that plane the spots of the LEDs lie outside the part that the iris passes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from device.values import Calibration, Colour, Frame, WhiteReference
 
 LEAST_DN = 20.0  # mean light of a frame above the dark one: with 1 % of error from a dark level that drifts by 0.2 DN
 MOST_ROOM_SHARE = 0.3  # of room light, and dark current, over the lamp's light: it may change between two frames
-MOST_SPREAD = 0.02  # of the frames of one colour, over their mean: the same as a just noticeable shade of a colour
+MOST_SPREAD = 0.02  # of the frames of one colour, over their mean: about a just noticeable difference of colour
 MOST_SATURATED = 0.001  # share of pixels at full scale
 MOST_RATIO = 20.0  # between two colours: LEDs of a ring and quantum efficiencies differ by less
 CARD_PLACE = "40 to 60 mm behind the place of the eye's pupil, square to the axis"

@@ -43,7 +43,7 @@ class Beam(NamedTuple):
 class Refraction(NamedTuple):
     """Refraction of an eye as a wavefront: mean sphere M and cylinder components J0 and J45, in dioptres.
 
-    Positive M: the beam that leaves the eye converges (myopia). The spectacle correction has the opposite sign.
+    Positive M: the beam that leaves the eye converges (myopia). The correction at the pupil is -M.
     """
 
     m_dpt: float = 0.0

@@ -46,8 +46,8 @@ LEAST_COARSE = 200  # samples of a quick look along its shorter side, to be regi
 class JoinedFrame:
     """A burst as one frame: linear DN above dark, (rows, cols) float32, NaN where too few frames saw the pixel.
 
-    `light` is the sum of the light of its frames in units of the reference's. `calibration` holds for it: its gain is
-    that of the sum of the light. `frames` has one entry per frame.
+    `light` is a ratio: the sum of the light of the used frames over that of the first used one, the reference.
+    `calibration` holds for it: its gain is that of the sum of the light. `frames` has one entry per frame.
     """
 
     counts: Image
@@ -60,8 +60,9 @@ class JoinedFrame:
 class SeenFrame:
     """A frame that is ready to be joined: `BurstJoiner.see` makes it, before the other frames are known.
 
-    `light`: DN above dark, and `good`: 1 for good pixels, both (rows, cols) of the sensor; `picture` on the grid of the
-    registration; `mean_dn`: mean light in DN; `saturated`: share of saturated pixels.
+    `light`: image of the light in DN above dark (in JoinedFrame a ratio), and `good`: 1 for good pixels, both (rows,
+    cols) of the sensor; `picture` on the grid of the registration; `mean_dn`: mean light in DN; `saturated`: share of
+    saturated pixels.
     """
 
     light: Image

@@ -1,7 +1,7 @@
 """Reconstruction of the bursts of an instrument: quick look of the first frame, joined frame, one picture.
 
-The joined frame is solved as the sum of its frames: a sum has the gain of the sensor, so that nothing is planned for
-the number of frames. Its read noise, sqrt(N) times that of one frame, is small beside the shot noise of the sum.
+The joined frame is solved as the sum of its N frames: a sum has the gain of the sensor, so that one planned solver
+serves any N. Its read noise is taken as that of one frame: the missing factor sqrt(N) is small beside shot noise.
 """
 
 from collections.abc import Container, Generator, Iterator, Mapping, Sequence
@@ -57,8 +57,8 @@ class BurstReconstructor:
     def prepare(self, counts: Pixels, dark: Pixels | None = None, *, refract: bool = False) -> PreparedFrame:
         """Return a frame (rows, cols) with its quick look, ready for `steps`, while the next frames are exposed.
 
-        With `refract` a thread begins to estimate its refraction: for the first useful frame. FrameError for a frame
-        without light, or with too many missing pixels.
+        With `refract` a thread begins to estimate its refraction; a burst needs it of its first used frame only.
+        FrameError for a frame without light, or with too many missing pixels.
         """
         seen, stage = self.joiner.see(counts, dark), self.single.stages[0]
         if not self.joiner.registers_quick_looks:
@@ -73,13 +73,14 @@ class BurstReconstructor:
         deadline: Deadline | None = None, unusable: Mapping[int, str] | None = None,
         prepared: Mapping[int, PreparedFrame] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
-        """Yield the quick look of the first frame, a pause after each frame and round, and the picture of the burst.
+        """Yield the quick look of the first frame, RoundDone after each frame and round, and the picture of the burst.
 
         `frames` are uint16 or float32 (rows, cols), all with the dark frame `dark`; `unusable` holds the reason of each
         frame that must not enter the picture, by its index, never the first; `prepared` the frames that are prepared
-        with this dark frame, by index. The deadline moves by the time of the pauses. A burst of one usable frame gives
-        the picture of that frame; so does a deadline that leaves no time to join them. FrameError for another shape, or
-        if no frame can be used.
+        with this dark frame, by index. The deadline moves by the time until the consumer continues after RoundDone. A
+        burst of one usable frame gives the picture of that frame; a deadline that leaves no time to join them gives
+        that of the first. FrameError for another shape, for a first frame with too many missing pixels for a quick
+        look, or if no frame can be used.
         """
         run, ready = _Run(self, deadline), dict(prepared or {})
         tasks = {k: one.refraction for k, one in ready.items()}
@@ -142,7 +143,7 @@ class _Run:
         self, frames: Sequence[Pixels], dark: Pixels | None, unusable: Mapping[int, str] | None = None,
         ready: Mapping[int, SeenFrame] | None = None,
     ) -> Iterator[RoundDone]:  # fmt: skip
-        """Join the frames; yield a pause after each one that is not ready, by which the deadline moves."""
+        """Join the frames; yield RoundDone after each that is not ready. The deadline moves by the consumer's time."""
         owner = self._owner
         begin_s = owner.clock.now_s()
         for step in owner.joiner.steps(frames, unusable, dark, ready):
@@ -202,7 +203,10 @@ class _Run:
 
 
 def only(index: int, uses: Sequence[FrameUse]) -> tuple[FrameUse, ...]:
-    """Return the use of the frames of a picture of one of them; a frame without another reason is left for the time."""
+    """Return the uses of the frames of a burst for a picture of frame `index` alone.
+
+    `uses` are those known so far; each other frame keeps its reason, or has NO_TIME without one.
+    """
     return tuple(
         FrameUse(one.index, True, (0.0, 0.0), 1.0)
         if one.index == index

@@ -25,10 +25,11 @@ GUIDED_SHARE = 0.5  # of the filtered picture; the rest keeps what green does no
 LEAST_SD = 10.0  # of the correlation: wrong registrations had 9.2 or less, right ones 10 or more (NUMERICS.md 10.1)
 LEAST_CERTAIN = 0.5  # of the correlation itself: in a small picture the surface has too few places for LEAST_SD
 
-# Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over four
-# photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3).
+# Blue over its mean as a linear function of red and green over theirs: offset, red, green. Least squares over the sRGB
+# values of four photographs, each with the same weight (sources, licences and range: NUMERICS.md 10.3). They are
+# applied to linear pictures.
 BLUE_FROM_RED_GREEN = (-0.133, 0.274, 0.862)
-BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green of these photographs, 0.42 to 0.72
+BLUE_OVER_GREEN = 0.60  # median of mean blue over mean green, sRGB values, 0.42 to 0.72; linear: white_balance
 MOST_OF_MEAN = 3.0  # of red and green over their means: the photographs reach 1.3 and 3.2
 
 
@@ -120,7 +121,8 @@ def guided_filter(picture: Image, guide: Image, field: Image) -> Image:
 def predicted_blue(red: Image, green: Image, field: Image) -> Image:
     """Return a blue channel predicted from red and green (rows, cols), in the units of green.
 
-    It is no measurement: its level follows the photographs of the fit, and what only blue light shows is missing.
+    It is no measurement: what only blue light shows is missing. Its mean is about BLUE_OVER_GREEN times that of green;
+    `white_balance.balanced` sets another mean in the picture of a press.
     """
     inside = field > 0.5
     means = [float(one[inside].mean()) if inside.any() else float(one.mean()) for one in (red, green)]

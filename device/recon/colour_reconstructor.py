@@ -64,13 +64,13 @@ class ColourReconstructor:
         deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
         lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
-        """Yield the steps of `green`, a pause after each round of the other colours, and the picture with its colours.
+        """Yield the steps of `green`, RoundDone after each round of the other colours, and the picture in colour.
 
         `frames`: one frame of each other colour, (rows, cols), with the dark frame `dark`; `missing` holds the reason
         of each colour without a frame; `lights_dn_per_s` the light of each colour at full drive (`white_balance`), None
         if it is not known: the hue is then that of photographs. `deadline` is also that of `green`; it moves by the
-        time of the pauses. The picture is a ColourReconstruction if another colour was solved; its report lists every
-        colour.
+        time until the consumer continues after RoundDone. The picture is a ColourReconstruction if another colour was
+        solved; its report lists every colour.
         """
         run = _Run(self, deadline)
         made = yield from run.green(green)
@@ -115,7 +115,7 @@ class ColourReconstructor:
     def refocus(self, colour: Colour, eye: Wavefront | None) -> None:
         """Use the PSF of a colour for `eye` in its last stage; None selects the stored PSF.
 
-        A colour that shares green's reconstructor has the PSF of the picture before.
+        A colour that shares green's reconstructor keeps the PSF of the last green picture.
         """
         if colour not in self._otfs:
             return
@@ -138,7 +138,7 @@ def psf_wavefront(report: Report, geometry: Geometry | None) -> Wavefront | None
 
 
 class _Run:
-    """State of one picture: the time that the other colours have taken, and the deadline, which pauses move."""
+    """State of one picture: time of the other colours, and deadline, which moves by the time of the consumer."""
 
     def __init__(self, owner: ColourReconstructor, deadline: Deadline | None) -> None:
         self._owner, self._deadline, self.spent_s = owner, deadline, 0.0
@@ -154,7 +154,7 @@ class _Run:
     def solve(
         self, colour: Colour, counts: Pixels, dark: Pixels | None, eye: Wavefront | None
     ) -> Generator[Step, None, Image | None]:
-        """Yield a pause after each round of one colour, and return its picture; its PSF is that of `eye`.
+        """Yield RoundDone after each round of one colour, and return its picture; its PSF is that of `eye`.
 
         None if no time is left for it. FrameError for a useless frame.
         """
@@ -181,7 +181,7 @@ class _Run:
         return self._deadline is None or self._deadline.fits(cost_s)
 
     def _passed_on(self, step: Step) -> Iterator[Step]:
-        """Yield a step; the deadline moves by the time until the consumer continues after a pause."""
+        """Yield a step; the deadline moves by the time until the consumer continues after RoundDone."""
         begin_s = self._owner.clock.now_s()
         yield step
         if self._deadline is not None and isinstance(step, RoundDone):

@@ -1,9 +1,10 @@
 """Montage: pictures of one eye in several gaze directions, joined to one picture in the projection of the first.
 
 Each picture is registered to those that are placed already (`estimation.masked_correlation`), and accepted only where
-the correlation is high, unambiguous and rests on a large enough overlap; else it stays apart, with the reason. Blended
-with weights that fall to 0 at the edge of each field. With a known scale in degrees a picture is placed by a rotation
-of the sphere of directions, else by a shift and a rotation of the plane (`model.field_projection`). NUMERICS.md 11.
+the correlation is high, unambiguous and rests on a large enough overlap; else it is left out, with the reason. Each
+picture is scaled to the median of those before it in their common part, then blended with weights that fall to 0 at
+the edge of its field. With a known scale in degrees a picture is placed by a rotation of the sphere of directions, else
+by a shift and a rotation of the plane (`model.field_projection`). NUMERICS.md 11.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,8 +28,8 @@ from device.recon.model.grid import Grid
 from device.recon.model.resampling import block_mean
 from device.values import Image, check_image_shape
 
-LEAST_PEAK, LEAST_OVER_SECOND, LEAST_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.24 to 0.51
-# A small overlap correlates higher by chance: more is asked of it. Pictures of one retina have 0.79 to 0.94.
+LEAST_PEAK, LEAST_OVER_SECOND, LEAST_OVERLAP = 0.5, 1.5, 0.2  # two different eyes have peaks of 0.26 to 0.44
+# A small overlap correlates higher by chance, so its peak must be higher. Pictures of one retina have 0.70 to 0.96.
 SMALL_OVERLAP, PEAK_PER_OVERLAP = 0.4, 0.5
 FIELD_SAMPLES = 260  # across the field when registered: vessels stay resolved
 FEATHER_SHARE = 0.25  # of the field's radius over which a picture's weight rises from its edge
@@ -89,7 +90,8 @@ def make_montage(
 ) -> Montage:
     """Return the montage of linear pictures (rows, cols) or (rows, cols, 3) of one size; FrameError otherwise.
 
-    The first picture is always used; a montage of one is that picture. `progress` gets the number of placed pictures.
+    The first picture is always used; a montage of one is that picture without the outer RIM_PX of its field, which are
+    0. `progress` gets the number of placed pictures.
     `px_per_deg`: pixels per degree of pictures that are linear in the field angle, FrameError if their corners are then
     more than WIDEST_DEG from the centre; None if unknown: the pictures are joined on the plane.
     """
@@ -121,8 +123,8 @@ def place(
 ) -> list[Placement]:  # fmt: skip
     """Return the placement of each picture; `n` pixels per sample, `px_per_deg` as in `make_montage`.
 
-    The picture with the best match is placed first, and the rest are searched in it too, so that a picture that has
-    nothing in common with the first can be placed by another one.
+    Each round places the picture with the best match, and then registers the remaining ones to it as well. So a picture
+    without a common part with the first one can be placed by another one.
     """
     projection = projection_of(None if px_per_deg is None else px_per_deg / n)
     placed = {0: Placement(0, True, STILL.shift, STILL.rotation_deg, None, None)}

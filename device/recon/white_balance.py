@@ -1,7 +1,8 @@
 """White balance of a colour picture: the light of each colour over that of a white card in the same lamp light.
 
 The level of a solved channel says nothing about its colour: lamp, sensor and diffuser have their own response to each
-colour. The card divides them out. Without one, the hue is that of photographs. NUMERICS.md 10.4.
+colour. The card divides them out. Without a card, the means of red and blue over that of green are those of
+photographs of the retina. NUMERICS.md 10.4.
 """
 
 from collections.abc import Mapping
@@ -45,11 +46,11 @@ def white_ratios(calibration: Calibration, lights_dn_per_s: Mapping[Colour, floa
 
 
 def balanced(picture: Image, field: Image, ratios: Mapping[Colour, float]) -> Image:
-    """Return a picture (rows, cols, 3) whose red and blue have the mean over the field that the white card gives them.
+    """Return a picture (rows, cols, 3) with red and blue scaled to a ratio of their means over the field to green's.
 
-    `field` is the lit field, (rows, cols) in 0..1. The mean of green stays. A colour without a value in `ratios`,
-    or any without one of green, has that of photographs. A channel without light stays as it is;
-    without light in green, red and blue become 0.
+    `field` is the lit field, (rows, cols) in 0..1. The wanted ratio of a colour is its value in `ratios` (light over
+    that of the white card) over the value of green; it is that of photographs, OVER_GREEN, if either value is missing.
+    Green stays as it is, and so does a channel without light; without light in green, red and blue become 0.
     """
     green = ratios.get("green")
     hue = [OVER_GREEN[colour] if not green else _share(colour, ratios, green) for colour in RGB]

@@ -17,10 +17,10 @@ from device.sim.render import electrons_per_s
 from device.sim.vessels import DISC
 from device.values import Colour, Eye, Image
 
-STEPS = 3  # of the drift between the frames of a burst; then the eye is back where it was
+STEPS = 3  # of the drift from the first frame of a burst on; one frame later the eye is at its first place again
 LEAST_DRIFT_PX = 0.1  # of the retina over a burst: below a tenth of a pixel no frame changes visibly (OPTICS.md 3.9)
-MOST_PARTS = 4  # of an exposure; a split into more moves the eye too far in each frame
-FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster motion is a saccade, which does not last for a burst: it blurs every frame
+MOST_PARTS = 4  # of an exposure; in a split into more each frame still has a quarter of its motion, which is too much
+FASTEST_DRIFT_DEG_PER_S = 5.0  # a faster eye, in a saccade, blurs each frame, but is not displaced between frames
 EffectSelector = Callable[[Scene], tuple[Decision, ...]]
 Pair = tuple[float, float]
 STRAIGHT: Pair = (0.0, 0.0)
@@ -103,8 +103,8 @@ class RenderedEyes:
     def drift_px(self) -> float:
         """Movement of the retina to the right from one frame of a burst to the next, in pixels.
 
-        The eye drifts by `drift_deg_per_s` for the time of one exposure. 0 if that is too small to be seen, or faster
-        than FASTEST_DRIFT_DEG_PER_S: a saccade.
+        The eye drifts by `drift_deg_per_s` for the time of one exposure. 0 if that is too small to be seen, or if the
+        speed is above FASTEST_DRIFT_DEG_PER_S.
         """
         speed = self.scene.sim.eye.drift_deg_per_s
         step_deg = (speed if speed <= FASTEST_DRIFT_DEG_PER_S else 0.0) * self.scene.spec.camera.exposure_s
@@ -141,9 +141,9 @@ class RenderedEyes:
     def electrons_per_s(self, eye: Eye, colour: Colour, step: int = 0, parts: int = 1) -> Image:
         """Return the noise-free electrons per second of an eye with one colour at full drive, float32 (rows, cols).
 
-        `step` is the number of frames for which the eye has drifted and turned; it is back where it was after those of
-        STEPS + 1 exposures. A frame lasts for 1 / `parts` of a picture's exposure. Computed once for each combination.
-        Behind a white card no eye is seen.
+        `step` is the index of the frame, and the number of frames for which the eye has drifted and turned before it;
+        the motion repeats after (STEPS + 1) * `parts` frames. A frame lasts for 1 / `parts` of a picture's exposure.
+        Computed once for each combination. Behind a white card no eye is seen.
         """
         if self._shows_card:
             return _of_card(self.retina(eye).plane(colour), self._of_eye_e_per_s(eye, colour))

@@ -27,7 +27,7 @@ SECONDS: Mapping[str, str] = {
     "upsample": "Interpolation of the picture to the pixels of the sensor.",
 }
 REFRACTION: Mapping[str, str] = {
-    "sphere": "Mean sphere M of the spectacle correction in dpt; negative for myopia.",
+    "sphere": "Mean sphere M of the correction at the eye's pupil in dpt; negative for myopia.",
     "sd": "Standard deviation of `sphere` in dpt.",
     "j0": "Jackson cross cylinder J0 of the correction in dpt (power vector after Thibos).",
     "j0_sd": "Standard deviation of `j0` in dpt.",

@@ -36,8 +36,8 @@ def measure_white_card(
     """Measure the light of a white card in each colour of the lamp; return the calibration with it, now in force.
 
     `ask` prompts the operator of a real head and returns once the card is there. CalibrationRefused with the reason if
-    the frames show no white card; the calibration in force then stays. SpecError for a head file without an archive or
-    without colours; errors of the head's parts and its archive.
+    the frames show no white card; the calibration in force then stays. SpecError for a head file without an archive,
+    with pictures in another light than green, or with green LEDs only; errors of the head's parts and its archive.
     """
     if spec.calibration is None:
         raise SpecError(f"{spec.name} names no archive of calibrations", "Give one with --archive.")

@@ -1,10 +1,10 @@
 """`make bench-refraction DATA=folder`: refraction and field edge from textbook frames, against the acceptance lines.
 
 Frames of photographs behind the textbook optics (`tests/textbook`), M from -6 to 6 dpt, full and a fifth of the light.
-Half of them have a field edge that deviates from the calibration: 0.2 deg too large, 0.1 deg too small, 0.1 deg off
-centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope reconstruct`, and its
-report is scored. `picture` measures what the PSF with the cylinder gains, `bursts` the refraction of several frames and
-its scatter between them, `time` the processor time of the estimates.
+For half of them the calibrated edge is not the true one: its diameter is 0.2 deg too large or 0.1 deg too small, or the
+true edge is 0.1 deg off centre, or soft over 0.3 to 2 deg. Each frame goes through the `Reconstructor` of `diffuscope
+reconstruct`, and its report is scored. `picture` measures what the PSF with the cylinder gains, `bursts` the refraction
+of several frames and its scatter between them, `time` the processor time of the estimates.
 Exit status 1 if a line fails.
 """
 
@@ -55,7 +55,7 @@ class Case:
 
     @property
     def edge_kind(self) -> str:
-        """Deviation of the edge from the calibration."""
+        """Deviation of the calibrated edge from the true one: of its diameter, or the kind."""
         edge = self.edge
         if edge.width_deg > 0:
             return "soft"
@@ -342,7 +342,7 @@ def astigmatic_cases(camera: Camera, field_deg: float, seed: int) -> Iterator[Ca
 
 
 def psnr_db(case: Case, picture: Image, truth: Plane) -> float:
-    """Return the PSNR of a picture within 0.7 degrees of the field's edge, after the best scale and offset."""
+    """Return the PSNR of a picture without the outer 0.7 degrees of its field, after the best scale and offset."""
     shape = case.camera.shape
     radius_px = (case.field_deg / 2 - 0.7) * Optics(PITCH_UM[case.camera]).px_per_deg
     inside = disc(shape, ((shape[0] - 1) / 2, (shape[1] - 1) / 2), radius_px) > 0.5
@@ -409,7 +409,7 @@ def burst_of(case: Case, data: Path, accommodation_dpt: float) -> tuple[list[Cou
 def judge_bursts(seed: int, count: int, data: Path) -> bool:
     """Print errors of M of the first frame and of the burst, and the scatter, of `count` bursts of each sensor.
 
-    Return True if at most MOST_ALARMS of the eyes that do not accommodate have a chi^2 beyond 1 % of its values.
+    Return True if chi^2 is above its 99th percentile in at most MOST_ALARMS of the bursts without accommodation.
     """
     alarms: list[bool] = []
     for name in ("imx296-33", "imx296-45", "paper-33"):

@@ -6,12 +6,13 @@ Loss of a picture against one exposure of a still eye, in dB, for m frames that 
     d0      = 0.372 (220 / L)^0.34        degrees
 
 The first term is the motion blur of one frame, the second the displacement between the frames, the third read noise and
-registration. D: motion of the eye over the light of the press, degrees; L: light of the press, mean electrons per um^2
-of the sensor. Fitted to twelve pictures of one photograph (one exposure, 4 and 8 frames; none to 12 pixels of 0.064
-degrees; 22 and 220 electrons per um^2), at most 0.16 dB off. The lamp stays on during the overhead of a frame (its
-read-out, the wait for its begin), and a press must not have more light than without a split: parts and their
-overheads fill the time of one exposure and one overhead, so that each of m parts lasts (T + o) / m - o. Lost light
-counts at 0.7 dB per halving. NUMERICS.md 9.3.
+registration. D: motion of the eye over the light of the press, degrees; d0: motion within one frame at which blur costs
+1 dB; L: light of the press, mean electrons per um^2 of the sensor. Fitted to 18 pictures of one photograph (one
+exposure, 4 and 8 frames; none to 12 pixels of 0.064 degrees; 22 and 220 electrons per um^2), at most 0.16 dB off; on
+four other photographs up to 0.44 dB off. The lamp stays on during the overhead o of a frame (read-out, wait for its
+begin), seconds. A press must not have more light than without a split: the p parts of an exposure of T seconds and
+their overheads fill T + o, so that each part lasts (T + o) / p - o. Lost light counts at 0.7 dB per halving.
+NUMERICS.md 9.3.
 """
 
 from dataclasses import dataclass
@@ -35,8 +36,9 @@ HALVING_DB = 0.7  # of half the light, measured with one and two frames of six p
 class ExposureSplit:
     """Split of each exposure of a press into `parts` of `part_s` seconds each, with its predicted gain.
 
-    `parts` is 1 and `part_s` None without a split. `motion_deg`: motion of the eye during one whole exposure.
-    `gain_db`: against exposures that are not split, less what the shorter light loses.
+    Without a split `parts` is 1, `part_s` None, and the others are 0, whatever the eye does. `motion_deg`: motion of
+    the eye during one whole exposure. `gain_db`: against exposures that are not split, less what the shorter light
+    loses.
     """
 
     parts: int = 1
@@ -105,8 +107,9 @@ def loss_db(frames: int, motion_deg: float, light_e_per_um2: float) -> float:
 
 
 def dark_fits(exposure_s: float, dark_s: float) -> bool:
-    """Return True if a dark frame of `dark_s` seconds holds the dark current of a frame of `exposure_s` seconds.
+    """Return True if a frame of `exposure_s` seconds is not too long for a dark frame of `dark_s` seconds.
 
-    The dark frame of a split press is as long as one part, at most half of the frames in other colours.
+    A dark frame that is too long is accepted. That of a split press has the exposure of one part, which is at most half
+    the exposure of the frames in other colours.
     """
     return exposure_s <= MOST_DARK_RATIO * dark_s

@@ -3,8 +3,8 @@
     I_T(x) = I_0(T^-1 x) / |det T|,   T = 1 - z a^2 [[M + J0, J45], [J45, M - J0]],   so   H_T(f) = H_0(T f)
 
 z is the distance from diffuser to sensor, a the angular magnification; z a^2 is `Geometry.scale_per_dpt`. Against full
-wave propagation the correlation is 0.9995 at 5 dpt. M > 0 means that the beam leaving the eye converges (myopia); a
-spectacle correction has the opposite sign.
+wave propagation the correlation is 0.9995 at 5 dpt. M > 0 means that the beam leaving the eye converges (myopia); the
+correction at the pupil is -M.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from device.recon.model.resolution import working_bin
 from device.values import Geometry, Image, Psf
 
 Transform = NDArray[np.float64]
-PADDING = 6  # oversampling of the stored spectrum: the interpolation error at the PSF's edge is (1/12)^2 = 0.7 %
+PADDING = 6  # oversampling of the stored spectrum: the interpolation error at the PSF's edge is (1/11)^2 = 0.8 %
 REACH = 1.06  # a stretch by 9 dpt extends 3 % beyond the last frequency, cylinders a little more
 LARGEST = 4e6  # numbers in the table: 32 MB
 

@@ -6,9 +6,10 @@ mean sphere M, cylinder J0, J45 and the field edge e (`refraction_likelihood`, `
 
     E(M, J0, J45, e) = sum over f of  log S + |R|^2 / S,    S = g_ring |H_T|^2 + s2
 
-|H_T|^2 includes SMEAR times its ring mean. R is the frame minus its smooth part, blurred by the *candidate's* PSF. If
-the smooth part is blurred by a fixed PSF, the estimate is biased by one third towards that PSF. The smooth part itself
-is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found for each fine search.
+|H_T|^2 includes SMEAR times its ring mean. R is the tapered spectrum of the frame minus the smooth part of the object
+behind the *candidate's* PSF. If that part is blurred by a fixed PSF, the estimate is biased by one third towards that
+PSF. The smooth part itself is fitted with the stored PSF for the coarse search over M, and with the PSF and edge found
+for each fine search.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,7 +52,7 @@ MOST_SD_DPT = 1.5
 MOST_SAMPLE_UM = 36.0  # of a refinement: at 40 um the caustic is not sampled, and eyes are wrong by up to 8 sd
 MOST_DISTANCE_SDS = 4.0  # between the refractions from the spectrum and from the frame
 
-LEAST_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains 0.02 to 0.13 dB, and as |J|^2
+LEAST_CYLINDER_DPT = 0.25  # |J| of a PSF with cylinder; at 0.5 a picture gains -0.02 to 0.15 dB, and as |J|^2
 
 Floats = NDArray[np.float64]
 
@@ -80,9 +81,9 @@ class Cylinder:
 class Refraction:
     """Refraction estimate: mean sphere M in dpt (positive: myopia), its standard deviation, and the search curve.
 
-    The report has the opposite sign (spectacle correction). `psf_scale` is the scale of the stored PSF; `curve` holds
-    (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum over
-    the coarse grid. `edge` is the edge of the lit field that was found with M.
+    The report has the opposite sign (correction at the pupil). `psf_scale` is the scale of the stored PSF; `curve`
+    holds (M in dpt, negative log likelihood) of every coarse candidate, sorted; `nats` is the median minus the minimum
+    over the coarse grid. `edge` is the edge of the lit field that was found with M.
     `missing_sd_dpt` is the part of the sd from missing pixels. `cylinder` is None before `add_cylinder`, `scatter`
     before `join`.
     """
@@ -99,7 +100,7 @@ class Refraction:
 
     @property
     def in_doubt(self) -> bool:
-        """True if the stored PSF is to be used: |M| < max(0.12 dpt, 2 sd), without the scatter between frames."""
+        """True if M alone does not call for another PSF: |M| < max(0.12 dpt, 2 sd); of a burst: sd of one frame."""
         sd_dpt = self.sd_dpt if self.scatter is None else self.scatter.stated_sd_dpt
         return abs(self.sphere_dpt) < max(0.12, 2 * sd_dpt)
 
@@ -202,7 +203,7 @@ class RefractionEstimator:
         """Return the refraction of a burst whose first frame gave `found`, and the scatter between its frames.
 
         `frames` (rows, cols) in counts begin with the first one. The sd of M grows to the scatter, if that is larger.
-        `found` is returned without a refined cylinder, and for less than LEAST_FRAMES.
+        `found` itself is returned if it has no refined cylinder, or for fewer than LEAST_FRAMES frames.
         """
         cylinder = found.cylinder
         if cylinder is None or len(frames) < LEAST_FRAMES or not self._is_refined:

@@ -1,8 +1,8 @@
 """Refraction of a burst: a step of each of its frames from the refraction of the first, and the scatter between them.
 
-The step of frame k from the eye T of the first frame is that of the crop-aware refinement, C (D' K^-1 r_k), with the
-covariance C of the first frame. Its mean that is not 0 at the true eye (NUMERICS.md 7.7) is that of the first frame's
-step, so that T plus the mean of the steps minus the first one is the refraction of the joined frames.
+The step of frame k from the eye T of the first frame is that of the crop-aware refinement, V (D' K^-1 r_k), with the
+covariance V of the first frame. At the true eye the mean of a step is not 0 (NUMERICS.md 7.7), but it is the same for
+all frames. So T plus the mean of (step k - step 1) is the refraction of the joined frames.
 """
 
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ BurstFrame = tuple[Pixels, Pixels | None, Places | None]  # counts, dark frame, 
 
 @dataclass(frozen=True)
 class FrameScatter:
-    """Scatter of M between `count` frames: its sd, the sd that a frame states, and chi^2, of count - 1 degrees."""
+    """Scatter of M between `count` frames: its sd, the sd stated by one, and chi^2, count - 1 degrees of freedom."""
 
     count: int
     sd_dpt: float

@@ -1,14 +1,15 @@
 """Field edge in the likelihood of a refraction: diameter, centre and softness of the lit disc, estimated with the eye.
 
 A cropped sensor shows only the inner part of the PSF of a point at the field edge, so that a displaced edge looks like
-another refraction: 0.1 deg costs 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. The edge is therefore not
+another refraction: 0.1 deg of diameter cost 0.4 dpt at 33.4 deg and 0.75 dpt at 45 deg on an IMX296. So the edge is not
 taken from the calibration. For each candidate eye T the likelihood of `refraction` is minimised over the edge e:
 
     E(T) = min over d of  sum over f of  log S + |R_T - sum_k d_k R_T,k|^2 / S  +  |(e + d - e_calibrated) / PRIOR|^2
 
 R_T,k is the tapered spectrum of the derivative of smooth part times edge with respect to e_k (radius, centre, width),
-blurred by the candidate's PSF. It is a generalised least-squares step with the spectrum S of the retina's detail as
-covariance; the steps are repeated with the smooth part fitted within the edge found (NUMERICS.md 7.5).
+blurred by the candidate's PSF. PRIOR is sqrt(2) sd of the edge. The minimum over d is a generalised least-squares step
+with the spectrum S of detail and noise as covariance; the steps are repeated with the smooth part fitted within the
+edge found (NUMERICS.md 7.5).
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ Floats = NDArray[np.float64]
 class EdgeModel:
     """Linear model of the edge around one candidate: spectra of the derivatives, (k, K), and their covariance model.
 
-    `weighted` is the conjugate of `moved` over the spectrum S; `matrix` the information of the k parameters.
+    `weighted` is the conjugate of `moved` over the spectrum S; `matrix` half the information on the k parameters.
     """
 
     moved: Spectrum
@@ -113,7 +114,7 @@ class EdgeLikelihood:
         return smooth.level_dn
 
     def __call__(self, eye_dpt: Floats, most: int = PARAMETERS) -> Candidate:
-        """Return the likelihood of an eye, minimised over the parameters of the edge, of which the first `most`."""
+        """Return the negative log likelihood of an eye, minimised over the first `most` parameters of the edge."""
         rest, otf, level = self._residual(eye_dpt)
         nats, count = self._nats(rest, otf), min(most, self._count)
         return self._minimised(rest, otf, self._edge_model(level, count)) if count else self._candidate(nats)
@@ -176,7 +177,7 @@ class EdgeLikelihood:
         return float(np.abs(self.edge.vector - before.vector).max())
 
     def field_edge(self, model: EdgeModel | None) -> FieldEdge:
-        """Return the present edge in degrees, with the sd of the diameter from the linear model."""
+        """Return the present edge in degrees; the sd of its diameter is from `matrix`, half the information."""
         radius_sd_samples = 0.0 if model is None else float(np.linalg.inv(model.matrix)[0, 0] ** 0.5)
         return self.prior.in_degrees(self.edge, radius_sd_samples)
 

@@ -18,7 +18,7 @@ from device.values import Image
 
 MARGIN_DEG = 1.5  # from the calibrated edge to the end of the range of the radius and of half the width
 FIRST_WIDTH_DEG = 0.4  # of the first model: a step has no derivative with respect to its width
-PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sd of radius, centre (down, right) and width around the calibrated edge
+PRIOR_DEG = (0.5, 0.2, 0.2, 1.0)  # sqrt(2) sd of radius, centre (down, right) and width around the calibrated edge
 LARGEST_STEP_DEG = 0.3  # of one iteration: the linear model holds within the structure of the caustic
 LEAST_WEIGHT = 0.03  # of the brightest block, added for the read noise
 
@@ -67,7 +67,8 @@ class Edge:
 class FieldEdge:
     """Lit disc: diameter, centre (down, right of the sensor's) and full width of its cosine ramp, in degrees.
 
-    `diameter_sd_deg` is the standard deviation of the diameter for a known eye; 0 if the edge was not estimated.
+    `diameter_sd_deg` is the standard deviation of the diameter for a known eye: sqrt(2) times the one that independent
+    frequencies would have; 0 if the edge was not estimated.
     """
 
     diameter_deg: float
@@ -80,8 +81,8 @@ class FieldEdge:
 class EdgePrior:
     """Calibrated edge with its uncertainty and range, for a field in degrees and a scale in samples per degree.
 
-    `calibrated` is the first edge, `precision` the inverse variance of each parameter around it, `largest_samples` the
-    largest radius.
+    `calibrated` is the first edge, `precision` half the inverse variance of each parameter around it, as in a negative
+    log likelihood, and `largest_samples` the largest radius.
     """
 
     def __init__(self, field_deg: float, per_deg: float) -> None:

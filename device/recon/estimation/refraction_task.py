@@ -46,7 +46,7 @@ class RefractionTask:
         return self._found.result()
 
     def latest(self) -> Refraction | NoRefraction:
-        """Wait for the refraction without its cylinder; return it with what is known beside it."""
+        """Wait for M; return the newest result so far: joined, with cylinder, or M alone, also if that is refused."""
         futures: tuple[Future[Refraction | NoRefraction], ...] = self._last, self._whole
         return next((one for one in futures if one.done()), self._found).result()
 

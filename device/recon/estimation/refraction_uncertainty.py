@@ -2,11 +2,12 @@
 
 Two covariances of the minimum are computed from the Hessian A of the negative log likelihood:
 
-    noise    f^2 s A^-1            f: correlation of neighbouring frequencies, s: spread of the taper
+    noise    f^2 s A^-1            f: empirical factor SD_FACTOR, s: spread of the taper
     sectors  A^-1 G A^-1           G = sum over blocks of g_b g_b^T, the sandwich estimator (White 1982)
 
-g_b is the gradient of the part of the likelihood that block b of the frequencies (a sector of a ring) contributes. At
-the minimum the g_b sum to zero; they are large where parts of the spectrum disagree, as under a wrong model.
+g_b is the gradient of the part of the likelihood that block b of the frequencies (a sector of some rings) contributes.
+It is taken at the middle point of the quadratic model, minus the mean over the blocks, which is 0 at the minimum. The
+g_b are large where parts of the spectrum disagree, as under a wrong model.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from device.recon.estimation.refraction_edge import Candidate
 from device.recon.estimation.refraction_likelihood import RINGS, Band
 
-SD_FACTOR = 1.4  # for the correlation of neighbouring frequencies; with it 23 frames have z scores of rms 1.0
+SD_FACTOR = 1.4  # empirical: with it 23 frames have z scores of rms 1.0; neighbouring frequencies are correlated
 SECTORS, RING_GROUPS = 6, 5
 
 Floats = NDArray[np.float64]
@@ -28,8 +29,8 @@ Floats = NDArray[np.float64]
 class Quadratic:
     """Quadratic model of a negative log likelihood around its minimum.
 
-    `minimum` is (d,), `hessian` (d, d) in nats; `gradients` (blocks, d) the gradients of the blocks at the minimum.
-    `is_minimum`: the Hessian is positive definite and the minimum is within twice the step.
+    `minimum` is (d,), `hessian` (d, d) in nats; `gradients` (blocks, d) those of the blocks at the middle point of the
+    fit. `is_minimum`: the Hessian is positive definite, and the minimum is within twice the step of the middle point.
     """
 
     minimum: Floats

@@ -123,7 +123,7 @@ def reflex_blobs(scene: Scene, shape: tuple[int, int]) -> Image:
 class RefractiveError:
     """Refractive error: defocus and astigmatism (M, J0, J45, in dpt) of the eye scale the PSF; OPTICS.md 2.6.
 
-    The edge of the PSF (the caustic) moves by scale_per_dpt hypot(M, J0, J45) times the iris's radius.
+    The rms shift of the PSF's edge (the caustic) is scale_per_dpt hypot(M, J0, J45) times the iris's radius.
     """
 
     name = "refraction"
@@ -261,7 +261,7 @@ class ObliqueAstigmatism:
         return Size(_LOCAL_ETA_PER_DPT * rms_dpt * scene.weight, f"up to {edge_dpt:.2f} dpt between the meridians")
 
     def apply(self, setup: OpticalSetup) -> None:
-        """Register the cylinder of each place, with its axis along the radius from the eye's axis, if there is one."""
+        """Register the cylinder of each place; the stronger meridian is along the radius from the eye's axis."""
         right_deg, down_deg = setup.scene.axis_deg
         at_30_dpt = setup.scene.sim.eye.oblique_dpt
 

@@ -39,7 +39,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class Adopted:
-    """Numbers of results: adopted now, in the store before, without a picture; and those that were refused."""
+    """Numbers of results adopted now and before, number of captures without a result, and the refused results."""
 
     adopted: int
     known: int
@@ -50,9 +50,10 @@ class Adopted:
 def adopt_results(folder: Path, store: Path, clock: Clock, progress: Callable[[str], None]) -> Adopted:
     """Store each result below `folder` as a version of its capture in `store`; idempotent.
 
-    `progress` gets lines of text. SettingError for a folder that holds no run, RecordNotFound for one that is no store,
-    StoreError while the instrument runs, StoreFull or StoreReadOnly if the disk takes no more: what was adopted stays.
-    A result that does not belong to the store is refused with the reason, and the others are adopted.
+    `progress` gets lines of text. SettingError for a folder that holds no run, or if its plan or a result is damaged;
+    RecordNotFound for a folder that is no store; StoreError while the instrument runs; StoreFull or StoreReadOnly if
+    the disk takes no more. What was adopted before an error stays. A result is refused with the reason, and the others
+    are adopted, if the store has no such capture, or has it from another device or with other frames.
     """
     if not (folder / PLAN).is_file():
         raise SettingError(f"{folder} holds no run", "Give the folder of diffuscope archive run.")

@@ -53,7 +53,7 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator[Client]:
     """Yield a client of a cluster: of the scheduler at this address, or of worker processes on this machine.
 
     `workers`: number of processes of one thread; None: one for each processor. SettingError for a scheduler that does
-    not answer, and for workers of other versions.
+    not answer, DiffuscopeError if the worker processes end while they start.
     """
     if scheduler is not None:
         try:

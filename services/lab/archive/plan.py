@@ -81,8 +81,9 @@ class PlannedCapture(_Part):
     """One capture: raw frame, own dark frame, calibration (digest), and the name of its result.
 
     `raw` is the first frame of the burst, `frames` are the others in their order, then those in other colours.
-    `origin`: UUID of the device that took it, empty if unknown. `truth` and `before` are pictures of the same rows and
-    columns to compare with, `report` is the earlier report in the store; each is a path, or empty.
+    `device`: name of the folder of its calibration archive; `origin`: UUID of the device that took it; both are empty
+    if unknown. `truth` is a picture of the rows and columns of the raw frame to compare with, `before` the earlier
+    picture (of a store: the lit field only), `report` the earlier report in the store; each is a path, or empty.
     """
 
     id: str
@@ -113,7 +114,7 @@ class LeftOut(_Part):
 
 
 class Plan(_Part):
-    """All of a reprocessing run, in the order in which it is computed."""
+    """All of a reprocessing run: captures in the order of their sources; a run computes them by calibration."""
 
     format: int = FORMAT
     made_at: str

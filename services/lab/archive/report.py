@@ -333,7 +333,7 @@ def _cost(columns: Columns) -> str:
     workers = Counter(word for word in columns.words("worker") if word)
     hours = sum(totals) / 3600
     rows = [
-        ["all captures, one after the other", f"{hours:.3g} h"], ["median of a capture", f"{median(totals):.2f} s"],
+        ["time of all tasks", f"{hours:.3g} h"], ["median of a capture", f"{median(totals):.2f} s"],
         ["of which the solver", f"{median(solving):.2f} s"], ["longest", f"{max(totals):.2f} s"],
         ["workers", str(len(workers))],
     ]  # fmt: skip

@@ -26,7 +26,8 @@ RECORDING_REMEDY = "Give a store (captures/), a folder of exports, or a folder w
 class FoundCalibration:
     """Files of one calibration by role: PSFs, dark, flat; or a folder of a calibration archive.
 
-    `colour_psfs`: PSF of another colour of light than that of `psfs`, which else hold for any colour.
+    `colour_psfs`: PSFs of single colours of light; `psfs` hold for the burst and for every colour without one.
+    `archived`: folder of an archived calibration, which replaces all other files.
     """
 
     psfs: tuple[Path, ...] = ()
@@ -37,7 +38,7 @@ class FoundCalibration:
 
     @property
     def files(self) -> tuple[tuple[Role, Path], ...]:
-        """Role and path of each file, in the order that decides about the picture."""
+        """Role and path of each file, in the order in which the digest of the calibration takes them."""
         if self.archived is not None:
             names = Archive(self.archived.parent).files(self.archived.name)
             return tuple(("archive", self.archived / name) for name in sorted(names))
@@ -52,7 +53,7 @@ class FoundCalibration:
 class FoundFrame:
     """One more raw frame of a capture: of the burst, or in another `colour` of light; `sha256` as in FoundCapture.
 
-    `unusable`: why the instrument did not use it for the quality of the frame; empty if it may be used.
+    `unusable`: the instrument's reason to leave the frame out for its quality; empty if it may be used.
     """
 
     path: Path
@@ -66,7 +67,8 @@ class FoundCapture:
     """A capture in a source; `refused` is the reason why it cannot be reconstructed, None if it can.
 
     `raw` is its first frame, `frames` are the others: of the burst in their order, then those in other colours.
-    `raw_sha256` and `dark_sha256` are as recorded in a store, None where the file must be read.
+    `raw_sha256` and `dark_sha256` are as recorded in a store, None where the file must be read. `device`: name of the
+    folder of its calibration archive; `origin`: UUID of the device; both are empty if unknown.
     """
 
     id: str

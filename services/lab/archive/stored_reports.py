@@ -5,7 +5,10 @@ from pathlib import Path
 
 
 def earlier_figures(path: str) -> dict[str, object]:
-    """Return the columns `before_...` of the table from a stored report; empty if there is none, or it is damaged."""
+    """Return the dose and the columns `before_...` but `before_picture` of the table from the stored report at `path`.
+
+    Empty for an empty path, and for a report that is missing or damaged.
+    """
     if not path:
         return {}
     try:

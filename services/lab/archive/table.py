@@ -1,4 +1,9 @@
-"""Table of a run as Parquet: one row for each capture of the plan, for pandas, DuckDB and Spark."""
+"""Table of a run as Parquet: one row for each capture of the plan, for pandas, DuckDB and Spark.
+
+`state` is `done` (has a result), `quarantine` (failed; `reason`, `reason_code`), `waiting` (not computed yet) or `left
+out` (of the plan; `reason`). Units are in the names of the columns; `rows` and `cols` are in pixels, figures without a
+unit as in `report.json`. `before_...` is of the picture and report as stored, the rest of this run.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
