@@ -76,7 +76,7 @@ class FrameReconstructor(Protocol):
     def steps(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool, deadline: Deadline | None = None
     ) -> Iterator[Step]:
-        """Yield the result of each stage, a pause after each round of the last one, and the picture."""
+        """Yield the result of each stage, ROUND_DONE after each round of the last one, and the picture."""
 
     def __call__(
         self, counts: Pixels, dark: Pixels | None = None, *, simulated: bool = False, deadline: Deadline | None = None,
@@ -111,7 +111,7 @@ class ColoursReconstructor(Protocol):
         deadline: Deadline | None = None, missing: Mapping[Colour, str] | None = None,
         lights_dn_per_s: Mapping[Colour, float] | None = None,
     ) -> Iterator[Step]:  # fmt: skip
-        """Yield the steps of `green`, a pause after each round of the other colours, and the picture with colours."""
+        """Yield the steps of `green`, ROUND_DONE after each round of other colours, and the picture with colours."""
 
 
 class FrameFeedback(Protocol):
