@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
@@ -421,7 +421,7 @@ def show_white_card(
 
 
 def _colours(words: str) -> tuple[Colour, ...]:
-    known: dict[str, Colour] = {"red": "red", "green": "green", "blue": "blue"}
+    known: dict[str, Colour] = {name: name for name in get_args(Colour)}
     named = [word.strip() for word in words.split(",") if word.strip()]
     if unknown := [word for word in named if word not in known]:
         raise typer.BadParameter(f"--colours {unknown[0]!r} is none of {', '.join(known)}")

@@ -11,7 +11,7 @@ from device.sim.simulated_calibration import calibration_point
 from device.sim.world import World
 from device.values import Colour, Image
 
-SCREEN_FALLOFF = 0.05  # relative falloff of the screen at the sensor's corners: no real screen is even
+SCREEN_FALLOFF = 0.05  # relative falloff at the sensor's corners: no real screen is even, also directly before it
 
 
 def cap(world: World) -> Image:

@@ -12,8 +12,9 @@ from hardware.parts import bought
 from hardware.parts.dimensions import Dimensions
 
 PRINTED = Path(__file__).parent / "printed"
-EYE = {"model eye tube", "pinhole piston", "step ring"}  # what makes the calibration's eye
-CHART = {"model eye tube", "chart piston", "step ring"}  # what makes the eye that shows a retina; all others: the head
+ANY_EYE = {"model eye tube", "step ring", "eye collar"}
+EYE = {"pinhole piston", *ANY_EYE}  # what makes the calibration's eye
+CHART = {"chart piston", *ANY_EYE}  # what makes the eye that shows a retina; all others: the head
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,11 @@ class Bought:
     board_mm: float = 38.0  # Raspberry Pi HQ and Global Shutter camera, their mechanical drawings
     board_thick_mm: float = 1.4
     board_holes_mm: float = 30.0  # square of four, 2.5 mm wide, 4 mm from the edges
-    image_above_board_mm: float = 1.2  # measure, with a depth gauge on the cover glass
+    image_above_board_mm: float = 1.2  # measure: depth gauge on the cover glass, less the two lengths of glass below
     package_mm: float = 12.0
     cover_glass_mm: float = 0.5  # measure, or the sensor's data sheet
     cover_glass_index: float = 1.5
-    cover_to_image_mm: float = 0.4
+    cover_to_image_mm: float = 0.4  # from the glass's rear face
     film_mm: float = 20.0  # polariser, cut to a disc
     film_thick_mm: float = 0.3
     led_mm: float = 2.0  # APA102-2020

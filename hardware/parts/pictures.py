@@ -33,9 +33,11 @@ AWAY: dict[str, Offset] = {  # how far each part is drawn from its place
     "camera": (0, 0, 112), "camera cover": (0, 0, 128),
 }  # fmt: skip
 EYE_AWAY: dict[str, Offset] = {
+    "eye collar": (0, 0, 30),
     "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "pinhole": (0, 0, -60), "pinhole piston": (0, 0, -70),
 }  # fmt: skip
 CHART_AWAY: dict[str, Offset] = {
+    "eye collar": (0, 0, 30),
     "eye lens": (0, 0, -62), "step ring": (0, 0, -30), "retina chart": (0, 0, -56), "chart piston": (0, 0, -70),
 }  # fmt: skip
 OBLIQUE = View((-0.60, 0.52, 0.24))

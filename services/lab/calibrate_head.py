@@ -19,8 +19,8 @@ from services.instrument.calibration_request import STEPS_FOLDER, CalibrationReq
 
 ASKED: dict[CalibrationTarget, str] = {
     "cap": "Put the cap on the head and shade it.",
-    "screen": "Take the cap off and put the even screen before the head, switched on.",
-    "point": "Put the point source before the head, on its axis, and switch the screen off.",
+    "screen": "Take the camera off the diffuser cell and lay it on the even screen, switched on, nothing between.",
+    "point": "Screen off, camera back onto its cell; put the point source before the head, on its axis.",
     **{
         stand: f"Move the point source along the axis to {moved_mm:+g} mm ({way} the lens) of where it was first."
         for stand, moved_mm in AXIAL_OFFSETS_MM.items()

@@ -15,7 +15,15 @@ from device.optics.matrix import ring
 from device.optics.retina_chart import RINGS
 from hardware.parts import assembly, bought
 from hardware.parts.dimensions import FOUR, Dimensions
-from hardware.parts.printed import diffuser_cell, pinhole_piston, retaining_ring, splitter_block, tube_flange
+from hardware.parts.printed import (
+    diffuser_cell,
+    eye_collar,
+    model_eye_tube,
+    pinhole_piston,
+    retaining_ring,
+    splitter_block,
+    tube_flange,
+)
 from hardware.parts.printed.iris import iris
 from hardware.parts.printed.led_cap import led_cap
 from hardware.parts.solids import Manifold, solid
@@ -221,6 +229,30 @@ def test_pupil_of_the_model_eye_is_that_of_the_paper(d: Dimensions, eye: Solids)
     end = tube.bounding_box()[5]
     widths = [hole_mm(tube, z) for z in np.linspace(end - 1.1, end - 0.01, 9)]
     assert min(widths) == pytest.approx(d.bought.eye_pupil_mm, abs=0.02)
+
+
+def test_collar_stops_eye_and_card_in_the_plane_of_the_pupil(d: Dimensions, eye: Solids) -> None:
+    """The eye can be tilted by four degrees in it, as a sensor 0.3 mm beside its axis requires."""
+    collar, tube, pupil = eye["eye collar"], eye["model eye tube"], model_eye_tube.pupil_z_mm(d)
+    assert hole_mm(tube, pupil + 0.1) == pytest.approx(d.bought.eye_pupil_mm, abs=0.02)
+    card = rod((0, 0, pupil - 0.3), (0, 0, 1), 0.3, eye_collar.CARD_MM)
+    for stopped in (tube, card):
+        assert common_mm3(stopped, collar) < NOTHING_MM3 < common_mm3(stopped.translate((0, 0, 0.1)), collar)
+    rises = model_eye_tube.WIDE_MM / 2 * sin(radians(4))  # one side of the rim: the cone moves it sideways for that
+    tilted = tube.translate((0, 0, -pupil - 0.1)).rotate((4, 0, 0)).translate((0, -eye_collar.SLOPE * rises, pupil))
+    assert common_mm3(tilted, collar) < NOTHING_MM3
+
+
+def test_collar_passes_the_field_and_slides_over_the_tubes(d: Dimensions, eye: Solids) -> None:
+    collar, pupil = eye["eye collar"], model_eye_tube.pupil_z_mm(d)
+    long, edge = 30.0, tan(radians(d.path.optics.field_deg / 2))
+    light = bundle((d.bought.eye_pupil_mm, 0, 0, pupil), (d.bought.eye_pupil_mm + 2 * long * edge, 0, 0, pupil + long))
+    assert common_mm3(light, collar) < NOTHING_MM3
+    screws_at = eye_collar.socket_z_mm(d)[1] - eye_collar.SCREWS_FROM_END_MM
+    for from_pupil_mm in (17.6, 24.1):  # 22.1 mm to the glass, within 2 mm; the glass up to 2.5 mm inside the tube
+        end = pupil + from_pupil_mm
+        assert common_mm3(rod((0, 0, end), (0, 0, 1), 60.0, d.bought.tube_mm), collar) < NOTHING_MM3
+        assert end < screws_at - 2
 
 
 def hole_mm(body: Manifold, z: float) -> float:

@@ -21,7 +21,7 @@ export const TECHNICIAN = {
   "pin.wait": { one: "Wait {n} second", other: "Wait {n} seconds" },
 
   "cal.title": "Calibration",
-  "cal.what": "The camera is measured with its cap on, before an even screen, and before a point of light.",
+  "cal.what": "The camera is measured with its cap on, lying on an even screen, and before a point of light.",
   "cal.needed": "The camera needs setting up before it can take pictures.",
   "cal.inforce": "In use now",
   "cal.none": "No calibration is in use yet.",
@@ -56,8 +56,8 @@ export const TECHNICIAN = {
   "step.last": "last time {value}",
 
   "ask.cap": "Put the cap on the camera and shade it.",
-  "ask.screen": "Take the cap off. Put the even screen before the camera and switch it on.",
-  "ask.point": "Switch the screen off. Put the point source on the axis, and its pattern on the cross.",
+  "ask.screen": "Take the camera off the diffuser cell. Lay it on the even screen, nothing in between, and switch that on.",
+  "ask.point": "Screen off, camera back on its cell. Put the point source on the axis, and its pattern on the cross.",
   "ask.other": "Put this before the camera: {stand}.",
   "go.cap": "The cap is on: measure",
   "go.screen": "The screen is there: measure",

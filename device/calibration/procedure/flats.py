@@ -14,7 +14,7 @@ from device.values import Image, Mask
 
 BLOCKS = 24  # per side, to which the shading is fitted
 ORDER = 4  # of the polynomial that models the shading of a screen
-MOST_SHADING = 0.4  # from the darkest to the brightest part of a screen
+MOST_SHADING = 0.4  # from the darkest to the brightest part of a screen; decision 0018 has what to expect
 MOST_UNEVEN = 0.01  # residual of a block, in addition to 6 sigma of the pixels
 LEAST_SHARE = 0.02  # of the converter range: a darker flat means that the cap is on
 MOST_BEND = 0.1  # at white
@@ -117,7 +117,7 @@ def flat_field_response(light: Image, good: Mask) -> tuple[Image, float]:
     found = np.asarray(solved[0], np.float64)
     smooth = (basis @ found).reshape(blocks.shape)
     darkest, brightest = float(blocks.min()), float(blocks.max())
-    remedy = "Take everything out of the beam, clean screen and diffuser, light the screen evenly, then start again."
+    remedy = "Lay the camera, without iris and diffuser, on the clean screen, light it evenly, then start again."
     if darkest < (1 - MOST_SHADING) * brightest:
         fall = 1 - darkest / brightest
         message = f"one part of the flat is {fall:.0%} darker than another (at most {MOST_SHADING:.0%})"

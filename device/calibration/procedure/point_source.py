@@ -135,7 +135,7 @@ def subtract_pedestal(light: Image, bad: Mask) -> tuple[Image, float, float, flo
     if mass <= 0 or residual > MOST_PEDESTAL:
         raise CalibrationRefused(
             f"the border of the frame is uneven by {residual:.2%} of the point's light (at most {MOST_PEDESTAL:.1%})",
-            "Put the point on the axis and shade it: its light or the room's reaches the border.",
+            "Tilt the source until its disc is in the middle of the frame, and shade it: light reaches the border.",
         )
     floor = float(np.concatenate(sides).std()) / float(cleared.max())
     return cleared, level * light.size / mass, residual, floor

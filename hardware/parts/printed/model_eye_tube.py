@@ -22,11 +22,20 @@ def seat_z_mm(d: Dimensions) -> float:
     return d.bought.eye_lens_thick_mm / 2 - (radius - (radius**2 - half**2) ** 0.5)
 
 
+def pupil_z_mm(d: Dimensions) -> float:
+    """The pupil's sharp edge."""
+    return d.bought.eye_lens_thick_mm / 2 + d.fit.slide_mm
+
+
+def face_z_mm(d: Dimensions) -> float:
+    """The tube's front face, with which it stands in the eye collar."""
+    return pupil_z_mm(d) + FRONT_MM
+
+
 def model_eye_tube(d: Dimensions) -> Part:
     """The lens drops in from behind onto a shoulder; the pupil's edge is sharp on the lens's side."""
     part, slide = d.bought, d.fit.slide_mm
-    seat, vertex = seat_z_mm(d), part.eye_lens_thick_mm / 2 + slide
-    end = vertex + FRONT_MM
+    seat, vertex, end = seat_z_mm(d), pupil_z_mm(d), face_z_mm(d)
     body = rod(WIDE_MM, (pinhole_piston.rear_z_mm(d), end))
     body -= rod(part.eye_lens_mm + slide, (pinhole_piston.rear_z_mm(d), seat))
     body -= rod(SHOULDER_MM, (seat, vertex)) + rod(part.eye_pupil_mm, (vertex, end))

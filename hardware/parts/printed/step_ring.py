@@ -1,4 +1,7 @@
-"""The step ring: 4 mm between piston and tube; none, one and two of them are -4, 0 and +4 mm of the screen."""
+"""The step ring: 4 mm between piston and tube; none, one and two of them are -4, 0 and +4 mm of the screen.
+
+A third, printed at half the height, is for the steps of 2 mm: it alone is -2 mm, beside one of 4 mm +2 mm.
+"""
 
 from build123d import Part
 
