@@ -392,8 +392,9 @@ def show_trial_lenses(
     A head whose offset, slope or cylinder is outside its limits is refused, and its calibration stays as it is.
     """
     from device.optics.trial_lens import PowerVector
+    from services.instrument.trial_lens_measurement import LensBench
     from services.lab.check_head import with_archive
-    from services.lab.trial_lens_check import LensBench, calibrate_with_lenses
+    from services.lab.trial_lens_check import calibrate_with_lenses
 
     _progress("the lamp shines for moments: a trainer eye stands before the head, and no person")
     spec, bench = with_archive(load_head(head), archive), LensBench(vertex_mm, PowerVector(eye_dpt))

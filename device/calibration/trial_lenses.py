@@ -181,11 +181,11 @@ def _judged(fit: TrialLensFit, line: _Line, readings: Sequence[LensReading]) -> 
     lens = readings[worst].lens.label
     off, again = fit.offset, "More light, or a trainer eye with more vessels, then show the lenses again."
     focus = (
-        "Set the trainer eye to 0 dpt, or give its refraction with --eye-dpt. If it is, the calibration's point source "
-        "was out of focus: calibrate the head again."
+        "Set the trainer eye to 0 dpt, or give the correction that it alone needs. If that is right, the calibration's "
+        "point source was out of focus: calibrate the head again."
     )
     oblique = "Put eye and lenses upright and on the axis; then the calibration's point source: calibrate again."
-    slope = "Measure the distance from lens to pupil (--vertex-mm). If it is right, calibrate with --dioptres."
+    slope = "Measure and give the distance from lens to pupil. If it is right, use calibrate --dioptres."
     turned = (
         "Turn the cylinder to the axis that is asked for, handle as the examiner sees it. If it is, the picture is "
         "turned or mirrored: look at `upright` in the head file."

@@ -10,10 +10,11 @@ from device.calibration.procedure.calibration_sequence import CalibrationSequenc
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationStopped, DiffuscopeError, StoreFull
-from device.head import Bench
+from device.head import Bench, Head
 from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest, calibration_job, write_identity
 from services.instrument.calibration_state import CalibrationState, RollbackRequest, RunRequest
 from services.instrument.camera_tap import CameraTap
+from services.instrument.trial_lens_state import TrialLensOutcome
 from services.instrument.watchdog import BEAT_S, Watchdog
 
 log = logging.getLogger(__name__)
@@ -29,24 +30,27 @@ STORE_FULL_REMEDY = (
 class CalibrationOutcome:
     """Outcome of a run: the calibration put in force, whether this run measured it, and the error that ended the run.
 
-    `failure` is None after success or a stop; `is_unexpected`: it was no DiffuscopeError.
+    `failure` is None after success or a stop; `is_unexpected`: it was no DiffuscopeError. `lenses`: readings of a run
+    with trial lenses, None of any other run.
     """
 
     result: StoredCalibration | None = None
     was_measured: bool = False
     failure: DiffuscopeError | None = None
     is_unexpected: bool = False
+    lenses: TrialLensOutcome | None = None
 
 
 @dataclass(frozen=True)
 class RunParts:
-    """Parts of a run; `open_bench` opens the head without a calibration."""
+    """Parts of a run; `open_bench` opens the head without a calibration, `open_head` with the one in force."""
 
     spec: InstrumentSpec
     archive: Archive
     clock: Clock
     watchdog: Watchdog
     open_bench: Callable[[], Bench]
+    open_head: Callable[[], Head]
 
 
 class CalibrationRun:

@@ -1,4 +1,7 @@
-"""Arbiter of the head: either the exam or a calibration run owns it, never both at once."""
+"""Arbiter of the head: either the exam or a calibration run owns it, never both at once.
+
+A run with trial lenses is a calibration run of a head whose calibration is valid.
+"""
 
 import asyncio
 import logging
@@ -13,7 +16,8 @@ from device.calibration.monitoring.finding import Finding
 from device.clock import Clock
 from device.config.head_file import CalibrationTable, InstrumentSpec
 from device.errors import CalibrationError, DiffuscopeError, HeadMismatch
-from device.head import Bench, Head, refuse_recording
+from device.head import Bench, Head, open_head, refuse_recording
+from device.light_safety.dose_ledger import MemoryLedger
 from services.errors import Busy
 from services.instrument.calibration_run import CalibrationOutcome, RunParts
 from services.instrument.calibration_session import CalibrationSession
@@ -22,6 +26,8 @@ from services.instrument.capture import NO_VISIT, LiveRequest, Preview
 from services.instrument.events import EventBus
 from services.instrument.exam import ExamService
 from services.instrument.exam_state import WireState
+from services.instrument.trial_lens_session import TrialLensSession
+from services.instrument.trial_lens_state import TrialLensOutcome, TrialLensRequest
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 
@@ -54,14 +60,16 @@ class HeadOwner:
 
     The exam or the calibration run owns the head; during a transfer neither does. `calibration_error`: why the exam
     cannot own it. `calibration_failure`: error that ended the last calibration run; `last_made_id`: calibration id
-    of the last finished one. `failure`: error that ended the process.
+    of the last finished one; `last_lenses`: readings of the last run, if it was one with trial lenses. `failure`: error
+    that ended the process.
     """
 
     exam: ExamService | None = None
-    session: CalibrationSession | None = None
+    session: CalibrationSession | TrialLensSession | None = None
     calibration_error: DiffuscopeError | None = None
     calibration_failure: DiffuscopeError | None = None
     last_made_id: str | None = None
+    last_lenses: TrialLensOutcome | None = None
     failure: DiffuscopeError | None = None
     is_closing: bool = False
     is_in_transfer: bool = False
@@ -97,7 +105,9 @@ class HeadTransfer:
         self, context: AppContext, open_exam: Callable[[], ExamService], open_bench: Callable[[], Bench]
     ) -> None:
         self._context, self._open_exam = context, open_exam
-        self._run_parts = RunParts(context.spec, context.archive, context.clock, context.watchdog, open_bench)
+        self._run_parts = RunParts(
+            context.spec, context.archive, context.clock, context.watchdog, open_bench, self._open_head
+        )
         self._lock = Condition()
         self._owner = HeadOwner(is_in_transfer=True)
         self._begin()
@@ -108,11 +118,11 @@ class HeadTransfer:
         with self._lock:
             return self._owner
 
-    def calibrate(self, request: RunRequest) -> None:
+    def calibrate(self, request: RunRequest | TrialLensRequest) -> None:
         """Start a calibration run after the exam has finished its captures and released the head.
 
-        A run that waits for a request gets this one. Raises Busy if a calibration is under way, while the exam starts
-        or during shutdown.
+        A run that waits for a request gets this one; it takes no trial lenses, because there is no valid calibration.
+        Raises Busy if a calibration is under way, while the exam starts or during shutdown.
         """
         with self._lock:
             now = self._owner
@@ -120,16 +130,21 @@ class HeadTransfer:
                 raise Busy("the instrument is being switched off", "Wait until it is back.")
             if now.session is None:
                 exam = _releasable_exam(now)
-                self._owner = replace(now, exam=None, calibration_failure=None, is_in_transfer=True)
+                self._owner = replace(now, exam=None, calibration_failure=None, last_lenses=None, is_in_transfer=True)
         if now.session is not None:
-            now.session.start(request)
+            _start_waiting(now, request)
             return
-        session: CalibrationSession | None = None
+        session: CalibrationSession | TrialLensSession | None = None
         try:
             self._release(exam)
-            session = CalibrationSession(self._run_parts, request, self._end_session)
+            session = self._begin_session(request)
         finally:
             self._finish(session=session)
+
+    def _begin_session(self, request: RunRequest | TrialLensRequest) -> CalibrationSession | TrialLensSession:
+        if isinstance(request, TrialLensRequest):
+            return TrialLensSession(self._run_parts, request, self._end_session)
+        return CalibrationSession(self._run_parts, request, self._end_session)
 
     def close(self) -> None:
         """Permit no further transfer, and wait for the end of a running one."""
@@ -164,7 +179,9 @@ class HeadTransfer:
             has_failed = outcome.failure is not None and now.calibration_error is not None
             is_last = outcome.is_unexpected or has_failed
             if not now.is_closing:
-                now = replace(now, calibration_failure=outcome.failure, is_in_transfer=not is_last)
+                now = replace(
+                    now, calibration_failure=outcome.failure, last_lenses=outcome.lenses, is_in_transfer=not is_last
+                )
             self._owner = now
         if now.is_closing:
             return
@@ -189,7 +206,7 @@ class HeadTransfer:
             self._finish(exam, session, calibration_error)
 
     def _finish(
-        self, exam: ExamService | None = None, session: CalibrationSession | None = None,
+        self, exam: ExamService | None = None, session: CalibrationSession | TrialLensSession | None = None,
         calibration_error: DiffuscopeError | None = None,
     ) -> None:  # fmt: skip
         """End a transfer with a new owner."""
@@ -199,10 +216,24 @@ class HeadTransfer:
             )
             self._lock.notify_all()
 
+    def _open_head(self) -> Head:
+        """Open the head with the calibration in force for trial lenses, whose light reaches no eye."""
+        context = self._context
+        spec = with_calibration(context.spec, context.archive.root)
+        return open_head(spec, context.clock, MemoryLedger(context.clock))
+
     def _fail(self, error: DiffuscopeError | None) -> None:
         with self._lock:
             self._owner = replace(self._owner, failure=error)
         self._context.on_failure()
+
+
+def _start_waiting(now: HeadOwner, request: RunRequest | TrialLensRequest) -> None:
+    """Give the request to the run that owns the head; Busy, or the error because of which a calibration is needed."""
+    if isinstance(now.session, CalibrationSession) and not isinstance(request, TrialLensRequest):
+        now.session.start(request)
+        return
+    raise now.calibration_error or Busy("a calibration is under way", "Go on with it, or cancel it first.")
 
 
 def _releasable_exam(now: HeadOwner) -> ExamService:
@@ -292,13 +323,16 @@ class HeadArbiter:
             return None
         return await exam.preview(after, wanted=wanted)
 
-    def calibrate(self, request: RunRequest) -> None:
+    def calibrate(self, request: RunRequest | TrialLensRequest) -> None:
         """Start a calibration run after the exam has finished its captures and released the head.
 
         A run that waits for a request (no valid calibration) gets this one. Raises Busy if a calibration is under way,
-        while the exam starts or during shutdown, SpecError for a recording.
+        while the exam starts or during shutdown, SpecError for a recording; for trial lenses CalibrationMissing or
+        CalibrationDamaged without a valid calibration in the archive.
         """
         refuse_recording(self.context.spec)
+        if isinstance(request, TrialLensRequest):
+            self.context.archive.load()  # raises before the exam is closed
         self._transfer.calibrate(request)
 
     def roll_back(self, id: str) -> None:

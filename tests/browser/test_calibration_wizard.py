@@ -1,23 +1,25 @@
-"""Calibration of the simulated head on the real server: injected faults, power cuts, wrong PINs."""
+"""Calibration of the simulated head on the real server: injected faults, power cuts, wrong PINs, trial lenses."""
 
 import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from device.calibration.archive import Archive
+from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.config.head_file import load_head
+from device.sim.simulated_calibration import simulated_calibration
 from services.instrument.calibration_request import CalibrationRequest
 from services.lab.calibrate_head import calibrate
 from tests.browser.axe import axe_faults
 from tests.browser.conftest import SMALL_PLANS, Complaints, Server, copy_small_plans
 from tests.browser.looks import SIZES, look_for_faults
-from tests.simulated import small_head_toml
+from tests.simulated import small_head_toml, world
 
 pytestmark = pytest.mark.browser
 
@@ -31,6 +33,16 @@ object = { kind = "point" }
 sensor = { prnu = 0.01, dsnu_e = 2.0, hot_pixels = 0.0003 }
 """
 HEAD = small_head_toml("Head on the bench", TABLES, exposure_s=0.005)
+# Few pixels, with many electrons each, that measure every lens within the limits; their PSF is off by 0.2 dpt.
+LENS_TABLES = TABLES.replace("[sim]\n", "[sim]\npeak_e = 690000\ncalibration = { m_dpt = 0.2 }\n").replace(
+    '{ kind = "point" }', "{ haemorrhages = 3 }"
+)
+LENS_HEAD = (
+    small_head_toml("Head for lenses", LENS_TABLES, exposure_s=0.005)
+    .replace("rows = 270", "rows = 158").replace("cols = 480", "cols = 282").replace("20.16", "34.27")
+    .replace("full_well_e = 23000", "full_well_e = 1060000\nbit_depth = 16")
+    .replace('backend = "sim"\n\n[optics]', 'backend = "sim"\npreview_colour = "green"\n\n[optics]')
+)  # fmt: skip
 SHAPES = [SIZES["tablet"], SIZES["portrait"], SIZES["phone"]]
 # Network errors while the server is killed.
 CUT = (
@@ -229,3 +241,69 @@ def test_wrong_pin_locks_out_and_logout(uncalibrated_server: Server, open_page: 
     expect(page.locator("#enter")).to_have_text("Open")
     page.wait_for_timeout(700)
     log_in(page)
+
+
+@pytest.fixture
+def lens_server(tmp_path: Path) -> Iterator[Server]:
+    """A real server for a head whose calibration is in force and can be checked with trial lenses."""
+    (tmp_path / "head.toml").write_text(LENS_HEAD)
+    spec = load_head(tmp_path / "head.toml")
+    assert spec.calibration is not None
+    made = Provenance("DS-7", datetime.now(UTC), "Ada", "0.1.0")
+    Archive(spec.calibration.archive).add_and_activate(simulated_calibration(world(spec)), made)
+    server = Server(tmp_path / "data", str(tmp_path / "head.toml"))
+    copy_small_plans(server.data)
+    server.start()
+    server.wait_until_ready()
+    yield server
+    server.close()
+
+
+def press(page: Page, name: str) -> None:
+    """Press a button by keyboard, after the debounce of the page."""
+    page.wait_for_timeout(700)
+    page.locator(name).focus()
+    page.keyboard.press("Enter")
+
+
+def test_trial_lenses_by_keyboard_put_the_offset_in_force(
+    lens_server: Server, open_page: Open, complaints: Complaints
+) -> None:
+    complaints.expect("422")
+    archive = archive_of(lens_server)
+    before = archive.active_id()
+    page = open_page(f"{lens_server.url}/technician")
+    log_in(page)
+    expect(page.locator("#lenses")).to_have_attribute("aria-disabled", "false", timeout=120_000)
+    page.locator("form:has(#lenses) summary").tap()
+    page.locator("#vertex").fill("far")
+    press(page, "#lenses")
+    expect(page.locator(".alert")).to_have_attribute("data-code", "input")
+    page.locator("#vertex").fill("12,0")
+    press(page, "#lenses")
+    expect(page.locator("[data-lens='0']")).to_have_attribute("data-state", "now", timeout=60_000)
+    expect(page.locator("[role=status]")).to_have_text("The simulated eye is there, without a lens.", timeout=60_000)
+    press(page, "#cancel")
+    page.wait_for_selector("[data-view=overview]")
+    assert archive.active_id() == before
+    expect(page.locator("#lenses")).to_have_attribute("aria-disabled", "false", timeout=60_000)
+    press(page, "#lenses")
+    for k, words in enumerate(("without a lens", "+2.00", "-2.00", "+5.00", "-5.00", "-2.00 × 30°")):
+        expect(page.locator(f"[data-lens='{k}']")).to_have_attribute("aria-current", "step", timeout=60_000)
+        expect(page.locator("[role=status]")).to_contain_text(words, timeout=60_000)
+        expect(page.locator("tr[data-state=done]")).to_have_count(k)
+        if k == 5:
+            assert faults_in_all_shapes(page, "#lens-go") == []
+            page.reload()  # a reload loses nothing
+            page.wait_for_selector("[data-lens='5'][data-state=now]")
+        press(page, "#lens-go")
+    page.wait_for_selector("[data-view=lens-result]", timeout=60_000)
+    offset = archive.load().calibration.refraction_offset
+    assert offset is not None
+    assert archive.active_id() != before
+    expect(page.locator("[data-finding]")).to_have_count(9)
+    expect(page.locator("[data-finding][data-ok=false]")).to_have_count(0)
+    expect(page.locator("[data-finding=offset]")).to_contain_text(f"{offset.m_dpt:+.2f} dpt")
+    assert faults_in_all_shapes(page, "header") == []
+    press(page, "#overview")
+    expect(page.locator("form:has(#lenses)")).to_contain_text(f"{offset.m_dpt:+.2f} dpt is taken from every refraction")

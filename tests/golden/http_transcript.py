@@ -12,6 +12,7 @@ from tests.golden.transcript import Transcript
 Chapter = Callable[[], list[dict[str, Any]]]
 UNKNOWN_CAPTURE, UNKNOWN_VISIT = "20260101T000000-OD-ffffff", "20260101T000000-ffffff"
 RACING = ("error", "progress", "stand", "state", "steps")  # of the wizard, which measures in another thread
+LENSES = "/api/calibration/trial-lenses"
 PIN, STANDS = {"pin": "2580"}, ("cap", "screen", "point")
 
 
@@ -274,6 +275,8 @@ def calibration() -> list[dict[str, Any]]:
         locked = {"": {"by": "Eve"}, "/ready": {"stand": "cap"}, "/cancel": {}, "/use": {"id": "0" * 16}}
         for path, body in locked.items():
             log.ask(f"POST /api/calibration{path}", json=body, note="nobody is logged in")
+        for path, body in {"": {}, "/ready": {"lens": 0}}.items():
+            log.ask(f"POST {LENSES}{path}", json=body, note="nobody is logged in")
         for path in ("", "/preview"):
             log.ask(f"GET /api/calibration{path}", note="nobody is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
@@ -281,13 +284,29 @@ def calibration() -> list[dict[str, Any]]:
         log.ask("GET /api/calibration/preview", note="nothing is being calibrated")
         log.ask("GET /api/calibration/preview", "/api/calibration/preview?after=-1")
         log.ask("POST /api/calibration", json={"by": ""})
+        log.ask(f"POST {LENSES}", json={}, note="without a calibration")
         made = _calibrated(log)
         use = "POST /api/calibration/use"
         log.ask(use, json={"id": made}, racing=("state",))
         log.ask(use, json={"id": "0" * 16})
         log.ask(use, json={"id": "../data"})
         _stopped(log)
+        _trial_lenses(log)
         return log.exchanges
+
+
+def _trial_lenses(log: Transcript) -> None:
+    """Record the start of a run with trial lenses, its refusals, the first lens, and a stop."""
+    _settled(log, "idle")
+    log.ask(f"POST {LENSES}/ready", json={"lens": 0}, note="no lenses are being measured")
+    log.ask(f"POST {LENSES}", json={"vertex_mm": 40})
+    log.ask(f"POST {LENSES}", json={}, racing=("lenses",))
+    until(lambda: log.instrument.send("GET", "/api/calibration").json()["lenses"]["state"] == "asking")
+    log.ask("GET /api/calibration", note="the first lens is asked for")
+    log.ask(f"POST {LENSES}/ready", json={"lens": 1}, note="another lens is asked for")
+    log.ask("POST /api/calibration/ready", json={"stand": "cap"}, note="trial lenses are under way")
+    log.ask(f"POST {LENSES}/ready", json={"lens": 0}, racing=("lenses",))
+    log.ask("POST /api/calibration/cancel", racing=("lenses", "state"))
 
 
 def _calibrated(log: Transcript) -> str:

@@ -1,4 +1,4 @@
-"""Calibration run over HTTP in virtual time: complete, with injected faults, stopped, rolled back."""
+"""Calibration run over HTTP in virtual time: complete, with injected faults, stopped, rolled back; trial lenses."""
 
 import asyncio
 import time
@@ -21,6 +21,7 @@ from device.config.head_file import CalibrationTable, InstrumentSpec, load_head
 from device.errors import CalibrationStale, CameraMissing
 from device.head import Bench, open_bench, open_head
 from device.light_safety.dose_ledger import MemoryLedger
+from device.sim.simulated_calibration import simulated_calibration
 from services.http.app import create_app
 from services.http.authentication import IDLE_TIMEOUT_S, PinAuthenticator
 from services.instrument.events import EventBus
@@ -29,6 +30,8 @@ from services.instrument.head_arbiter import AppContext, HeadArbiter, archive_pa
 from services.instrument.watchdog import Watchdog
 from services.records.capture_store import CaptureStore
 from tests.journey.conftest import SMALL_HEAD
+from tests.simulated import world
+from tests.unit.test_trial_lenses import WHO
 
 FLAWS = "\n[sim.sensor]\nprnu = 0.01\ndsnu_e = 2.0\nhot_pixels = 0.0003\n"
 TINY = (
@@ -168,6 +171,7 @@ def station(make_station: MakeStation) -> Station:
 PROTECTED = [
     ("GET", "/api/calibration"), ("POST", "/api/calibration"), ("POST", "/api/calibration/ready"),
     ("POST", "/api/calibration/cancel"), ("POST", "/api/calibration/use"), ("GET", "/api/calibration/preview"),
+    ("POST", "/api/calibration/trial-lenses"), ("POST", "/api/calibration/trial-lenses/ready"),
     ("POST", "/api/technician/lock"), ("POST", "/api/technician/here"),
 ]  # fmt: skip
 
@@ -177,7 +181,7 @@ def test_technician_endpoints_require_the_pin_and_captures_do_not(make_station: 
 
     def all_locked() -> None:
         for method, path in PROTECTED:
-            body = {"by": "Eve", "stand": "cap", "id": "0" * 16} if method == "POST" else None
+            body = {"by": "Eve", "stand": "cap", "id": "0" * 16, "lens": 0} if method == "POST" else None
             answer = station.ask(method, path, body)
             assert (answer.status_code, answer.json()["code"]) == (401, "technician.locked"), path
 
@@ -431,3 +435,90 @@ def test_a_bench_that_cannot_be_opened_returns_the_head_to_the_exam(make_station
     assert other.state()["error"]["code"] == "camera.missing"
     assert owner.owner.session is None
     assert not station.died.is_set()
+
+
+# Trial lenses
+
+
+LENSES = "/api/calibration/trial-lenses"
+
+
+def await_lens(station: Station, number: int) -> dict[str, Any]:
+    """Wait until this lens is asked for; return the description of the run."""
+    until(lambda: (station.state()["lenses"] or {"lens": None})["lens"] == number, 60)
+    until(lambda: station.state()["lenses"]["state"] == "asking", 60)
+    run: dict[str, Any] = station.state()["lenses"]
+    return run
+
+
+def begin_lenses(station: Station, **options: float) -> None:
+    until(lambda: station.state()["state"] == "idle")
+    station.post(LENSES, options)
+    await_lens(station, 0)
+
+
+@pytest.fixture
+def calibrated(make_station: MakeStation, tmp_path: Path) -> Station:
+    """A station of a head with a calibration in force, which sees a point: its pixels measure lenses, but not well."""
+    (tmp_path / "head.toml").write_text(TINY)
+    of = world(load_head(tmp_path / "head.toml"))
+    Archive(tmp_path / "archive").add_and_activate(simulated_calibration(of), WHO)
+    station = make_station(TINY, archive=True)
+    station.set_pin()
+    return station
+
+
+def test_a_head_outside_its_limits_shows_readings_and_findings_and_keeps_its_calibration(calibrated: Station) -> None:
+    before = calibrated.state()["in_force"]["id"]
+    begin_lenses(calibrated, vertex_mm=13.0)
+    for number in range(6):
+        run = await_lens(calibrated, number)
+        assert [row["state"] for row in run["rows"]] == ["done"] * number + ["now"] + ["todo"] * (5 - number)
+        assert all((row["measured"] is None) == (row["state"] != "done") for row in run["rows"])
+        assert calibrated.refused(f"{LENSES}/ready", {"lens": 5 - number}) == (409, "busy")
+        calibrated.post(f"{LENSES}/ready", {"lens": number})
+    until(lambda: calibrated.state()["state"] == "idle", 60)
+    state = calibrated.state()
+    run = state["lenses"]
+    assert (run["state"], run["vertex_mm"], run["stored_id"]) == ("done", 13.0, None)
+    assert run["rows"][1]["nominal"]["m_dpt"] == pytest.approx(-2 / (1 + 0.013 * 2))
+    for row in run["rows"]:
+        assert row["measured"]["m_dpt"] == pytest.approx(row["nominal"]["m_dpt"], abs=4 * row["sd"]["m_dpt"])
+    failing = [one for one in run["findings"] if not one["ok"]]
+    assert run["error"]["remedy"] in [one["remedy"] for one in failing]
+    assert run["error"] == state["error"]
+    assert [one["id"] for one in state["kept"]] == [state["in_force"]["id"]] == [before]
+    assert "trial_offset_dpt" not in state["in_force"]["numbers"]
+    assert calibrated.ask("POST", "/api/captures", {"eye": "OD"}).json()["calibration_id"] == before
+
+
+def test_a_cancelled_run_returns_the_head_to_the_exam(calibrated: Station) -> None:
+    begin_lenses(calibrated)
+    assert calibrated.state()["state"] == "lenses"
+    assert calibrated.refused("/api/captures", {"eye": "OD"}) == (409, "busy")
+    assert calibrated.refused(LENSES) == (409, "busy")
+    assert calibrated.refused("/api/calibration", {"by": "Bob"}) == (409, "busy")
+    assert calibrated.refused("/api/calibration/ready", {"stand": "cap"}) == (409, "busy")
+    assert calibrated.ask("GET", "/api/calibration/preview").status_code == 204
+    calibrated.post("/api/calibration/cancel")
+    until(lambda: calibrated.state()["state"] == "idle")
+    state = calibrated.state()
+    assert (state["lenses"], state["error"]) == (None, None)
+    assert calibrated.ask("POST", "/api/captures", {"eye": "OD"}).status_code == 201
+
+
+def test_without_a_calibration_in_force_no_lens_is_measured(make_station: MakeStation) -> None:
+    station = make_station(archive=True)
+    station.set_pin()
+    assert station.refused(LENSES) == (423, "calibration.missing")
+    assert station.state()["state"] == "begin"
+
+
+@pytest.mark.parametrize("body", [{"vertex_mm": -1}, {"vertex_mm": "far"}, {"eye_dpt": 11}, {"lamp": 1}])
+def test_an_invalid_request_for_lenses_is_422_and_the_exam_keeps_the_head(lasting: Station, body: Any) -> None:
+    assert lasting.refused(LENSES, body) == (422, "input")
+    assert lasting.refused(f"{LENSES}/ready", {"lens": -1}) == (422, "input")
+    assert lasting.refused(f"{LENSES}/ready", {"lens": 0}) == (409, "busy")
+    until(lambda: lasting.state()["state"] == "idle")
+    assert lasting.refused(LENSES) == (423, "calibration.missing"), "what a simulated head computes is in no archive"
+    assert lasting.owner.owner.session is None

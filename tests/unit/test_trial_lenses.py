@@ -26,8 +26,9 @@ from device.recon.estimation.refraction_notation import report_of, sphere_cylind
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.sim.simulated_calibration import simulated_calibration
 from device.values import Calibration, Psf, RefractionOffset, Sensor
+from services.instrument.trial_lens_measurement import LensBench, alignment_remedy, keep_offset
 from services.lab.check_head import with_archive
-from services.lab.trial_lens_check import LensBench, calibrate_with_lenses, keep_offset
+from services.lab.trial_lens_check import calibrate_with_lenses, table
 from tests import scenes
 from tests.scenes import speckle
 from tests.simulated import coarse, exposed_counts, small_head_toml, with_keys, world
@@ -193,19 +194,33 @@ def test_the_offset_of_a_simulated_head_is_measured_and_stored(tmp_path: Path) -
     assert [line[:5] for line in lines if line.startswith(("no le", "-5.00"))] == ["no le", "-5.00"]
 
 
+def fit_of(off: PowerVector) -> TrialLensFit:
+    return fit_trial_lenses(readings(off), VERTEX_MM)
+
+
 def test_a_head_outside_its_limits_keeps_its_calibration(tmp_path: Path) -> None:
-    archive, lines = Archive(tmp_path), list[str]()
+    archive = Archive(tmp_path)
     archive.add_and_activate(Calibration((Psf(speckle((9, 9))),), Sensor()), WHO)
-    shown = tuple(readings(PowerVector(-0.7)))
+    refused = fit_of(PowerVector(-0.7))
     with pytest.raises(CalibrationRefused, match=r"the refraction is off by -0\.70 dpt"):
-        keep_offset(archive, archive.load(), shown, LensBench(), lines.append)
-    assert any(line.startswith("FAIL  offset ") for line in lines), "the table is shown before"
+        keep_offset(archive, archive.load(), refused)
+    assert any(line.startswith("FAIL  offset ") for line in table(readings(PowerVector(-0.7)), refused))
     assert len(archive.ids()) == 1
-    keep_offset(archive, archive.load(), tuple(readings(PowerVector(-0.2))), LensBench(), lines.append)
-    again = keep_offset(archive, archive.load(), tuple(readings(PowerVector(0.1))), LensBench(), lines.append)
-    assert archive.load().calibration.refraction_offset == again.fit.offset, "a later offset replaces the earlier one"
+    keep_offset(archive, archive.load(), fit_of(PowerVector(-0.2)))
+    again = keep_offset(archive, archive.load(), later := fit_of(PowerVector(0.1)))
+    assert archive.load().calibration.refraction_offset == later.offset, "a later offset replaces the earlier one"
+    assert archive.active_id() == again.calibration.id
     names = [name for name, _ in archive.load().provenance.figures]
     assert len(names) == len(set(names))
+
+
+def test_the_remedy_gives_a_distance_only_for_a_head_with_the_lenses_of_the_light_path() -> None:
+    spec = load_head(SIM)
+    assert "37.5 mm before the first lens" in alignment_remedy(spec)
+    assert spec.optics is not None
+    other = spec.model_copy(update={"optics": spec.optics.model_copy(update={"angular_magnification": 0.8})})
+    for unknown in (other, spec.model_copy(update={"optics": None})):
+        assert "the trainer eye's pupil on the axis, where " in alignment_remedy(unknown)
 
 
 def test_a_reconstruction_reports_the_refraction_without_the_offset() -> None:

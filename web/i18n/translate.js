@@ -87,3 +87,9 @@ export function isToday(iso) {
 export function number(value, digits = 1) {
   return new Intl.NumberFormat(language, { maximumFractionDigits: digits }).format(value);
 }
+
+/** Format a number with its sign and that many decimals; zero has no sign. */
+export function signed(value, digits = 2) {
+  const form = { signDisplay: "exceptZero", minimumFractionDigits: digits, maximumFractionDigits: digits };
+  return new Intl.NumberFormat(language, form).format(value);
+}

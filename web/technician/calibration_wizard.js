@@ -2,17 +2,11 @@
 
 import { drawing } from "./calibration_drawings.js";
 import { navigation } from "./nav.js";
-import { html, nothing, svg } from "../vendor/lit-html.js";
-import { calendarDay, clockTime, number, t } from "../i18n/translate.js";
+import { errorBox, icon, prompt, when } from "./page_parts.js";
+import { lensCard, lensResult, lensRun } from "./trial_lenses.js";
+import { html, nothing } from "../vendor/lit-html.js";
+import { number, t } from "../i18n/translate.js";
 import { TECHNICIAN } from "../i18n/en_technician.js";
-
-const PATHS = {
-  warn: svg`<path d="M12 4 2.5 20h19zM12 10v4.5M12 17.2v.3"></path>`,
-  done: svg`<path d="M4 12.5 9.5 18 20 6.5"></path>`,
-  now: svg`<path d="M5 12h14M13 6l6 6-6 6"></path>`,
-  todo: svg`<circle cx="12" cy="12" r="8"></circle>`,
-  wait: svg`<circle cx="12" cy="12" r="9"></circle><path d="M12 7v5l3.5 2"></path>`,
-};
 
 // The headline number of each step: its key in the step's result, and in the archived calibration.
 const HEADLINES = {
@@ -31,7 +25,6 @@ const RESULTS = [
 ];
 
 const textOr = (key, otherwise, vars) => t(key in TECHNICIAN ? key : otherwise, vars);
-const when = (moment) => `${calendarDay(moment)}, ${clockTime(moment)}`;
 
 /** Template of the whole technician page. */
 export function technicianPage(state, actions) {
@@ -49,6 +42,8 @@ const views = {
   overview: (state, actions) => navigation(state, actions, overview),
   wizard: (state, actions) => wizard(state, actions),
   done: (state, actions) => done(state, actions),
+  lenses: (state, actions) => lensRun(state, actions),
+  "lens-result": (state, actions) => lensResult(state, actions),
 };
 
 function header({ cal, theme, view, lost }, actions) {
@@ -66,18 +61,6 @@ function header({ cal, theme, view, lost }, actions) {
       ${lost ? html`<p class="lost" role="alert">${icon("warn")} ${t("tech.lost")}</p>` : nothing}
     </header>
   `;
-}
-
-function prompt(tone, text) {
-  return html`<p class="prompt" role="status" data-tone=${tone}>${text}</p>`;
-}
-
-function errorBox(error) {
-  if (!error) return nothing;
-  return html`<div class="alert" role="alert" data-code=${error.code}>
-    ${icon("warn")}
-    <p><strong>${error.message}</strong> ${error.remedy}</p>
-  </div>`;
 }
 
 // ---- login
@@ -107,7 +90,8 @@ function loginForm({ hasPin, pin, wait, error, busy }, actions) {
 
 // ---- overview: calibration in use, start, restore an earlier one
 
-function overview({ cal, by, error, busy }, actions) {
+function overview(state, actions) {
+  const { cal, by, error, busy } = state;
   const ready = cal.state !== "starting";
   return html`
     <section class="column" aria-label=${t("cal.title")}>
@@ -136,7 +120,7 @@ function overview({ cal, by, error, busy }, actions) {
           ${startWord(cal, by, busy)}
         </button>
       </form>
-      ${earlierCalibrations(cal, actions)}
+      ${lensCard(state, actions)} ${earlierCalibrations(cal, actions)}
     </section>
   `;
 }
@@ -309,8 +293,4 @@ function results({ numbers }) {
 function formatNumber(key, value) {
   const [unit, digits] = UNITS[key] ?? ["plain", 3];
   return t(`unit.${unit}`, { v: number(unit === "percent" ? 100 * value : value, digits) });
-}
-
-function icon(name) {
-  return html`<svg class="icon" viewBox="0 0 24 24" aria-hidden="true" focusable="false">${PATHS[name]}</svg>`;
 }

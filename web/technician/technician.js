@@ -1,4 +1,4 @@
-// Controller of the technician page: PIN login and calibration. The state of a calibration is polled from the server,
+// Controller of the technician page: PIN login, calibration, trial lenses. The state of a calibration is polled from the server,
 // so a reload or restart loses nothing.
 
 import { ApiError } from "../core/api.js";
@@ -16,7 +16,7 @@ const ACTIVITY_MS = 30_000; // at most one activity report in this time
 useLanguage("en", TECHNICIAN);
 
 const store = createStore({
-  view: "opening", // opening | door | overview | wizard | done
+  view: "opening", // opening | door | overview | wizard | done | lenses | lens-result
   section: "calibration", // section of the overview
   cal: null, // latest calibration state of the server
   hasPin: true,
@@ -34,6 +34,7 @@ const { get, set } = store;
 let ignoreTapsUntil = 0;
 let activityMs = 0;
 let dismissed = readStorage("dismissed");
+let dismissedLenses = readStorage("dismissed.lenses");
 
 // ---- requests
 
@@ -81,12 +82,21 @@ async function refresh() {
 
 function showCalibration(cal) {
   const before = get().cal;
-  const inProgress = cal.state === "asking" || cal.state === "measuring";
-  const view = inProgress ? "wizard" : cal.made && cal.made.id !== dismissed ? "done" : "overview";
-  if (view !== get().view || cal.state !== before?.state || cal.stand !== before?.stand) ignoreTaps();
-  if (cal.stand !== before?.stand || cal.state === "measuring") set({ error: null });
+  const view = viewOf(cal);
+  if (view !== get().view || stepOf(cal) !== stepOf(before)) ignoreTaps();
+  const measuring = cal.state === "measuring" || cal.lenses?.state === "measuring";
+  if (cal.stand !== before?.stand || cal.lenses?.lens !== before?.lenses?.lens || measuring) set({ error: null });
   set({ cal: Object.freeze(cal), view });
 }
+
+function viewOf({ state, made, lenses }) {
+  if (lenses && lenses.state !== "done") return "lenses";
+  if (state === "asking" || state === "measuring") return "wizard";
+  if (lenses && lenses.ended_at !== dismissedLenses) return "lens-result";
+  return made && made.id !== dismissed ? "done" : "overview";
+}
+
+const stepOf = (cal) => [cal?.state, cal?.stand, cal?.lenses?.state, cal?.lenses?.lens].join();
 
 async function loginState() {
   const { has_pin: hasPin, wait_s: wait } = await request("/api/technician");
@@ -154,10 +164,9 @@ const actions = {
     const { by, cal } = get();
     if (!by.trim() || cal.state === "starting") return;
     const form = event.target.elements;
-    const source = Number(form.source.value.replace(",", "."));
     const options = { by: by.trim() };
     if (form.serial.value.trim()) options.serial = form.serial.value.trim();
-    if (form.source.value.trim()) options.source_deg = Number.isFinite(source) ? source : form.source.value;
+    if (form.source.value.trim()) options.source_deg = numberOrText(form.source.value);
     submit("/api/calibration", options);
   },
 
@@ -166,6 +175,21 @@ const actions = {
     if (cal.state !== "asking") return;
     set({ mishap: "" });
     submit("/api/calibration/ready", { stand: cal.stand, ...(mishap && { mishap }) });
+  },
+
+  startLenses(event) {
+    event.preventDefault();
+    if (get().cal.state !== "idle") return;
+    const { vertex, eye } = event.target.elements;
+    const options = {};
+    if (vertex.value.trim()) options.vertex_mm = numberOrText(vertex.value);
+    if (eye.value.trim()) options.eye_dpt = numberOrText(eye.value);
+    submit("/api/calibration/trial-lenses", options);
+  },
+
+  lensReady() {
+    const { lenses } = get().cal;
+    if (lenses.state === "asking") submit("/api/calibration/trial-lenses/ready", { lens: lenses.lens });
   },
 
   cancel: () => submit("/api/calibration/cancel", {}),
@@ -179,11 +203,23 @@ const actions = {
     showCalibration(get().cal);
   },
 
+  dismissLenses() {
+    dismissedLenses = get().cal.lenses?.ended_at ?? "";
+    writeStorage("dismissed.lenses", dismissedLenses);
+    showCalibration(get().cal);
+  },
+
   setTheme(theme) {
     saveSetting("theme", theme);
     set({ theme });
   },
 };
+
+// Return the number, with a comma or a point; a text that is none is left for the server to refuse.
+function numberOrText(text) {
+  const value = Number(text.trim().replace(",", ".").replace("−", "-"));
+  return Number.isFinite(value) ? value : text;
+}
 
 // Report activity on touch, which extends the login; polling does not.
 function reportActivity() {
@@ -195,7 +231,7 @@ function reportActivity() {
 addEventListener("pointerdown", reportActivity);
 addEventListener("keydown", reportActivity);
 
-// ---- storage: theme and technician's name in localStorage; the dismissed result in sessionStorage
+// ---- storage: theme and technician's name in localStorage; the dismissed results in sessionStorage
 
 function saveSetting(key, value) {
   writeStorage(key, value, localStorage);

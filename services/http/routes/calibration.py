@@ -1,4 +1,4 @@
-"""Endpoints of the calibration of the head: state, live picture of the sensor, start, steps, choice."""
+"""Endpoints of the calibration of the head: state, live picture of the sensor, start, steps, choice, trial lenses."""
 
 from dataclasses import asdict
 from functools import lru_cache
@@ -11,11 +11,13 @@ from device.calibration.archive import Archive, StoredCalibration
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
 from device.errors import CalibrationError, HeadMismatch
 from device.head import fault_names, kind_of
+from device.optics.trial_lens import PowerVector
 from services.errors import Busy
 from services.http.authentication import IDLE_TIMEOUT_S, PinAuthenticator
 from services.http.dependencies import login_renewal, login_required
 from services.http.media import JpegResponse, file_responses, no_picture
 from services.http.problem_responses import error_text
+from services.http.routes.trial_lenses import trial_lens_answer
 from services.http.schemas.calibration import (
     ArchivedCalibration,
     CalibrationAnswer,
@@ -25,11 +27,16 @@ from services.http.schemas.calibration import (
     IntactCalibration,
     StepState,
     TargetReady,
+    TrialLensReady,
+    TrialLensStart,
 )
 from services.http.schemas.problems import ErrorText
 from services.instrument.calibration_request import STEPS_FOLDER, CalibrationRequest
-from services.instrument.calibration_session import STANDS, SessionState
-from services.instrument.head_arbiter import HeadArbiter
+from services.instrument.calibration_session import STANDS, CalibrationSession, SessionState
+from services.instrument.head_arbiter import HeadArbiter, HeadOwner
+from services.instrument.trial_lens_measurement import LensBench
+from services.instrument.trial_lens_session import TrialLensSession
+from services.instrument.trial_lens_state import TrialLensRequest
 
 MAX_LISTED = 8  # calibrations in the list of earlier ones
 STEP_FILES: dict[CalibrationTarget, str] = {"cap": "darks.npz", "screen": "flats.npz", "point": "point.npz"}
@@ -40,7 +47,8 @@ def calibration_router(arbiter: HeadArbiter, authenticator: PinAuthenticator) ->
     """Return the router of the calibration; every endpoint needs the login."""
     router = APIRouter()
     router.include_router(_read_router(arbiter), dependencies=[Depends(login_required(authenticator))])
-    router.include_router(_write_router(arbiter), dependencies=[Depends(login_renewal(authenticator))])
+    for part in (_write_router(arbiter), _trial_lens_router(arbiter)):
+        router.include_router(part, dependencies=[Depends(login_renewal(authenticator))])
     return router
 
 
@@ -61,7 +69,7 @@ def _read_router(arbiter: HeadArbiter) -> APIRouter:
         (counts), `X-Full` (share of saturated pixels). 204 if there is none within 2 s or no calibration runs.
         """
         wizard = arbiter.owner.session
-        frame = wizard.next_picture(after) if wizard is not None else None
+        frame = wizard.next_picture(after) if isinstance(wizard, CalibrationSession) else None
         if frame is None:
             return Response(status_code=204)
         age_ms = max(0, round((arbiter.context.clock.now_s() - frame.seen_s) * 1000))
@@ -91,14 +99,14 @@ def _write_router(arbiter: HeadArbiter) -> APIRouter:
     def ready(ready: TargetReady) -> CalibrationAnswer:
         """Confirm that the requested target is in place, and measure it; 409 if this target is not requested now."""
         wizard = arbiter.owner.session
-        if wizard is None:
+        if not isinstance(wizard, CalibrationSession):
             raise Busy("nothing is being calibrated", "Start the calibration first.")
         wizard.ready(ready.stand, ready.mishap)
         return calibration_state(arbiter)
 
     @router.post("/cancel")
     def cancel() -> CalibrationAnswer:
-        """Cancel the running calibration; its finished steps can be resumed for 12 hours."""
+        """Cancel the running calibration, or run with trial lenses; steps of the former can be resumed for 12 hours."""
         arbiter.stop_calibration()
         return calibration_state(arbiter)
 
@@ -111,11 +119,37 @@ def _write_router(arbiter: HeadArbiter) -> APIRouter:
     return router
 
 
+def _trial_lens_router(arbiter: HeadArbiter) -> APIRouter:
+    """Return the router of the endpoints that measure the head with trial lenses."""
+    router = APIRouter(prefix="/api/calibration/trial-lenses")
+
+    @router.post("")
+    def start_trial_lenses(start: TrialLensStart) -> CalibrationAnswer:
+        """Start a run with trial lenses before a trainer eye, for a head with a calibration in force.
+
+        Within the limits of the head a calibration with the offset is put in force, else nothing is changed. 409 while
+        a calibration is under way or the instrument starts, 423 without a valid calibration, 401 without a login.
+        """
+        arbiter.calibrate(TrialLensRequest(LensBench(start.vertex_mm, PowerVector(start.eye_dpt))))
+        return calibration_state(arbiter)
+
+    @router.post("/ready")
+    def trial_lens_ready(ready: TrialLensReady) -> CalibrationAnswer:
+        """Confirm that the requested lens is in place, and measure it; 409 if this lens is not requested now."""
+        run = arbiter.owner.session
+        if not isinstance(run, TrialLensSession):
+            raise Busy("no trial lenses are being measured", "Start the check with trial lenses first.")
+        run.ready(ready.lens)
+        return calibration_state(arbiter)
+
+    return router
+
+
 def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
     """Return the state of the calibration procedure, its errors and the archived calibrations."""
     spec, archive, owner = arbiter.context.spec, arbiter.context.archive, arbiter.owner
     problem = owner.problem
-    now = owner.session.snapshot() if owner.session is not None else SessionState(owner.idle_state)
+    now = _session_state(owner)
     kept = _listed(archive)
     return CalibrationAnswer(
         state=now.state,
@@ -125,6 +159,7 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
         needed=error_text(problem if isinstance(problem, CalibrationError | HeadMismatch) else None),
         steps=[_step(stand, now) for stand in STANDS],
         unfinished=[stand for stand, name in STEP_FILES.items() if (archive.root / STEPS_FOLDER / name).is_file()],
+        lenses=trial_lens_answer(owner),
         made=next((one for one in kept if one.id == owner.last_made_id), None),
         in_force=next((one for one in kept if one.in_force), None),
         kept=kept,
@@ -135,6 +170,13 @@ def calibration_state(arbiter: HeadArbiter) -> CalibrationAnswer:
         mishaps=list(fault_names()) if spec.camera.backend == "sim" else [],
         idle_s=IDLE_TIMEOUT_S,
     )
+
+
+def _session_state(owner: HeadOwner) -> SessionState:
+    """Return the state of the calibration run; without one `lenses` during a run with trial lenses, else idle."""
+    if isinstance(owner.session, CalibrationSession):
+        return owner.session.snapshot()
+    return SessionState(owner.idle_state if owner.session is None else "lenses")
 
 
 def _step(stand: CalibrationTarget, now: SessionState) -> StepState:
@@ -171,12 +213,15 @@ def _read(archive: Archive, id: str) -> IntactCalibration:
 def intact_calibration(stored: StoredCalibration) -> IntactCalibration:
     """Return origin and figures of a calibration that is not in force.
 
-    `psf_spread_px` is the effective number of pixels of the PSF: squared sum over sum of squares.
+    `psf_spread_px` is the effective number of pixels of the PSF: squared sum over sum of squares. `trial_offset_dpt` is
+    the offset of M by trial lenses.
     """
     calibration, made = stored.calibration, stored.provenance
-    psf = calibration.psfs[0].pixels
+    psf, off = calibration.psfs[0].pixels, calibration.refraction_offset
     numbers = dict(made.figures) | asdict(calibration.sensor)
     numbers |= {"psf_spread_px": float(psf.sum(dtype=np.float64) ** 2 / np.square(psf, dtype=np.float64).sum())}
+    if off is not None:
+        numbers |= {"trial_offset_dpt": off.m_dpt}
     return IntactCalibration(
         id=calibration.id, serial=made.serial, made_at=made.made_at, made_by=made.made_by, software=made.software,
         temperature_c=made.temperature_c, simulated=calibration.simulated, numbers=numbers, damaged=None,

@@ -7,6 +7,8 @@ from pydantic import Field
 from device.calibration.procedure.calibration_sequence import CalibrationTarget
 from services.http.schemas.common import KEY_PATTERN, RequestBody, ResponseBody, Timestamp
 from services.http.schemas.problems import ErrorText
+from services.http.schemas.status import FindingAnswer
+from services.instrument.trial_lens_measurement import VERTEX_MM
 
 
 class CalibrationStart(RequestBody):
@@ -28,6 +30,19 @@ class CalibrationChoice(RequestBody):
     """Request body: the id of the calibration to restore."""
 
     id: str = Field(pattern=KEY_PATTERN)
+
+
+class TrialLensStart(RequestBody):
+    """Request body: distance from lens to pupil in mm, and the correction that the trainer eye alone needs in dpt."""
+
+    vertex_mm: float = Field(default=VERTEX_MM, ge=0, le=30)
+    eye_dpt: float = Field(default=0.0, ge=-10, le=10)
+
+
+class TrialLensReady(RequestBody):
+    """Request body: number of the lens before the trainer eye, from 0."""
+
+    lens: int = Field(ge=0, le=20)
 
 
 class StepState(ResponseBody):
@@ -65,10 +80,54 @@ class IntactCalibration(ResponseBody):
 ArchivedCalibration = IntactCalibration | DamagedCalibration
 
 
+class LensPower(ResponseBody):
+    """Correcting lens as power vector, dpt: mean sphere (negative for myopia), J0 and J45."""
+
+    m_dpt: float
+    j0_dpt: float
+    j45_dpt: float
+
+
+class TrialLensRow(ResponseBody):
+    """One lens: its prescription, the correction that it should give (`nominal`), and the measured one with its sd.
+
+    `state`: `todo`, `now` or `done`. `off_line_dpt`: measured M minus the line of all readings; null before the fit.
+    """
+
+    sphere_dpt: float
+    cylinder_dpt: float
+    axis_deg: float
+    state: Literal["todo", "now", "done"]
+    nominal: LensPower
+    measured: LensPower | None
+    sd: LensPower | None
+    off_line_dpt: float | None
+
+
+class TrialLensAnswer(ResponseBody):
+    """Run with trial lenses: `begin`, `asking` (for number `lens`), `measuring`, or `done` at `ended_at`.
+
+    `error`: why the last measurement, or the head, was refused. `findings` and `offset`: of a finished run whose
+    readings determine them. `stored_id`: calibration with the offset, in force since then; null if nothing was changed.
+    """
+
+    state: Literal["begin", "asking", "measuring", "done"]
+    lens: int | None
+    vertex_mm: float
+    eye_dpt: float
+    rows: list[TrialLensRow]
+    findings: list[FindingAnswer]
+    offset: LensPower | None
+    error: ErrorText | None
+    stored_id: str | None
+    ended_at: Timestamp | None
+
+
 class CalibrationAnswer(ResponseBody):
     """State of the calibration procedure, its errors, and the archived calibrations.
 
-    `state`: `starting`, `idle`, `begin`, `asking` (for the target `stand`) or `measuring`. `progress`: 0 to 1, or null.
+    `state`: `starting`, `idle`, `begin`, `asking` (for the target `stand`) or `measuring`; `lenses` during a run with
+    trial lenses, which is described by `lenses`, as is the last run if it was one. `progress`: 0 to 1, or null.
     `error`: last error of the procedure. `needed`: error because of which a calibration is required. `unfinished`:
     targets whose measurement can be resumed. `made`: calibration of the last run; `kept`: the newest calibrations and
     the one in force. `mishaps`: faults that can be injected into a simulated head. `white_dn`: counts of a saturated
@@ -82,6 +141,7 @@ class CalibrationAnswer(ResponseBody):
     needed: ErrorText | None
     steps: list[StepState]
     unfinished: list[CalibrationTarget]
+    lenses: TrialLensAnswer | None
     made: ArchivedCalibration | None
     in_force: ArchivedCalibration | None
     kept: list[ArchivedCalibration]
