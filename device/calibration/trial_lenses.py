@@ -185,7 +185,8 @@ def _judged(fit: TrialLensFit, line: _Line, readings: Sequence[LensReading]) -> 
         "point source was out of focus: calibrate the head again."
     )
     oblique = "Put eye and lenses upright and on the axis; then the calibration's point source: calibrate again."
-    slope = "Measure and give the distance from lens to pupil. If it is right, use calibrate --dioptres."
+    slope = "The scale per dioptre of the head is wrong: calibrate it with `calibrate --dioptres`."
+    distance = f"It is that of {lens}: measure its distance from the pupil, and show it again."
     turned = (
         "Turn the cylinder to the axis that is asked for, handle as the examiner sees it. If it is, the picture is "
         "turned or mirrored: look at `upright` in the head file."
@@ -194,7 +195,7 @@ def _judged(fit: TrialLensFit, line: _Line, readings: Sequence[LensReading]) -> 
     rows = (
         ("offset_sd", max(off.m_sd_dpt, off.j0_sd_dpt, off.j45_sd_dpt), MOST_OFFSET_SD_DPT, "dpt", again),
         ("slope_sd", fit.slope_sd, MOST_SLOPE_SD, "share", again),
-        ("line", fit.residuals_dpt[worst], residual_limit, "dpt", f"It is that of {lens}: show this lens again."),
+        ("line", fit.residuals_dpt[worst], residual_limit, "dpt", distance),
         ("slope", fit.slope - 1, MOST_SLOPE_ERROR, "share", slope),
         ("offset", off.m_dpt, MOST_OFFSET_DPT, "dpt", focus),
         ("offset_j0", off.j0_dpt, MOST_CYLINDER_OFFSET_DPT, "dpt", oblique),
