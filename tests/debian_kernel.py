@@ -40,7 +40,7 @@ DEVICES = {
     "dma_heap": "DMABUF_HEAPS_SYSTEM", "gpiochip": "GPIO_CDEV", "i2c": "I2C_CHARDEV", "media": "MEDIA_CONTROLLER",
     "spi": "SPI_SPIDEV", "video4linux": "VIDEO_DEV",
 }  # fmt: skip
-MODULES = {"i2c-dev": "I2C_CHARDEV", "spidev": "SPI_SPIDEV"}
+MODULES = {"i2c-dev": "I2C_CHARDEV", "spidev": "SPI_SPIDEV", "videodev": "VIDEO_DEV"}
 
 # Debian's kernel of that processor lacks them, and the card runs without: only libcamera opens dma_heap.
 LACKS = {"amd64": set[str](), "arm64": {"DMABUF_HEAPS_SYSTEM"}}

@@ -4,8 +4,9 @@ They are copied by hand: where a newer release differs, change the fact and its 
 """
 
 # Options of the kernel of a Raspberry Pi 5, "y" built in, "m" a module: raspberrypi/linux,
-# arch/arm64/configs/bcm2712_defconfig at commit 00527380ab0ac773d616d1056901948303b332cb. SQUASHFS_ZLIB is not in that
-# file: fs/squashfs/Kconfig, default y.
+# arch/arm64/configs/bcm2712_defconfig at commit 00527380ab0ac773d616d1056901948303b332cb.
+# Not in that file: SQUASHFS_ZLIB (fs/squashfs/Kconfig, default y), VIDEO_DEV (drivers/media/Kconfig, default
+# MEDIA_SUPPORT, which is m).
 KERNEL = {
     "ARM64_16K_PAGES": "y", "BCM2835_WDT": "y", "BLK_DEV_LOOP": "y", "DMABUF_HEAPS_CMA": "y",
     "DMABUF_HEAPS_SYSTEM": "y",
@@ -13,15 +14,15 @@ KERNEL = {
     "MMC_SDHCI": "y", "OVERLAY_FS": "m", "RASPBERRYPI_FIRMWARE": "y", "SENSORS_RASPBERRYPI_HWMON": "m",
     "SPI_DW_MMIO": "m",
     "SPI_SPIDEV": "m", "SQUASHFS": "m", "SQUASHFS_LZO": "y", "SQUASHFS_XATTR": "y", "SQUASHFS_XZ": "y",
-    "SQUASHFS_ZLIB": "y", "SQUASHFS_ZSTD": "y", "VFAT_FS": "y", "VIDEO_IMX296": "m", "VIDEO_IMX477": "m",
-    "VIDEO_RASPBERRYPI_PISP_BE": "m", "VIDEO_RP1_CFE": "m", "VIDEO_VIVID": "m",
+    "SQUASHFS_ZLIB": "y", "SQUASHFS_ZSTD": "y", "VFAT_FS": "y", "VIDEO_DEV": "m", "VIDEO_IMX296": "m",
+    "VIDEO_IMX477": "m", "VIDEO_RASPBERRYPI_PISP_BE": "m", "VIDEO_RP1_CFE": "m", "VIDEO_VIVID": "m",
 }  # fmt: skip
 
 # The same file, which names neither; asked for in raspberrypi/linux issues 2006 and 2194, which were closed.
 KERNEL_LACKS = ("SQUASHFS_LZ4", "I2C_STUB")
 
 # Module of an option of KERNEL, where a device node depends on it.
-MODULES = {"I2C_CHARDEV": "i2c-dev", "SPI_SPIDEV": "spidev"}
+MODULES = {"I2C_CHARDEV": "i2c-dev", "SPI_SPIDEV": "spidev", "VIDEO_DEV": "videodev"}
 
 # raspberrypi/libcamera v0.7.1+rpt20260429 (26bfadc66e8d7f727a993fe58174217b8a96f7f9), src/ipa/rpi/pisp/data/NAME.json,
 # rpi.black_level, on a scale of 16 bits. A sensor without an entry is not in src/ipa/rpi/cam_helper there.

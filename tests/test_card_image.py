@@ -5,7 +5,9 @@ No Raspberry Pi and no package archive is needed; checks with the real programs 
 """
 
 import configparser
+import os
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -73,6 +75,23 @@ def test_first_boot_may_take_longer_than_the_default_timeout_of_a_device() -> No
     """/data appears only when systemd-repart has made it."""
     [row] = [line.split() for line in text("systemd/image/fstab").splitlines() if line.startswith("LABEL=data ")]
     assert "x-systemd.device-timeout=5min" in row[3].split(",")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts need root")
+@pytest.mark.parametrize("is_busy", [False, True])
+def test_unfinished_root_is_not_removed_through_a_mount(tmp_path: Path, is_busy: bool) -> None:
+    """An interrupted build leaves mounts; here a folder is mounted in a mount namespace, and a process may be in it."""
+    machine, root = tmp_path / "machine", tmp_path / "a root"
+    for folder in (machine, root / "dev"):
+        folder.mkdir(parents=True)
+    (machine / "null").touch()
+    body = 'mount --bind "$1" "$2/dev"; [ "$3" = no ] || cd "$2/dev"; exec "$0" "$2"'
+    words = ["sh", "-ec", body, ROOT / "systemd/image/discard", machine, root, "yes" if is_busy else "no"]
+    done = subprocess.run(["unshare", "--mount", *words], capture_output=True, text=True, check=False)
+    assert (machine / "null").exists()
+    assert root.exists() is is_busy
+    assert ("still mounted" in done.stderr) is is_busy, done.stderr
+    assert done.returncode == is_busy
 
 
 def test_layer_hooks_name_existing_scripts_and_variables() -> None:
@@ -148,6 +167,7 @@ def test_every_file_beside_the_recipe_is_installed() -> None:
         "README.md",
         "base",
         "bundle",
+        "discard",
         "install",
         "keys",
         "release",
