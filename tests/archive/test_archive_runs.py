@@ -110,7 +110,7 @@ def test_a_killed_worker_and_a_killed_run_leave_the_same_bytes(
 
 @pytest.fixture
 def scheduler(environment: dict[str, str], tmp_path: Path) -> Iterator[tuple[str, "subprocess.Popen[bytes]"]]:
-    """Address and process of a Dask scheduler with one worker, as on a cluster."""
+    """Address and process of a Dask scheduler with one worker in another folder, as on a cluster."""
     python, file = str(Path(COMMAND).parent / "dask"), tmp_path / "scheduler.json"
     words = [python, "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0", "--scheduler-file"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
@@ -120,7 +120,8 @@ def scheduler(environment: dict[str, str], tmp_path: Path) -> Iterator[tuple[str
             assert time.monotonic() < end
             time.sleep(0.1)
         worker = [python, "worker", "--scheduler-file", str(file), "--nthreads", "1", "--dashboard-address", ":0"]
-        with subprocess.Popen(worker, **quiet) as other:  # type: ignore[call-overload]
+        (tmp_path / "worker").mkdir()
+        with subprocess.Popen(worker, cwd=tmp_path / "worker", **quiet) as other:  # type: ignore[call-overload]
             yield json.loads(file.read_text())["address"], process
             other.terminate()
         process.terminate()
@@ -134,8 +135,8 @@ def test_a_lost_scheduler_ends_the_run_with_a_message_and_another_run_resumes(
     tmp_path: Path,
 ) -> None:
     out, (address, process) = tmp_path / "out", scheduler
-    command = [COMMAND, "archive", "run", str(whole[0]), "-o", str(out), "--scheduler", address]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as run:
+    command = [COMMAND, "archive", "run", str(whole[0]), "-o", out.name, "--scheduler", address]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as run:
         wait_for_results(out, 3)
         process.kill()
         error = run.communicate(timeout=60)[1]

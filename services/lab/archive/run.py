@@ -43,6 +43,7 @@ def run_plan(
         raise SettingError(
             f"the plan was made with other versions than those of this machine: {found}", "Make a new plan."
         )
+    root = root.absolute()  # workers have other working directories
     results = ResultFolder(root)
     write_or_raise(root, lambda: atomic_io.make_folder(root))
     try:
@@ -72,6 +73,7 @@ def _run(
             computing = _Computing(plan, results, len(names), clock, progress)
             for outcome in cluster.outcomes(client, plan, names, results.root):
                 computing.take(outcome)
+            computing.require_results()
     done = sum(results.has(one.result) for one in captures)
     path = results.root / TABLE
     write_or_raise(path, lambda: write_table(plan, results))
@@ -88,11 +90,13 @@ class _Computing:
         self._results, self._count, self._clock, self._progress = results, count, clock, progress
         self._begin_s = self._shown_s = clock.now_s()
         self._ended = self._failed = 0
+        self._stored: list[str] = []
 
     def take(self, outcome: Outcome) -> None:
         """Record the end of a task; DiffuscopeError if its whole source is gone."""
         failure = outcome.failure
         if failure is None:
+            self._stored.append(outcome.name)
             self._results.release(outcome.name)
         else:
             self._quarantine(failure)
@@ -104,6 +108,14 @@ class _Computing:
             self._progress(
                 f"{self._ended}/{self._count} done, {self._failed} in quarantine, {60 / max(each_s, 1e-9):.0f} "
                 f"captures/min, {each_s * (self._count - self._ended):.0f} s left"
+            )
+
+    def require_results(self) -> None:
+        """Raise DiffuscopeError if workers have stored results and none of them is here."""
+        if self._stored and not any(map(self._results.has, self._stored)):
+            raise DiffuscopeError(
+                f"the workers stored {len(self._stored)} results, but none is in {self._results.root}",
+                "Give a folder that has this path on every machine, on a disk that all of them share.",
             )
 
     def _quarantine(self, failure: Quarantined) -> None:
