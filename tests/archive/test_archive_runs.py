@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import numpy as np
@@ -113,15 +114,15 @@ def scheduler(environment: dict[str, str], tmp_path: Path) -> Iterator[tuple[str
     """Address and process of a Dask scheduler with one worker in another folder, as on a cluster."""
     python, file = str(Path(COMMAND).parent / "dask"), tmp_path / "scheduler.json"
     words = [python, "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", ":0", "--scheduler-file"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
-    with subprocess.Popen([*words, str(file)], **quiet) as process:  # type: ignore[call-overload]
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    with subprocess.Popen([*words, str(file)], **quiet) as process:
         end = time.monotonic() + 30
         while not file.is_file():
             assert time.monotonic() < end
             time.sleep(0.1)
         worker = [python, "worker", "--scheduler-file", str(file), "--nthreads", "1", "--dashboard-address", ":0"]
         (tmp_path / "worker").mkdir()
-        with subprocess.Popen(worker, cwd=tmp_path / "worker", **quiet) as other:  # type: ignore[call-overload]
+        with subprocess.Popen(worker, cwd=tmp_path / "worker", **quiet) as other:
             yield json.loads(file.read_text())["address"], process
             other.terminate()
         process.terminate()
@@ -216,7 +217,9 @@ def test_a_worker_that_outlives_a_plan_takes_the_settings_of_the_next_one(
             calibrations.add(calibration.digest, files)
             solvers = Solvers(calibrations)
         solvers.solve(Task(first, calibration, plan.settings, plan.software), results, "worker")
-        rounds.append(results.read(first.result).report["report"]["rounds"])  # type: ignore[index, call-overload]
+        report = results.read(first.result).report["report"]
+        assert isinstance(report, dict)
+        rounds.append(report["rounds"])
     assert rounds == [3, 1]
 
 

@@ -90,9 +90,8 @@ class CropRefinement:
                 covariance = model.covariance(fit.derivatives)
             if is_cropped and done == 0:
                 by_noise = self._score_of_noise(fit)
-                by_noise[1:] = (
-                    0  # small by symmetry (at most 0.3 sd of J0 on four frames); the draws would mostly scatter
-                )
+                # Of J0 and J45 it is small by symmetry (0.3 sd on four frames), and draws would mostly scatter.
+                by_noise[1:] = 0
             bias_dpt = covariance @ (without_noise + by_noise)
             step = covariance @ fit.score - bias_dpt
             if done >= FULL_STEPS:

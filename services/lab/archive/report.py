@@ -269,14 +269,14 @@ def _frames(columns: Columns) -> str:
 
 def _causes(columns: Columns) -> str:
     """Return messages and reasons with the number of their captures, and the ids of the first ones."""
-    ids, kinds = columns.words("id"), {"quarantine": "quarantine", "left out": "left out", "waiting": "not computed"}
+    ids = columns.words("id")
     found: dict[tuple[str, str], list[str]] = defaultdict(list)
     for id, many in zip(ids, columns.values("messages"), strict=True):
         for one in many if isinstance(many, list) else ():
             found["message", str(one)].append(id)
     for id, state, reason in zip(ids, columns.words("state"), columns.words("reason"), strict=True):
         if reason:
-            found[kinds.get(state, state), reason].append(id)
+            found[state, reason].append(id)
     ordered = sorted(found.items(), key=lambda one: -len(one[1]))[:40]
     rows = [[kind, words, str(len(some)), ", ".join(some[:NAMED])] for (kind, words), some in ordered]
     head = ("kind", "words", "captures", f"the first {NAMED}")
