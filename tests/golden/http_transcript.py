@@ -212,17 +212,17 @@ def _backups(log: Transcript) -> None:
     for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
         log.ask(operation)
     log.ask("POST /api/technician/lock")
-    log.ask(f"GET {at}", note="nobody is logged in")
+    log.ask(f"GET {at}", note="no technician is logged in")
     for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
-        log.ask(operation, note="nobody is logged in")
+        log.ask(operation, note="no technician is logged in")
 
 
 def _diary(log: Transcript) -> None:
     paths = ("/api/technician/diary", "/api/technician/diary.txt")
     for path in paths:
-        log.ask(f"GET {path}", note="nobody is logged in")
+        log.ask(f"GET {path}", note="no technician is logged in")
     export = "POST /api/technician/diary/export"
-    log.ask(export, json={"folder": str(log.instrument.stick)}, note="nobody is logged in")
+    log.ask(export, json={"folder": str(log.instrument.stick)}, note="no technician is logged in")
     log.ask("POST /api/technician/pin", json=PIN)
     for path in paths:
         log.ask(f"GET {path}")
@@ -252,9 +252,9 @@ def technician() -> list[dict[str, Any]]:
         log.ask("GET /api/technician")
         log.ask("POST /api/technician/here")
         log.ask("POST /api/technician/lock")
-        log.ask("POST /api/technician/lock", note="nobody is logged in")
-        log.ask("POST /api/technician/here", note="nobody is logged in")
-        log.ask("POST /api/technician/pin", json={"pin": "1111"}, note="nobody is logged in, and there is a PIN")
+        log.ask("POST /api/technician/lock", note="no technician is logged in")
+        log.ask("POST /api/technician/here", note="no technician is logged in")
+        log.ask("POST /api/technician/pin", json={"pin": "1111"}, note="no technician is logged in, and there is a PIN")
         log.ask("POST /api/technician/unlock", json={"pin": "1111"})
         log.ask("POST /api/technician/unlock", json=PIN, note="too soon after a wrong PIN")
         log.ask("POST /api/technician/unlock", json={"pin": "1" * 41})
@@ -274,11 +274,11 @@ def calibration() -> list[dict[str, Any]]:
         log.ask("POST /api/captures", json={"eye": "OD"}, note="without a calibration")
         locked = {"": {"by": "Eve"}, "/ready": {"stand": "cap"}, "/cancel": {}, "/use": {"id": "0" * 16}}
         for path, body in locked.items():
-            log.ask(f"POST /api/calibration{path}", json=body, note="nobody is logged in")
+            log.ask(f"POST /api/calibration{path}", json=body, note="no technician is logged in")
         for path, body in {"": {}, "/ready": {"lens": 0}}.items():
-            log.ask(f"POST {LENSES}{path}", json=body, note="nobody is logged in")
+            log.ask(f"POST {LENSES}{path}", json=body, note="no technician is logged in")
         for path in ("", "/preview"):
-            log.ask(f"GET /api/calibration{path}", note="nobody is logged in")
+            log.ask(f"GET /api/calibration{path}", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
         log.ask("GET /api/calibration")
         log.ask("GET /api/calibration/preview", note="nothing is being calibrated")
@@ -359,10 +359,12 @@ def updates() -> list[dict[str, Any]]:
         for call, body in {"GET ": None, "POST /check": None, "POST /restart": None}.items():
             method, path = call.split(" ")
             log.ask(
-                f"{method} /api/update{path}", note="nobody is logged in", **({} if body is None else {"json": body})
+                f"{method} /api/update{path}",
+                note="no technician is logged in",
+                **({} if body is None else {"json": body}),
             )
-        log.ask("POST /api/update/install", json={"id": "0" * 16}, note="nobody is logged in")
-        log.ask("PUT /api/update/file", content=b"x", note="nobody is logged in")
+        log.ask("POST /api/update/install", json={"id": "0" * 16}, note="no technician is logged in")
+        log.ask("PUT /api/update/file", content=b"x", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
         log.ask("GET /api/update")
         device.board.bundle("two.raucb", padding_bytes=1000)
@@ -435,10 +437,10 @@ def explorer() -> list[dict[str, Any]]:
         made = log.ask("POST /api/captures", json={"eye": "OD"})["id"]
         log.exchanges.clear()
         again, at = "GET /api/technician/captures/{id}/again.png", f"/api/technician/captures/{made}/again.png"
-        log.ask("GET /api/technician/explorer", note="nobody is logged in")
-        log.ask("POST /api/technician/explorer", note="nobody is logged in")
-        log.ask("PUT /api/technician/pace", json={"pace": "best"}, note="nobody is logged in")
-        log.ask(again, f"{at}?method=gradient", note="nobody is logged in")
+        log.ask("GET /api/technician/explorer", note="no technician is logged in")
+        log.ask("POST /api/technician/explorer", note="no technician is logged in")
+        log.ask("PUT /api/technician/pace", json={"pace": "best"}, note="no technician is logged in")
+        log.ask(again, f"{at}?method=gradient", note="no technician is logged in")
         log.ask("POST /api/technician/pin", json=PIN)
         log.ask("GET /api/technician/explorer")
         log.ask("PUT /api/technician/pace", json={"pace": "best"})

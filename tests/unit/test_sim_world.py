@@ -202,6 +202,41 @@ def test_faults_raise_their_errors():
     assert camera.expose(ExposureSettings(0.1)).number == 1
 
 
+class SleepHooked(VirtualClock):
+    """Virtual clock that calls `during` in each sleep, and takes 10 ms whenever it is read."""
+
+    during = staticmethod(lambda: None)
+
+    def now_s(self):
+        self.elapsed_s += 0.01
+        return super().now_s()
+
+    def sleep(self, duration_s):
+        self.during()
+        super().sleep(duration_s)
+
+
+def test_what_a_frame_computes_falls_within_its_exposure():
+    world = World(small_head(), clock := SleepHooked())
+    camera = SimCamera(world)
+    begin_s = clock.elapsed_s
+    camera.expose(ExposureSettings(0.1))
+    assert clock.elapsed_s - begin_s == pytest.approx(0.11)  # and the first reading of the clock
+
+
+def test_a_lamp_that_goes_out_during_an_exposure_leaves_a_dark_frame():
+    world = World(small_head(), clock := SleepHooked())
+    camera, light = SimCamera(world), SimLight(world)
+    shot = ExposureSettings(0.1)
+    dark = camera.expose(shot).counts.mean()
+    with light.on(Illumination("green")):
+        assert camera.expose(shot).counts.mean() > 2 * dark
+        clock.during = lambda: setattr(world, "illumination", None)
+        frame = camera.expose(shot)
+    assert frame.illumination is None
+    assert frame.counts.mean() == pytest.approx(dark, abs=0.5)  # dark current and read noise only: counts
+
+
 def test_a_lamp_that_breaks_before_the_context_begins_stays_dark():
     world = World(small_head(), VirtualClock())
     light = SimLight(world)

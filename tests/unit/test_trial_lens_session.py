@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from copy import copy
+from functools import partial
 from pathlib import Path
 from threading import Event
 
@@ -102,6 +103,10 @@ class Run:
         assert not self.done.is_set(), self.outcomes
         return self.now
 
+    def has_asked_again(self, error: DiffuscopeError) -> bool:
+        """Return whether the last measurement failed with this error, and its lens is asked for."""
+        return self.now.error is error and self.now.state == "asking"
+
     def show(self, *lenses: int) -> None:
         for lens in lenses:
             self.asked(lens)
@@ -187,7 +192,7 @@ def test_a_failed_measurement_is_reported_and_the_same_lens_is_asked_for_again(b
     for error in (CalibrationRefused("no vessels"), CameraMissing("unplugged")):
         run.checks[0].failing.append(error)
         run.session.ready(1)
-        until(lambda error=error: run.now.error is error and run.now.state == "asking")  # type: ignore[misc]
+        until(partial(run.has_asked_again, error))
         assert (run.now.lens, len(run.now.readings)) == (1, 1)
     run.session.ready(1)
     assert run.asked(2).error is None
