@@ -10,7 +10,7 @@ export OPENBLAS_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
+.PHONY: help run pi gate test test-faults test-browser test-paper test-hard test-systemd test-appliance test-arm64 test-boot test-other test-golden test-exam test-light test-archive test-mutants bundle browser buses strace lint release bench bench-archive bench-attacks bench-data bench-frames bench-kills bench-store bench-montage bench-psf bench-retinas bench-refraction bench-sides bench-wifi bench-page bench-peers parts part-pictures test-parts site test-site lock clean
 
 help: ## List the make targets.
 	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/make \1\t\2/p' Makefile | expand -t 20
@@ -93,7 +93,7 @@ gate: $(GATE_ROOT)/ready ## Check schematic (ERC) and boards (DRC) of gate and r
 JOURNEYS := tests/browser/test_page.py
 # What takes minutes of pure computing or kills processes; the rest is `make test`, which should stay below nine minutes.
 FAULTS := tests/hard tests/physics tests/property
-NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive
+NOT_HERE := not bench and not rig and not systemd and not paper and not site and not archive and not boot
 # Many tests wait for a clock, a process or a browser: three workers keep two cores busy.
 WORKERS := -n 3 --dist loadfile
 # A test of the page waits for the page's debounce, for fades and for the browser's start.
@@ -159,6 +159,11 @@ bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORM
 test-appliance: .venv/ready ## Update a device from version to version, with real RAUC and a real systemd; needs root.
 	@systemd/image/install
 	@$(BIN)/python -m pytest tests/appliance -rP
+
+# The card's processor is arm64; ARCH=amd64 shows the same root without the buses of the device tree.
+test-boot: .venv/ready ## Boot the card in QEMU: page, device nodes, power cuts, update, rollback; as root, half an hour, not in CI.
+	@tests/boot/install $(or $(ARCH),arm64)
+	@ARCH=$(or $(ARCH),arm64) $(BIN)/python -m pytest -x -rP tests/boot
 
 test-arm64: .venv/ready ## Run the solver's tests on an emulated 64-bit ARM, as root; half an hour, not in CI.
 	@tests/arm64/run
