@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from device.config.head_file import load_head
+from services.identity.apply_settings import OUTPUT
 from services.identity.certificates import ACCESS_POINT_ADDRESS, NETWORKS, SHARED_HOST_NAME
 from tests.project_files import ROOT, text
 
@@ -30,6 +31,7 @@ PROGRAMS = {
     "ssh-keygen": ("openssh-server", "services/identity/apply_settings.py"),
     "NetworkManager": ("network-manager", "services/identity/apply_settings.py"),
     "rpi-fw-crypto": ("rpifwcrypto", f"{CARD}/luks/diffuscope-key.service"),
+    "iw": ("iw", "systemd/diffuscope-country.service"),
     "unsquashfs": ("squashfs-tools", "systemd/diffuscope-wish.service"),
 }
 RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
@@ -174,6 +176,17 @@ def test_access_point_is_off_and_has_no_shared_password() -> None:
     assert profile["wifi-security"]["key-mgmt"] == "wpa-psk"
     assert profile["connection"]["autoconnect"] == "false", "the page has no sign-in yet"
     assert profile["ipv4"]["address1"] == f"{ACCESS_POINT_ADDRESS}/{NETWORKS[0].prefixlen}"
+
+
+def test_country_of_the_settings_is_set_when_the_radio_appears() -> None:
+    unit = configparser.ConfigParser(interpolation=None, delimiters="=", strict=False)
+    unit.read_string(text("systemd/diffuscope-country.service"))
+    written = f"/{OUTPUT}/country.env"
+    assert unit["Unit"]["ConditionPathExists"] == unit["Service"]["EnvironmentFile"] == written
+    assert unit["Unit"]["After"] == "diffuscope-identity.service", "which writes it"
+    [rule] = [line for line in text("systemd/image/devices.rules").splitlines() if '"ieee80211"' in line]
+    assert 'TAG+="systemd", ENV{SYSTEMD_WANTS}+="diffuscope-country.service"' in rule
+    assert "cfg80211.ieee80211_regdom=IN" in text(f"{CARD}/cmdline.txt").split(), "without the key"
 
 
 def test_avahi_host_name_is_in_the_certificate() -> None:
