@@ -154,6 +154,7 @@ def test_make_pi_gives_the_environment_the_camera_of_raspberry_pi_os(tmp_path: P
     [site] = venv.glob("lib/python3.*/site-packages")
     assert (site / "debian.pth").read_text() == "/usr/lib/python3/dist-packages\n"
     assert "python3-picamera2 python3-libcamera" in log.read_text()
+    assert "\nmake pi " in text("systemd/README.md"), "the installation without a card"
     assert sorted(config.read_text().split()) == ["dtparam=i2c_arm=on", "dtparam=spi=on", "dtparam=strict_gpiod"]
 
 
