@@ -40,6 +40,6 @@ IMX708_LOWEST_GAIN = 1024 / (1024 - 112)
 GROUPS = {"spidev": "spi", "i2c-dev": "i2c", "gpio": "gpio", "dma_heap": "video"}
 DEBIAN_GROUPS = {"video4linux": "video", "media": "video"}
 
-# Raspberry Pi documentation, "Real Time Clock (RTC)", "Enable battery charging": the cell at J5 is charged only with this
-# parameter, in microvolts; Raspberry Pi's own cell (ML2020) takes 3.0 V.
+# Raspberry Pi documentation, "Real Time Clock (RTC)", "Enable battery charging": rtc_bbat_vchg in microvolts, without
+# which the cell at J5 is not charged.
 CLOCK_CELL_UV = 3_000_000

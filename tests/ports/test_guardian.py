@@ -105,7 +105,7 @@ def light_up(chain):
 
 
 def test_the_blanker_of_a_boot_waits_for_its_bus(sound_wires):
-    """Defect 7: with --insist it tries again while the bus fails; without, one failure ends it and the LEDs stay lit."""
+    """Defect 7: with --insist it tries again while the bus fails; without, it ends and the LEDs stay lit."""
     chain = ChainSpec()
     light_up(chain)
     emulated_buses().set_faults("spi.cut")
