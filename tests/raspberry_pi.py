@@ -39,3 +39,7 @@ IMX708_LOWEST_GAIN = 1024 / (1024 - 112)
 # name groups of video4linux and media only.
 GROUPS = {"spidev": "spi", "i2c-dev": "i2c", "gpio": "gpio", "dma_heap": "video"}
 DEBIAN_GROUPS = {"video4linux": "video", "media": "video"}
+
+# Raspberry Pi documentation, "Real Time Clock (RTC)", "Enable battery charging": rtc_bbat_vchg in microvolts, without
+# which the cell at J5 is not charged.
+CLOCK_CELL_UV = 3_000_000

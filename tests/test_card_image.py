@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from device.config.head_file import load_head
+from services.identity.apply_settings import OUTPUT
 from services.identity.certificates import ACCESS_POINT_ADDRESS, NETWORKS, SHARED_HOST_NAME
 from tests.project_files import ROOT, text
 
@@ -24,6 +25,15 @@ THEIRS = {
     "rpi5", "image-base", "debian-trixie-arm64-multi", "rpi-debian-trixie", "rpi-essential-base", "systemd-min",
     "network-manager",
 }  # fmt: skip
+# Package of a program that is called on the card, and the file that calls it.
+PROGRAMS = {
+    "qrencode": ("qrencode", "services/identity/apply_at_boot.py"),
+    "ssh-keygen": ("openssh-server", "services/identity/apply_settings.py"),
+    "NetworkManager": ("network-manager", "services/identity/apply_settings.py"),
+    "rpi-fw-crypto": ("rpifwcrypto", f"{CARD}/luks/diffuscope-key.service"),
+    "iw": ("iw", "systemd/diffuscope-country.service"),
+    "unsquashfs": ("squashfs-tools", "systemd/diffuscope-wish.service"),
+}
 RULES = r"bool|dir|file|string(-or-empty)?|size|int(:\d+-\d+)?|regex:.+|keywords:[\w,-]+|list:[\w,-]+|[\w-]+(,[\w-]+)+"
 
 
@@ -69,6 +79,30 @@ def test_boot_that_fails_before_the_health_check_restarts() -> None:
     unit.read_string(text("systemd/image/emergency.conf"))
     assert unit["Service"]["ExecStart"].endswith("systemctl --force reboot'")
     assert "emergency.conf etc/systemd/system/emergency.service.d/" in text("systemd/image/release")
+
+
+def test_programs_that_a_boot_calls_are_packages_of_the_card() -> None:
+    """Defect 2: without qrencode and sshd the label and the only login are missing, and nothing fails."""
+    packages = {*yaml.safe_load(text(f"{CARD}/layer/diffuscope.yaml"))["mmdebstrap"]["packages"], *THEIRS}
+    for program, (package, caller) in PROGRAMS.items():
+        assert program in text(caller), caller
+        assert package in packages, program
+
+
+def test_what_the_volatile_root_would_forget_is_on_the_data_partition() -> None:
+    """Defects 9 and 16: networks, upload settings and the last known time were lost at every boot."""
+    rows = [line.split() for line in text("systemd/image/fstab").splitlines() if line.startswith("/data/")]
+    bound = {target: source for source, target, *_ in rows}
+    assert bound["/etc/NetworkManager/system-connections"] == "/data/network"
+    assert bound["/var/lib/systemd/timesync"] == "/data/timesync"
+    assert all("bind" in row[3].split(",") for row in rows)
+    made = re.findall(r"^MakeDirectories=(.*)", text("systemd/image/repart.conf"), re.M)[0].split()
+    assert {source.removeprefix("/data") for source in bound.values()} <= set(made)
+    places = re.findall(r'^mkdir -p "\$root"/{(.*)}', text("systemd/image/release"), re.M)[0].split(",")
+    assert {target.removeprefix("/") for target in bound} <= set(places), "a bind mount needs its folder"
+    links = re.findall(r"^L (\S+) .* (\S+)$", text("systemd/image/send.tmpfiles"), re.M)
+    names = "send.env", "send.toml", "send.token", "send.crt"
+    assert links == [(f"/etc/diffuscope/{name}", f"/data/send/{name}") for name in names]
 
 
 def test_first_boot_may_take_longer_than_the_default_timeout_of_a_device() -> None:
@@ -142,6 +176,17 @@ def test_access_point_is_off_and_has_no_shared_password() -> None:
     assert profile["wifi-security"]["key-mgmt"] == "wpa-psk"
     assert profile["connection"]["autoconnect"] == "false", "the page has no sign-in yet"
     assert profile["ipv4"]["address1"] == f"{ACCESS_POINT_ADDRESS}/{NETWORKS[0].prefixlen}"
+
+
+def test_country_of_the_settings_is_set_when_the_radio_appears() -> None:
+    unit = configparser.ConfigParser(interpolation=None, delimiters="=", strict=False)
+    unit.read_string(text("systemd/diffuscope-country.service"))
+    written = f"/{OUTPUT}/country.env"
+    assert unit["Unit"]["ConditionPathExists"] == unit["Service"]["EnvironmentFile"] == written
+    assert unit["Unit"]["After"] == "diffuscope-identity.service", "which writes it"
+    [rule] = [line for line in text("systemd/image/devices.rules").splitlines() if '"ieee80211"' in line]
+    assert 'TAG+="systemd", ENV{SYSTEMD_WANTS}+="diffuscope-country.service"' in rule
+    assert "cfg80211.ieee80211_regdom=IN" in text(f"{CARD}/cmdline.txt").split(), "without the key"
 
 
 def test_avahi_host_name_is_in_the_certificate() -> None:

@@ -68,23 +68,31 @@ def is_name(dotted: str) -> bool:
     return False
 
 
+def is_test(file: str, name: str) -> bool:
+    """Return whether a file of the repository has the test."""
+    return file in places() and f"\ndef {name}(" in text(file)
+
+
 def missing_names(markdown: str) -> list[str]:
-    """Return the modules and files in code spans that the repository does not have."""
+    """Return the modules, files and tests in code spans that the repository does not have."""
     spans = re.findall(r"`([^`\n]+)`", FENCE.sub("", markdown))
     modules = [span for span in spans if re.fullmatch(rf"(?:{'|'.join(TOP_FOLDERS)})(?:\.\w+)+", span)]
     sources = [span for span in spans if re.fullmatch(r"[\w/-]*[a-z0-9_]\.(?:py|js)", span)]
+    tests = [span for span in spans if re.fullmatch(r"tests/[\w/]+\.py::test_\w+", span)]
     vendored = {path.name for path in (ROOT / "web" / "vendor").glob("*.js")}
     missing = [name for name in modules if not is_name(name)]
+    missing += [id for id in tests if not is_test(*id.split("::"))]
     return missing + [
         name for name in sources if name not in vendored and not any(f"/{one}".endswith(f"/{name}") for one in places())
     ]
 
 
 def test_a_missing_name_is_noticed() -> None:
-    assert missing_names("`device.recon.gone` `services.lab.frontier.gone` `gone.py` `core/gone.js`") == [
-        "device.recon.gone", "services.lab.frontier.gone", "gone.py", "core/gone.js",
-    ]  # fmt: skip
+    gone = "`device.recon.gone` `services.lab.frontier.gone` `gone.py` `core/gone.js`"
+    assert missing_names(gone) == gone.replace("`", "").split()
     assert missing_names("`device.recon.methods.METHODS` `exam_loop.py` `core/capture.js` `hardware.parts`") == []
+    here = "tests/test_documents.py::test_a_missing_name_is_noticed"
+    assert missing_names(f"`{here}` `{here}_not`") == [f"{here}_not"]
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)

@@ -1,5 +1,6 @@
 """Card, units, presets and wheels against the facts of Raspberry Pi's software in tests/raspberry_pi.py."""
 
+import os
 import re
 import subprocess
 import sys
@@ -15,6 +16,15 @@ from tests.project_files import ROOT, text
 
 IMAGE = "systemd/image"
 BUILT_FOR_ANOTHER_NUMPY = 'raise ValueError("numpy.dtype size changed, may indicate binary incompatibility")\n'
+# Runs what changes the test's own files only: lines of config.txt and modules-load.d.
+SUDO = """\
+#!/bin/sh
+echo "$@" >>{log}
+case "$*" in
+"tee -a {config}") exec "$@" ;;
+"tee "*) exec cat ;;
+esac
+"""
 OPEN_ALL = """\
 import sys
 from pathlib import Path
@@ -85,6 +95,13 @@ def test_the_led_bus_starts_the_blanker() -> None:
     assert 'ENV{SYSTEMD_WANTS}+="diffuscope-blank.service"' in rule
 
 
+def test_the_clock_cell_of_the_parts_list_is_charged() -> None:
+    """Defect 9: the board keeps the time while it is off only with a cell, which it does not charge by itself."""
+    [cell] = [line for line in text("hardware/parts.csv").splitlines() if "clock cell" in line]
+    assert "rechargeable" in cell
+    assert f"dtparam=rtc_bbat_vchg={raspberry_pi.CLOCK_CELL_UV}" in settings(f"{IMAGE}/card/config.txt")
+
+
 def test_presets_have_the_black_level_of_libcamera() -> None:
     """Defect 13: the driver refuses a head file whose black level is half or twice that of libcamera."""
     for name, level in raspberry_pi.BLACK_LEVELS.items():
@@ -119,6 +136,26 @@ def test_any_failure_of_an_import_is_an_error_with_a_remedy(tmp_path: Path) -> N
     done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT)
     codes = ["camera.missing", "light.fault", "bus.fault", "bus.fault"]
     assert done.stdout.splitlines() == [f"{code} True True" for code in codes]
+
+
+def test_make_pi_gives_the_environment_the_camera_of_raspberry_pi_os(tmp_path: Path) -> None:
+    """Defect 14: the recipe itself, with a stand-in for sudo; .venv did not see Debian's libcamera."""
+    venv, config, log = tmp_path / "venv", tmp_path / "config.txt", tmp_path / "log"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
+    config.write_text("dtparam=spi=on\n")
+    (venv / "bin/sudo").write_text(SUDO.format(log=log, config=config))
+    (venv / "bin/pip").write_text("#!/bin/sh\n")
+    for name in ("sudo", "pip"):
+        (venv / "bin" / name).chmod(0o755)
+    path = f"{venv / 'bin'}:{os.environ['PATH']}"
+    for _ in range(2):  # a second run adds no line twice
+        words = ["make", "pi", "MAKE=true", f"BIN={venv / 'bin'}", f"PI_CONFIG={config}"]
+        subprocess.run(words, cwd=ROOT, env=os.environ | {"PATH": path}, check=True, capture_output=True)
+    [site] = venv.glob("lib/python3.*/site-packages")
+    assert (site / "debian.pth").read_text() == "/usr/lib/python3/dist-packages\n"
+    assert "python3-picamera2 python3-libcamera" in log.read_text()
+    assert "\nmake pi " in text("systemd/README.md"), "the installation without a card"
+    assert sorted(config.read_text().split()) == ["dtparam=i2c_arm=on", "dtparam=spi=on", "dtparam=strict_gpiod"]
 
 
 def test_every_part_of_the_image_names_one_debian_and_one_python() -> None:

@@ -11,10 +11,13 @@ from device.clock import Clock
 from services.identity.certificates import create_server_certificate
 from services.identity.provision import Identity
 
+# agetty replaces \4{INTERFACE} by the address, again whenever it changes; without a network nothing stands there.
 LABEL = """
   {name}   serial {serial}
   Wi-Fi {name}   password {wifi}
   Photograph this, print it, and stick it onto the device.
+
+  Address by Wi-Fi: \\4{{wlan0}}   by cable: \\4{{eth0}}\\4{{end0}}
 
 """
 

@@ -10,7 +10,7 @@ from device.errors import DiffuscopeError
 from services.identity.card_settings import CardSettings, Ethernet, Wifi, head_path, kept_settings, take_settings
 
 CONNECTIONS = "run/NetworkManager/system-connections"
-OUTPUT = "run/diffuscope-settings"  # readable for the instrument: head file, programme, arguments, problem
+OUTPUT = "run/diffuscope-settings"  # readable for all: head file, programme, arguments, country, problem
 HOST_KEY = "ssh_host_ed25519_key"
 
 
@@ -46,6 +46,8 @@ class CardBoot:
         if settings.programme is not None:
             arguments["PROGRAMME"] = f"--protocol {_from_root(output / settings.programme, self.root)}"
         self._write_public("instrument.env", "".join(f"{name}={value}\n" for name, value in arguments.items()))
+        if settings.country is not None:
+            self._write_public("country.env", f"COUNTRY={settings.country}\n")
         if settings.time_zone is not None:
             zone = self.root / "etc/localtime"
             zone.unlink(missing_ok=True)

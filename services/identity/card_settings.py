@@ -18,6 +18,7 @@ from device.errors import DiffuscopeError, SpecError
 from services.records.protocol import load_protocol
 
 FILE = "diffuscope.toml"
+COUNTRIES = "iso3166.tab"  # of tzdata: a line for each country, its code first
 PASSWORD = re.compile(rb'^([ \t]*password[ \t]*=[ \t]*)(["\'])(.*?)\2', re.MULTILINE)
 KEPT = re.compile(r"\*+")  # what is left of a password on the first partition
 
@@ -57,11 +58,13 @@ class Ssh(Table):
 
 
 class CardSettings(Table):
-    """Content of `diffuscope.toml`; an absent key leaves what the card has.
+    """Content of `diffuscope.toml`; for an absent key the release decides.
 
-    `head`: a head file of the release, or the name of a file `NAME.toml` beside; `programme`: name of a file beside.
+    `country`: ISO 3166 code, whose rules the radio follows; `head`: a head file of the release, or the name of a file
+    `NAME.toml` beside; `programme`: name of a file beside.
     """
 
+    country: str | None = Field(default=None, pattern="^[A-Z]{2}$")
     time_zone: str | None = Field(default=None, pattern="^[A-Za-z0-9_+-]+(/[A-Za-z0-9_+-]+)*$")
     head: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+([.]toml)?$")
     programme: str | None = Field(default=None, pattern="^[A-Za-z0-9_-]+[.]toml$")
@@ -128,6 +131,8 @@ def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path
     """Return the head file and programme beside the settings by name, checked; SpecError for one that is not valid."""
     if settings.time_zone is not None and not (zones / settings.time_zone).is_file():
         raise SpecError(f"{FILE}: time_zone: {settings.time_zone!r} is none", "Write one such as Asia/Kolkata.")
+    if settings.country is not None and f"\n{settings.country}\t" not in (zones / COUNTRIES).read_text("utf-8"):
+        raise SpecError(f"{FILE}: country: {settings.country!r} is none", "Write one such as KE; Great Britain is GB.")
     if settings.programme is not None:
         load_protocol(boot / settings.programme)
     if settings.head is not None:

@@ -104,6 +104,22 @@ def light_up(chain):
     os.close(wire)
 
 
+def test_the_blanker_of_a_boot_waits_for_its_bus(sound_wires):
+    """Defect 7: with --insist it tries again while the bus fails; without, it ends and the LEDs stay lit."""
+    chain = ChainSpec()
+    light_up(chain)
+    emulated_buses().set_faults("spi.cut")
+    command = [sys.executable, "-I", "-S", str(BLANK), "--device", chain.device]
+    assert subprocess.run(command, stderr=subprocess.DEVNULL, check=False).returncode == 1
+    with subprocess.Popen([*command, "--insist"]) as blanker:
+        time.sleep(0.5)
+        assert emulated_buses().lit
+        assert blanker.poll() is None
+        emulated_buses().set_faults()
+        assert blanker.wait(timeout=5) == 0
+    assert not emulated_buses().lit
+
+
 def test_a_fork_that_holds_the_pipe_of_a_dead_parent_does_not_keep_the_light_on(sound_wires):
     """The end of the pipe is not the end of the process: a fork without exec holds a copy of the pipe."""
     result = LitProcess(emulated_buses(), 5.0, "heir").await_end("heir")

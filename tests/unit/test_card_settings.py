@@ -19,6 +19,7 @@ from tests.project_files import ROOT, text
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGJcPFbe5hVKaLZ4yKkYbCzW1Sxd0hNnT0y0vN3hX4bQ me@laptop"
 PASSWORD = "ganga 2026"
 GOOD = f"""\
+country = "KE"
 time_zone = "Asia/Kolkata"
 head = "imx477"
 [wifi]
@@ -35,6 +36,7 @@ def card(tmp_path: Path) -> CardBoot:
     for name in ("boot/chooser", "data", "opt/diffuscope", "etc/diffuscope", "usr/share/zoneinfo/Asia"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "usr/share/zoneinfo/Asia/Kolkata").touch()
+    (tmp_path / "usr/share/zoneinfo/iso3166.tab").write_text("# codes\nIN\tIndia\nKE\tKenya\n")
     (tmp_path / "opt/diffuscope/hardware").symlink_to(ROOT / "hardware")
     return CardBoot(tmp_path)
 
@@ -68,6 +70,7 @@ def test_settings_are_taken_kept_and_applied_at_every_boot(card: CardBoot) -> No
         arguments = card.root / "run/diffuscope-settings/instrument.env"
         assert arguments.read_text() == "HEAD=/opt/diffuscope/hardware/heads/imx477.toml\n"
         assert stat.S_IMODE(arguments.stat().st_mode) == 0o644
+        assert (arguments.parent / "country.env").read_text() == "COUNTRY=KE\n"
         assert (card.root / "run/diffuscope-ssh/authorized_keys").read_text() == f"{KEY}\n"
         assert not (card.root / "run/diffuscope-settings/problem.json").exists()
         if boot == 1:
@@ -102,7 +105,9 @@ def test_a_power_cut_before_the_stars_is_completed_by_the_next_boot(card: CardBo
     [
         ("[wifi", "is not TOML"), (GOOD.replace("name", "nmae"), "did you mean 'wifi.name'|'wifi.nmae'"),
         (GOOD.replace(PASSWORD, "short"), "8 to 63"), (GOOD.replace("ssh-ed25519", "-----BEGIN"), "id_ed25519.pub"),
-        (GOOD.replace("Kolkata", "Kalkutta"), "Asia/Kalkutta"), (GOOD.replace("imx477", "imx999"), "imx999"),
+        (GOOD.replace("Kolkata", "Kalkutta"), "Asia/Kalkutta"),
+        (GOOD.replace("KE", "UK"), "'UK' is none"), (GOOD.replace("KE", "Kenya"), "country"),
+        (GOOD.replace("imx477", "imx999"), "imx999"),
         (f'programme = "mine.toml"\n{GOOD}', "mine.toml"),
         (GOOD.replace("Clinic", "Other").replace(PASSWORD, "*" * 10), "no password"),
         (GOOD.replace(PASSWORD, 'ga\\"ga 2026'), "removed"),

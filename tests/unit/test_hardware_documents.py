@@ -149,6 +149,15 @@ def test_wiring_matches_the_head_file(head: Path) -> None:
         assert wired_values("gpio.button") == {str(spec.gpio.button)}
 
 
+@pytest.mark.parametrize("head", HEADS, ids=lambda path: path.stem)
+def test_no_head_file_names_a_gauge_that_is_not_ordered(head: Path) -> None:
+    """Defect 4: a gauge that does not answer refuses every press."""
+    [gauge] = [line for line in text("hardware/parts.csv").splitlines() if line.startswith("fuel gauge,")]
+    assert "not yet ordered" in gauge
+    bus = load_head(head).bus
+    assert bus is None or bus.battery is None
+
+
 def test_head_file_lines_of_the_instructions_load(tmp_path: Path) -> None:
     lines = re.findall(r"^```\n(\[gpio\]\n.*?)^```", text("hardware/wiring.md"), re.M | re.S)
     (head := tmp_path / "head.toml").write_text(text("hardware/heads/imx296.toml") + "\n" + lines[0])

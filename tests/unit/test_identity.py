@@ -13,7 +13,7 @@ import pytest
 from device.clock import SystemClock, VirtualClock
 from services.errors import StoreDamaged
 from services.identity.apply_at_boot import Computer
-from services.identity.provision import FILES, Identity, load_or_create_identity
+from services.identity.provision import FILES, Identity, device_name, load_or_create_identity
 from tests.project_files import ROOT
 
 SERIAL = "10000000a1b2c3d4"
@@ -115,6 +115,20 @@ def test_every_boot_writes_the_same_identity_and_a_new_server_key(computer: Comp
         secret = [path for path in (computer.root / "run").rglob("*") if path.is_file()]
         assert len(secret) == 4
         assert {stat.S_IMODE(path.stat().st_mode) for path in secret} == {0o600}
+
+
+@pytest.mark.skipif(None in (shutil.which("agetty"), shutil.which("script")), reason="agetty is not installed")
+def test_screen_shows_the_address_on_each_network_and_nothing_without(computer: Computer) -> None:
+    """A wrong Wi-Fi password has no other sign: the label as agetty shows it, with one interface of this machine."""
+    applied_identity(computer)
+    label = (computer.root / "run/issue.d/diffuscope.issue").read_text()
+    assert label.endswith("Address by Wi-Fi: \\4{wlan0}   by cable: \\4{eth0}\\4{end0}\n\n")
+    here = computer.root / "issue"
+    here.write_text(label.replace("wlan0", "lo").replace("eth0", "none0").replace("end0", "none1"))
+    words = ["script", "-qec", f"agetty --show-issue --issue-file {here}", "/dev/null"]
+    shown = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert "Address by Wi-Fi: 127.0.0.1   by cable: \n" in shown
+    assert f"Wi-Fi {device_name(SERIAL)}   password" in shown
 
 
 def test_board_without_serial_number_keeps_its_random_one(computer: Computer) -> None:

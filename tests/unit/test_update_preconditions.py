@@ -16,6 +16,7 @@ from services.errors import (
     UpdateWrongDevice,
 )
 from services.update.preconditions import refuse_old_bootloader, refuse_while_in_use
+from tests.updates import Board
 
 NOW = datetime(2026, 11, 20, 12, tzinfo=UTC)
 NO_JSON = [b"", b"not JSON", b'{"visits": [', b"\xff\xfe\xfd"]
@@ -104,6 +105,19 @@ def test_an_update_needs_a_bootloader_of_november_2024(tmp_path: Path, built: st
     with pytest.raises(UpdateWrongDevice, match=f"is of {built}") as refused:
         refuse_old_bootloader(file)
     assert "Bootloader (Pi 5 family)" in refused.value.remedy
+
+
+def test_an_old_bootloader_refuses_an_update_before_anything_is_written(tmp_path: Path) -> None:
+    """Defect 12: a tried version hung in the firmware, and no one looked at its date."""
+    board, file = Board.new(tmp_path), tmp_path / "build-timestamp"
+    file.write_bytes(int(datetime(2024, 9, 23, tzinfo=UTC).timestamp()).to_bytes(4, "big"))
+    board.bundle("two.raucb")
+    with pytest.raises(UpdateWrongDevice, match="bootloader"):
+        board.updater("1.0", bootloader=file).install(None)
+    assert not board.is_off
+    assert board.boot() == "A"
+    board.updater("1.0", bootloader=tmp_path / "absent").install(None)
+    assert board.boot() == "B"
 
 
 def test_a_computer_without_a_bootloader_in_its_device_tree_may_be_updated(tmp_path: Path) -> None:
