@@ -136,7 +136,12 @@ def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path
     if settings.programme is not None:
         load_protocol(boot / settings.programme)
     if settings.head is not None:
-        load_head(head_path(settings.head, boot, release))
+        path = head_path(settings.head, boot, release)
+        if not path.is_file():
+            heads = ", ".join(sorted(file.stem for file in head_path("any", boot, release).parent.glob("*.toml")))
+            remedy = f"Write one of {heads}, or the name of a .toml file beside {FILE}."
+            raise SpecError(f"{FILE}: head: there is no head file {path.name!r}", remedy)
+        load_head(path)
     names = {path.name for path in boot.glob("*.toml")} - {FILE}  # also the sensors that a head file names
     return {name: (boot / name).read_bytes() for name in sorted(names)}
 

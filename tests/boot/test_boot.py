@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.boot, pytest.mark.timeout(1500)]
 ARCH = os.environ.get("ARCH") or "arm64"
 HERE = ROOT / "tests/boot"
 PYTHON = "/opt/diffuscope/.venv/bin/python"
-DIFFUSCOPE = "/opt/diffuscope/.venv/bin/diffuscope"
+DIFFUSCOPE = "diffuscope"  # as remedies write it
 BROKEN = '"""A release that ends as soon as it is asked to serve."""\n\nraise SystemExit("broken release")\n'
 IMPATIENT = 'sticks = "/media"\npatience_s = 25.0\n'
 PASSWORD = "eight or more"
@@ -159,6 +159,7 @@ def test_first_boot_whose_power_is_cut_is_completed_by_the_next(board: Board) ->
 def test_page_is_served_after_power_on(board: Board) -> None:
     took_s = board.wait_for_page()
     no_unit_failed(board)
+    assert board.ssh("systemctl", "is-enabled", "rpi-eeprom-update.service", check=False).strip() == "masked"
     here = run(sys.executable, "-m", "tests.boot.probe", "fft")
     board.ssh("mkdir", "-p", "/run/probe")
     board.copy(HERE / "probe.py", "/run/probe/")
@@ -231,6 +232,7 @@ def test_power_cut_during_a_capture_loses_no_earlier_capture(board: Board) -> No
     assert {name: digest for name, digest in captures(board).items() if name in kept} == kept
     reported = json.dumps(board.ask("health"))
     assert "no_such_head" in reported
+    assert "imx296_power" in reported, "the remedy names the heads"
     assert "heads/sim.toml" in board.ssh("cat", "/run/diffuscope-settings/instrument.env")
     assert "no_such_head" in board.ssh("cat", "/run/issue.d/settings.issue")
     (nonsense / "diffuscope.toml").write_text(before)
