@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from dataclasses import replace
 from functools import cache
-from math import radians, tan
+from math import degrees, radians, tan
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -224,6 +224,42 @@ def test_dioptre_steps_of_the_model_eye_match_the_guide() -> None:
         assert re.search(rf"{dpt:.2f}( dioptres)? of {kind}", guide)
         assert re.search(rf"{100 * shrinks_per_dpt * dpt:.1f} % {goes}", guide)
     assert f"bright disc, {7.7 * relay.pupil_magnification:.1f} mm" in guide
+
+
+def test_frame_of_a_torch_in_the_guide_matches_the_optics() -> None:
+    """A torch 18 cm off the axis at 1 m moves the disc of the caustic by that tangent through relay and diffuser."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    moved_um = 0.18 * relay.angular_magnification * path.optics.diffuser_to_sensor_um
+    guide = text("hardware/assembly.md")
+    shift = re.search(r"1 m before the head: 18 cm to the right.*? is about (\d+) pixels right", guide)
+    assert shift is not None
+    assert float(shift[1]) == pytest.approx(moved_um / 3.45, rel=0.03)  # rounded to ten pixels
+
+
+def test_other_pinholes_of_the_guide_match_the_optics() -> None:
+    """Width over focal length, and the first null of a disc (OPTICS.md 2.5) in the field."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    guide = " ".join(text("hardware/assembly.md").split())
+    mm_per_deg = relay.diffuser_to_sensor_mm * tan(radians(relay.angular_magnification))
+    widths_deg = {um: degrees(um / 25_000) for um in (200, 250, 275, 300)}
+    nulls = [1.22 / (path.optics.diffuser_to_sensor_um / 1000 * relay.angular_magnification * radians(deg)) * mm_per_deg
+             for deg in widths_deg.values()]  # fmt: skip
+    first, *others = [f"{deg:.2f} for {um}" for um, deg in widths_deg.items()]
+    assert f"in degrees: {first} um, {', '.join(others)}." in guide
+    assert f"{(275 / 200) ** 2:.1f} times for 200 um" in guide
+    *begin, last = [f"{null:.2f}" for null in nulls]
+    assert f"end at {', '.join(begin)} and {last} cycles" in guide
+
+
+def test_width_of_the_meter_in_the_guide_matches_the_optics() -> None:
+    """Behind the pupil the light of the field spreads from the ring of spots, by the widest emitter of a head."""
+    path = load_light_path(HARDWARE / "optics.toml")
+    design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
+    spots_mm = ring_at_pupil_mm(design.chain, 0.75) + 0.75 * design.emitter_mm
+    spread = 2 * tan(radians(path.optics.field_deg / 2))
+    claim = (f"{spots_mm:.1f} mm wide and {spread:.1f} mm more for each millimetre that it lies behind the card: "
+             f"{spots_mm + spread:.1f} mm at 1 mm, {spots_mm + 14 * spread:.1f} mm at 14 mm")  # fmt: skip
+    assert claim in " ".join(text("hardware/assembly.md").split())
 
 
 def printed() -> set[str]:
