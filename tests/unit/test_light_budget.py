@@ -1,17 +1,18 @@
 """Light budget: the chain is the photon budget taken apart, and no head of the search exceeds a limit."""
 
+import re
 from dataclasses import replace
-from math import exp
+from math import exp, radians, sin
 from pathlib import Path
 
 import pytest
 
 from device.config.head_file import InstrumentSpec, SinkSpec, load_head
-from device.errors import LightLimit
+from device.errors import LightLimit, SettingError
 from device.head import hazard_of
 from device.light_safety.hazard import Hazard, light_limits
 from device.optics.budget import Design, design_of_head, optical_budget
-from device.optics.illumination import LED, led_at
+from device.optics.illumination import LED, led_at, photon_budget
 from device.optics.light_budget import (
     CELL_UM,
     ENOUGH_E,
@@ -23,9 +24,11 @@ from device.optics.light_budget import (
     simulated,
 )
 from device.optics.light_path import load_light_path
-from device.optics.matrix import share_in_pupil
+from device.optics.matrix import ring, share_in_pupil
 from device.values import Colour, Illumination
 from services.lab import head_search, light_report
+from services.lab.light_report import expected_mw
+from services.lab.optics_report import widest_iris_mm
 
 HARDWARE = Path(__file__).parents[2] / "hardware"
 PATH = load_light_path(HARDWARE / "optics.toml")
@@ -51,10 +54,14 @@ def test_the_chain_is_the_photon_budget_times_the_share_in_the_pupil(path: Path)
     chosen = design_of_head(PATH, load_head(path))
     budget = optical_budget(chosen)
     inside = share_in_pupil(chosen.chain, 0.75, chosen.emitter_mm, chosen.pupil_mm)
-    cell = budget.electrons_per_px * (CELL_UM / chosen.pitch_um) ** 2
+    leds = len(ring(chosen.chain))
+    whole = photon_budget("green", chosen.pitch_um, 33.4, chosen.eye_mm, chosen.relay, leds, chosen.led)
+    cell = whole.electrons_per_px_s * chosen.exposure_s * (CELL_UM / chosen.pitch_um) ** 2
+    assert budget.electrons_per_px == pytest.approx(inside * whole.electrons_per_px_s * chosen.exposure_s)
+    assert budget.light.cornea_mw == whole.cornea_mw
     assert product(chain(chosen)) == pytest.approx(cell * inside, rel=1e-9)
     assert product(chain(chosen, 0.5, 4)) == pytest.approx(2 * cell * inside, rel=1e-9)
-    assert retina_mw_per_cm2(chain(chosen)) == pytest.approx(budget.light.retina_mw_per_cm2 * inside, rel=1e-9)
+    assert retina_mw_per_cm2(chain(chosen)) == pytest.approx(whole.retina_mw_per_cm2 * inside, rel=1e-9)
 
 
 def test_the_monte_carlo_has_the_quantiles_of_a_log_normal_product() -> None:
@@ -126,6 +133,40 @@ def test_the_search_exceeds_no_limit_and_ranks_enough_light_first() -> None:
     assert any(enough)
     assert enough == sorted(enough, reverse=True)
     assert all(one.leds * one.choice.current_ma <= head_search.SUPPLY_MA for one in found)
+
+
+def test_the_search_leaves_out_an_iris_whose_caustic_the_sensor_does_not_hold() -> None:
+    """The calibration wants a sixteenth of the sensor's side dark at each edge: 3.28 mm of the IMX296's 3.75."""
+    small = design("imx296")
+    assert widest_iris_mm(small) == pytest.approx(14 / 16 * 1088 * 3.45e-3)
+    assert max(one.iris_um for one in head_search.search(small)) == 3200
+    large = replace(small, rows=1456)
+    assert max(one.iris_um for one in head_search.search(large)) == 4000
+
+
+@pytest.mark.parametrize("name", ["imx296", "imx296_power"])
+def test_a_pupil_that_passes_no_light_is_refused_with_a_remedy(name: str) -> None:
+    chosen = replace(design(name), pupil_mm=6.0)
+    for show in (light_report.table, light_report.gains_svg):
+        with pytest.raises(SettingError, match="no light reaches the sensor: a pupil of 6 mm") as refused:
+            show(chosen)
+        begins_mm = float(re.findall(r"wider than ([\d.]+) mm", refused.value.remedy)[0])
+        assert replace(chosen, pupil_mm=begins_mm - 0.01).share_in_pupil == 0
+        show(replace(chosen, pupil_mm=begins_mm + 0.1))
+
+
+def test_a_wider_field_has_a_wider_cone_in_budget_and_hazard() -> None:
+    """50 degrees need the cone of 37.5: sin^2 of its half is 2.2 times that of 25 degrees."""
+    spec = head("imx296_power")
+    assert spec.optics is not None
+    wide = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 50.0})})
+    times = (sin(radians(50 * 0.375)) / sin(radians(12.5))) ** 2
+    usual, more = (expected_mw(design_of_head(PATH, one)) for one in (spec, wide))
+    assert more / usual == pytest.approx(times, rel=0.01)  # 12.5 degrees are 12.525, rounded by the paper
+    waists = [hazard_of(one).beams["green"].waist_w_per_cm2 for one in (spec, wide)]
+    assert waists[1] / waists[0] == pytest.approx(times, rel=0.01)
+    narrow = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 20.0})})
+    assert hazard_of(narrow).beams["green"].waist_w_per_cm2 == waists[0], "the cap of an unmeasured head may be another"
 
 
 def test_the_chain_agrees_with_two_published_instruments() -> None:
