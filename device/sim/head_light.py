@@ -38,7 +38,7 @@ def head_light(spec: InstrumentSpec, colour: Colour) -> HeadLight:
     design = _design(spec, colour)
     mean_e = product(chain(design)) * (design.pitch_um / CELL_UM) ** 2
     leds = f"{len(ring(design.chain))} {colour} LEDs of {design.led.power_mw:g} mW"
-    origin = f"{leds}, not measured: right within a factor of two"
+    origin = f"{leds}, not measured: 90 % of heads and eyes within a factor of 2.5"
     beam = design.measured
     if design.radiometry is not None and beam is not None:
         origin = f"{beam.retina_mw_per_cm2:g} mW/cm2 on the retina, measured: {design.radiometry.measured}"

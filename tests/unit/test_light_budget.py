@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from device.config.head_file import InstrumentSpec, SinkSpec, load_head
+from device.config.radiometry import LED_FWHM_UM
 from device.errors import LightLimit, SettingError
 from device.head import hazard_of
 from device.light_safety.hazard import Hazard, light_limits
@@ -27,8 +28,9 @@ from device.optics.light_path import load_light_path
 from device.optics.matrix import ring, share_in_pupil
 from device.values import Colour, Illumination
 from services.lab import head_search, light_report
-from services.lab.light_report import expected_mw
+from services.lab.light_report import at_full_drive, expected_beam, expected_mw, half_period_um
 from services.lab.optics_report import widest_iris_mm
+from tests.project_files import text
 
 HARDWARE = Path(__file__).parents[2] / "hardware"
 PATH = load_light_path(HARDWARE / "optics.toml")
@@ -181,6 +183,45 @@ def test_the_chain_agrees_with_two_published_instruments() -> None:
         for lumens in (20, 50)
     )
     assert low < 1.40 < high
+
+
+def test_documents_have_the_figures_of_the_chosen_head() -> None:
+    chosen = design("imx296_power")
+    built, shares = at_full_drive(chosen), light_report.limit_shares(chosen, expected_beam(chosen), light_limits())
+    low, high = (f"{100 * one:.0f}" for one in (built.share.low, built.share.high))
+    small = replace(chosen, pupil_mm=7.0)
+    bound = simulated(chain(chosen))
+    facts = {
+        "electrons": f"{spaced(product(chain(chosen)))} electrons", "small pupil": f"{spaced(product(chain(small)))}",
+        "within": f"{spaced(built.electrons.median)}", "no go": f"{100 * built.no_go:.0f} % of builds are NO GO",
+        "share": f"{100 * shares[0].used:.0f} % of", "range": f"{low} to {high} %",
+        "half-period": f"{half_period_um(chosen, built.electrons.median):.0f} (um )?instead of "
+        f"{half_period_um(design('imx296'), product(chain(design('imx296')))):.0f} um",
+    }  # fmt: skip
+    decision = " ".join(text("hardware/decisions/0006-ring-of-high-power-leds.md").split())
+    readme, optics = (" ".join(text(name).split()) for name in ("hardware/README.md", "device/optics/OPTICS.md"))
+    for words in (readme, decision):
+        assert [what for what, figure in facts.items() if not re.search(figure, words)] == []
+    quantiles = [spaced(one) for one in (bound.low, bound.high, built.electrons.low, built.electrons.high)]
+    for words in (readme, optics):
+        assert "{} to {}".format(*quantiles[:2]) in words
+        assert "{} to {}".format(*quantiles[2:]) in words
+    row = f"| {spaced(product(chain(chosen)))} | {quantiles[0]} to {quantiles[1]} | {facts['small pupil']} | "
+    assert f"{row}{half_period_um(chosen, product(chain(chosen))):.0f} um | {100 * shares[0].used:.0f} % | " in optics
+    assert f"{100 * shares[2].used:.0f} % |" in optics.partition(row)[2][:40]
+    assert f"a Gaussian of full width {1000 * LED_FWHM_UM:.0f} nm" in optics
+
+
+@pytest.mark.parametrize("path", HEADS, ids=lambda path: path.stem)
+def test_readme_has_the_electrons_of_a_smaller_pupil(path: Path) -> None:
+    chosen = replace(design_of_head(PATH, load_head(path)), pupil_mm=7.0)
+    mean_e = product(chain(chosen)) * (chosen.pitch_um / CELL_UM) ** 2
+    assert re.search(rf"^\| `{path.name}` \| \d+ \| \d+ \| {mean_e:.0f} \|$", text("hardware/README.md"), re.M)
+
+
+def spaced(electrons: float) -> str:
+    """Return a number of electrons to ten, as the documents write it: 11 980."""
+    return re.sub(r"^(\d\d)(\d{3})$", r"\1 \2", f"{round(electrons, -1):.0f}")
 
 
 def test_gains_and_report_name_every_cause(tmp_path: Path) -> None:
