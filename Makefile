@@ -88,6 +88,7 @@ gate: $(GATE_ROOT)/ready ## Check schematic (ERC) and boards (DRC) of gate and r
 			done || exit 1; \
 		done' >$(GATE_ROOT)/log 2>&1 || { cat $(GATE_ROOT)/log $(GATE_ROOT)/gate/out/*.rpt; exit 1; }
 	@cp -r $(GATE_ROOT)/gate/out out/gate && cat out/gate/*.rpt
+	@[ -z "$$SUDO_UID" ] || { chown "$$SUDO_UID:$$SUDO_GID" out && chown -R "$$SUDO_UID:$$SUDO_GID" out/gate; }  # else make parts is refused
 
 # A press on the real server, with every interruption; `make test-browser` tests whole visits and the rest of the page.
 JOURNEYS := tests/browser/test_page.py

@@ -20,7 +20,6 @@ from device.calibration.procedure.calibration_sequence import (
 from device.clock import Clock
 from device.config.head_file import ChainSpec, InstrumentSpec, ReplaySpec, load_head
 from device.config.operating_limits import is_battery_low, is_too_hot
-from device.config.radiometry import FIELD_DEG
 from device.drivers.button import GpioButton
 from device.drivers.chips import Eeprom24, I2cBus, Max17048, Tmp117
 from device.drivers.gpio import InputLine, OutputLine
@@ -480,8 +479,13 @@ def hazard_of(spec: InstrumentSpec) -> Hazard:
     """Return the hazard and limits of a head's light, by measured radiometry, else worst case; no light in a replay."""
     if spec.light.backend in ("replay", "none"):
         return Hazard(NO_LIGHT, light_limits())
-    field_deg = spec.optics.field_deg if spec.optics else FIELD_DEG
-    return Hazard(radiometry(spec.light.radiometry, field_deg, lamps=lamps_of(spec)), light_limits())
+    if spec.optics is None:
+        return Hazard(radiometry(spec.light.radiometry, lamps=lamps_of(spec)), light_limits())
+    optics = spec.optics
+    beams = radiometry(
+        spec.light.radiometry, optics.field_deg, lamps=lamps_of(spec), magnification=optics.angular_magnification
+    )
+    return Hazard(beams, light_limits())
 
 
 def recording_spec(folder: Path, raws: tuple[Path, ...] = (), psfs: tuple[Path, ...] = ()) -> InstrumentSpec:

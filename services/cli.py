@@ -318,6 +318,7 @@ def judge_light(
     meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],
     colour: Annotated[str, typer.Option(help="Of the reading; by default the picture's.")] = "",
     guard_factor: Annotated[float, typer.Option(min=1.3, max=10, help="For the meter's error.")] = 1.3,
+    fwhm_nm: Annotated[float, typer.Option(min=0, max=100, help="Full width at half maximum of the spectrum.")] = 35,
     level: Annotated[float, typer.Option(min=0.001, max=1, help="Share of full drive, as diffuscope meter says.")] = 1,
 ) -> None:
     """Judge a power meter's reading of a ring: its shares of the limits, GO or NO GO, and the lines for the head file.
@@ -329,7 +330,9 @@ def judge_light(
     spec = load_head(head)
     if colour:
         spec = measured_light.in_colour(spec, colour)
-    reading = measured_light.MeterReading(spec.light.colour, power_mw, waist_mw_per_cm2, peak_nm, meter, guard_factor)
+    reading = measured_light.MeterReading(
+        spec.light.colour, power_mw, waist_mw_per_cm2, peak_nm, meter, guard_factor, fwhm_nm
+    )
     reading = reading.scaled(level)
     found = measured_light.judge(spec, optics_report.design_of(spec), reading)
     typer.echo(measured_light.words(reading, found))
@@ -658,7 +661,7 @@ def hard(
 @app.command()
 def optics(
     head: Annotated[Path | None, typer.Option(help="Head file, such as hardware/heads/imx296.toml.")] = None,
-    sensor: Annotated[str | None, typer.Option(help="A sensor of device/config/sensors.py, such as imx296.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="A file of device/config/sensor_presets/, such as imx296.")] = None,
     eye_mm: Annotated[float | None, typer.Option(min=5, max=35, help="Focal length of the eye.")] = None,
     pupil_mm: Annotated[float | None, typer.Option(min=0.1, max=10, help="Diameter of its pupil.")] = None,
     svg: Annotated[Path | None, typer.Option(help="Where to draw the light path, to scale.")] = None,

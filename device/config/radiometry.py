@@ -8,16 +8,19 @@ from device.config.toml_file import Table
 from device.values import Colour
 
 WAIST_CM2 = pi * 0.05**2  # a disc of 1 mm
+LED_FWHM_UM = 0.035  # of a spectrum that was not measured: the wide end of green LEDs, 30 to 35 nm (an estimate)
 FIELD_DEG = 33.4  # the paper's; default of a head without [optics]
 
 
 class BeamSpec(Table):
     """Irradiance of one colour with the whole ring at full drive: on the retina, and in the waist of the beam.
 
-    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm diameter.
+    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm diameter. `wavelength_um` is the peak of the spectrum
+    and `fwhm_um` its full width at half maximum.
     """
 
     wavelength_um: float = Field(ge=0.4, le=0.7)
+    fwhm_um: float = Field(default=LED_FWHM_UM, ge=0, le=0.1)
     retina_mw_per_cm2: float = Field(gt=0)
     waist_mw_per_cm2: float = Field(gt=0)
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from math import exp, floor, log
+from math import exp, floor, log, sqrt
 from pathlib import Path
 from typing import Literal, Self
 
@@ -12,7 +12,16 @@ from pydantic import Field, model_validator
 from device.config.radiometry import FIELD_DEG, WAIST_CM2, RadiometrySpec
 from device.config.toml_file import Table, load_toml
 from device.errors import LightLimit, SpecError
-from device.optics.illumination import LED, LEDS, TRANSMISSION_TO_EYE, Led, photon_budget
+from device.optics.illumination import (
+    LED,
+    LEDS,
+    RELAY_HALF_CONE_DEG,
+    RELAY_MAGNIFICATION,
+    TRANSMISSION_TO_EYE,
+    Led,
+    half_cone_deg,
+    photon_budget,
+)
 from device.optics.matrix import Lamp
 from device.values import Colour, Illumination
 
@@ -94,6 +103,20 @@ class Weight(_Source):
                 return exp(log(at_low) + (log(at_high) - log(at_low)) * (nm - low) / (high - low))
         raise SpecError(f"light of {nm:g} nm has no weight between {self.nm[0]:g} and {self.nm[-1]:g} nm")
 
+    def of_spectrum(self, wavelength_um: float, fwhm_um: float) -> float:
+        """Return the mean weight of a Gaussian spectrum by its peak and full width, um; width 0: of the peak.
+
+        An LED of 525 nm and 35 nm weighs 1.26 times its peak, as A(lambda) is exponential. What lies outside the table
+        counts nothing.
+        """
+        if fwhm_um == 0:
+            return self.at(wavelength_um)
+        sigma_um = fwhm_um / sqrt(8 * log(2))
+        places = (wavelength_um + 0.1 * step * sigma_um for step in range(-40, 41))
+        inside = [um for um in places if self.nm[0] <= round(1000 * um, 6) <= self.nm[-1]]
+        shares = [exp(-(((um - wavelength_um) / sigma_um) ** 2) / 2) for um in inside]
+        return sum(share * self.at(um) for share, um in zip(shares, inside, strict=True)) / sum(shares)
+
 
 class Limits(Table):
     """Limits of `limits.toml`; the properties are this instrument's limits: standard value times permitted share."""
@@ -154,11 +177,15 @@ def light_limits(path: Path = LIMITS) -> Limits:
 
 @dataclass(frozen=True)
 class Beam:
-    """Unweighted irradiances at the eye from the ring at full drive in one colour; guard factors are included."""
+    """Unweighted irradiances at the eye from the ring at full drive in one colour; guard factors are included.
+
+    `fwhm_um`: width of the spectrum about its peak `wavelength_um`.
+    """
 
     wavelength_um: float
     retina_w_per_cm2: float
     waist_w_per_cm2: float
+    fwhm_um: float = 0.0
 
 
 Radiometry = Mapping[Colour, Beam]
@@ -167,31 +194,39 @@ NO_LIGHT: Radiometry = {colour: Beam(led.wavelength_um, 0.0, 0.0) for colour, le
 
 def radiometry(
     measured: RadiometrySpec | None = None, field_deg: float = FIELD_DEG, leds: int = LEDS,
-    lamps: Mapping[Colour, Lamp] | None = None,
+    lamps: Mapping[Colour, Lamp] | None = None, magnification: float = RELAY_MAGNIFICATION,
 ) -> Radiometry:  # fmt: skip
     """Return the beam of each colour: as measured, times the guard factor; if unmeasured, the worst case.
 
-    `lamps` are the head's LEDs by colour; None: `leds` LEDs of an APA102-2020 in each of its colours.
+    `lamps` are the head's LEDs by colour; None: `leds` LEDs of an APA102-2020 in each of its colours. `magnification`
+    of the relay is f1 / f2.
     """
     found: dict[Colour, Beam] = {}
     for colour, lamp in (lamps or {colour: Lamp(led, leds) for colour, led in LED.items()}).items():
         spec = measured.beam(colour) if measured else None
         if measured is None or spec is None:
-            found[colour] = worst_beam(colour, field_deg, lamp.count, lamp.led)
+            found[colour] = worst_beam(colour, field_deg, lamp.count, lamp.led, magnification)
         else:
             scale = measured.guard_factor / 1000
-            found[colour] = Beam(spec.wavelength_um, scale * spec.retina_mw_per_cm2, scale * spec.waist_mw_per_cm2)
+            found[colour] = Beam(
+                spec.wavelength_um, scale * spec.retina_mw_per_cm2, scale * spec.waist_mw_per_cm2, spec.fwhm_um
+            )
     return found
 
 
-def worst_beam(colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS, led: Led | None = None) -> Beam:
+def worst_beam(
+    colour: Colour, field_deg: float = FIELD_DEG, leds: int = LEDS, led: Led | None = None,
+    magnification: float = RELAY_MAGNIFICATION,
+) -> Beam:  # fmt: skip
     """Return the worst-case beam of an unmeasured colour: lossless optics, and LEDs brighter by the uncertainty factor.
 
     `retina` holds the light of all `leds` LEDs, `waist` that of one LED: the LEDs are further apart than the disc of 1
-    mm over which the waist irradiance is averaged.
+    mm over which the waist irradiance is averaged. The cone is that of the field, and no narrower than the paper's: the
+    cap of an unmeasured head may be another one. The spectrum counts as its peak, as the optics' losses are greater.
     """
     led = led or LED[colour]
-    budget = photon_budget(colour, pitch_um=1.0, field_deg=field_deg, led=led)
+    half_cone = max(RELAY_HALF_CONE_DEG, half_cone_deg(field_deg, magnification))
+    budget = photon_budget(colour, pitch_um=1.0, field_deg=field_deg, led=led, half_cone=half_cone)
     scale = LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE / 1000
     return Beam(
         led.wavelength_um,
@@ -210,12 +245,14 @@ class Hazard:
     def photochemical_w_per_cm2(self, glow: Illumination) -> float:
         """Return the A-weighted irradiance of the retina, W/cm2."""
         beam = self._beam(glow)
-        return glow.level * beam.retina_w_per_cm2 * self.limits.photochemical_weight.at(beam.wavelength_um)
+        weight = self.limits.photochemical_weight.of_spectrum(beam.wavelength_um, beam.fwhm_um)
+        return glow.level * beam.retina_w_per_cm2 * weight
 
     def thermal_w_per_cm2(self, glow: Illumination) -> float:
         """Return the R-weighted irradiance of the retina, W/cm2."""
         beam = self._beam(glow)
-        return glow.level * beam.retina_w_per_cm2 * self.limits.thermal_weight.at(beam.wavelength_um)
+        weight = self.limits.thermal_weight.of_spectrum(beam.wavelength_um, beam.fwhm_um)
+        return glow.level * beam.retina_w_per_cm2 * weight
 
     def waist_w_per_cm2(self, glow: Illumination) -> float:
         """Return the irradiance in the waist of the beam, unweighted, W/cm2."""

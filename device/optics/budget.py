@@ -1,14 +1,23 @@
 """Optical budget of a head: the numbers that its light path, sensor and eye give, by closed formulas."""
 
-from dataclasses import dataclass
-from math import radians
+from dataclasses import dataclass, replace
+from math import pi, radians, tan
 
 from device.config.head_file import ChainSpec, InstrumentSpec, OpticsSpec
+from device.config.radiometry import BeamSpec, RadiometrySpec
 from device.config.sensors import SensorProfile
 from device.errors import SpecError
 from device.optics import field_extent
 from device.optics.eye import Relay, reflex_free_mm, size_mm
-from device.optics.illumination import LED, Led, PhotonBudget, half_period_deg, photon_budget, within_simulated_range
+from device.optics.illumination import (
+    LED,
+    MEAN_OVER_PEAK,
+    Led,
+    PhotonBudget,
+    half_period_deg,
+    photon_budget,
+    within_simulated_range,
+)
 from device.optics.light_path import LightPath, relay_of
 from device.optics.matrix import (
     EMITTER_MM,
@@ -18,13 +27,17 @@ from device.optics.matrix import (
     lamps_of,
     ring,
     ring_at_pupil_mm,
+    share_in_pupil,
 )
 from device.values import Colour
 
 
 @dataclass(frozen=True)
 class Design:
-    """Input of a budget: light path, LED ring, sensor, eye (focal length and pupil), colour and exposure time."""
+    """Input of a budget: light path, LED ring, sensor, eye (focal length and pupil), colour and exposure time.
+
+    `radiometry` is the head file's; where it has the design's colour, `led.power_mw` is what gives the measured light.
+    """
 
     title: str
     path: LightPath
@@ -40,6 +53,17 @@ class Design:
     led: Led = LED["green"]
     emitter_mm: float = EMITTER_MM
     read_noise_e: float = 0.0
+    radiometry: RadiometrySpec | None = None
+
+    @property
+    def measured(self) -> BeamSpec | None:
+        """Measured light of the ring in this colour; None if it was not measured."""
+        return None if self.radiometry is None else self.radiometry.beam(self.colour)
+
+    @property
+    def share_in_pupil(self) -> float:
+        """Share of the ring's light that passes the eye's pupil, 0 to 1."""
+        return share_in_pupil(self.chain, self.relay.angular_magnification, self.emitter_mm, self.pupil_mm)
 
     @property
     def relay(self) -> Relay:
@@ -65,7 +89,10 @@ class Side:
 
 @dataclass(frozen=True)
 class OpticalBudget:
-    """Numbers of a design; fields are full angles at the eye, `long` and `short` are the sensor's sides."""
+    """Numbers of a design; fields are full angles at the eye, `long` and `short` are the sensor's sides.
+
+    Of `light`, the power at the cornea is that of the whole ring, the rest that of the share in the pupil.
+    """
 
     field_deg: float
     retina_mm: float
@@ -100,9 +127,26 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
     chain, camera, pupil_mm = geometry_of(spec) or path.ring, spec.camera, spec.light.pupil_mm or path.eye.pupil_mm
     colour = spec.light.colour
     lamp = (lamps_of(spec) or {}).get(colour) or Lamp(LED[colour], len(ring(chain)))
-    return Design(
+    found = Design(
         spec.name, path, spec.optics, chain, camera.rows, camera.cols, camera.pitch_um, path.eye.focal_mm, pupil_mm,
-        colour, camera.exposure_s, lamp.led, lamp.emitter_mm, camera.read_noise_e,
+        colour, camera.exposure_s, lamp.led, lamp.emitter_mm, camera.read_noise_e, spec.light.radiometry,
+    )  # fmt: skip
+    if found.measured is None:
+        return found
+    times = found.measured.retina_mw_per_cm2 / _whole_light(found).retina_mw_per_cm2
+    return replace(found, led=replace(found.led, power_mw=times * found.led.power_mw))
+
+
+def lit_area_cm2(field_deg: float, eye_mm: float = 17.0) -> float:
+    """Return the lit area of a retina, cm2, for a full field angle and the eye's focal length."""
+    return pi * (eye_mm / 10 * tan(radians(field_deg / 2))) ** 2
+
+
+def _whole_light(design: Design) -> PhotonBudget:
+    """Return the photon budget of the whole ring, whatever the eye's pupil."""
+    return photon_budget(
+        design.colour, design.pitch_um, design.optics.field_deg, design.eye_mm, design.relay, len(ring(design.chain)),
+        design.led,
     )  # fmt: skip
 
 
@@ -117,10 +161,13 @@ def design_of_sensor(path: LightPath, sensor: SensorProfile) -> Design:
 def optical_budget(design: Design) -> OpticalBudget:
     """Return all numbers of a design, by the formulas in `eye.py`, `matrix.py` and `illumination.py`."""
     relay, field, pitch_um = design.relay, design.optics.field_deg, design.pitch_um
-    leds = len(ring(design.chain))
-    light = photon_budget(design.colour, pitch_um, field, design.eye_mm, relay, leds, design.led)
+    whole, inside = _whole_light(design), design.share_in_pupil
+    light = PhotonBudget(
+        whole.cornea_mw, inside * whole.retina_mw_per_cm2, inside * whole.image_nw, inside * whole.electrons_per_px_s
+    )
     electrons = light.electrons_per_px_s * design.exposure_s
-    finest_deg = half_period_deg(electrons, pitch_um)
+    peak_e = electrons / MEAN_OVER_PEAK
+    finest_deg = half_period_deg(peak_e, pitch_um)
     long, short = (_side(relay, field, side_mm) for side_mm in design.sides_mm)
     return OpticalBudget(
         field_deg=field,
@@ -136,7 +183,7 @@ def optical_budget(design: Design) -> OpticalBudget:
         pupil_margin_mm=relay.pupil_margin_mm(design.pupil_mm),
         filled_field_deg=relay.filled_field_deg(design.pupil_mm),
         led_cone_deg=relay.led_cone_deg(field),
-        leds=leds,
+        leds=len(ring(design.chain)),
         ring_at_pupil_mm=ring_at_pupil_mm(design.chain, relay.angular_magnification),
         inner_ring_at_pupil_mm=inner_ring_at_pupil_mm(design.chain, relay.angular_magnification),
         reflex_free_mm=reflex_free_mm(field / 2),
@@ -146,7 +193,7 @@ def optical_budget(design: Design) -> OpticalBudget:
         electrons_per_px=electrons,
         half_period_deg=finest_deg,
         half_period_um=radians(finest_deg) * design.eye_mm * 1000,
-        within_simulated_range=within_simulated_range(electrons, pitch_um),
+        within_simulated_range=within_simulated_range(peak_e, pitch_um),
     )
 
 

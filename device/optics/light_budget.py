@@ -2,22 +2,25 @@
 
 The product of the factors is the mean number of electrons in a cell of 10 um on the sensor, of all frames of a picture
 together. It is `photon_budget` taken apart, times the share of the ring that the eye's pupil passes (OPTICS.md 4.6).
+Where the head file has a measured irradiance, the LED's power is what gives it, and the parts before the cornea have no
+uncertainty of their own.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi, prod, radians, sin, sqrt, tan
 from typing import Literal
 
 import numpy as np
 
 from device.optics import field_extent
-from device.optics.budget import Design
-from device.optics.illumination import PLANCK_LIGHT_J_M, RELAY_HALF_CONE_DEG
-from device.optics.matrix import ring, share_in_pupil
+from device.optics.budget import Design, lit_area_cm2
+from device.optics.illumination import PLANCK_LIGHT_J_M, half_cone_deg
+from device.optics.matrix import ring
 
 CELL_UM = 10.0
-ENOUGH_E = 5000.0  # electrons per cell of 10 um that a picture of vessels should have
+ENOUGH_E = 5000.0  # electrons per cell of 10 um that a picture of vessels should have: an estimate by eye, no source
+METER_SPREAD = 0.13  # of a measured ring: 1.3, the least guard factor, in 95 %
 DRAWS = 20000
 Cause = Literal["safety", "LED", "coupling", "polarisers", "splitter", "pupil", "eye", "pixel", "exposure"]
 
@@ -49,7 +52,22 @@ class Spread:
 
 def chain(design: Design, level: float = 1.0, frames: int = 1) -> tuple[Factor, ...]:
     """Return the factors of a design at `level` (0 to 1] of full drive, over `frames` exposures of one picture."""
-    return (*_to_eye(design, level), *_from_eye(design), *_sensor(design, frames))
+    lamp = _lamp(design, level)
+    if design.radiometry is not None and design.measured is not None:
+        lamp = [replace(factor, spread=0.0) for factor in lamp]
+        source = f"measured: {design.radiometry.measured}"
+        lamp[2] = replace(lamp[2], spread=METER_SPREAD, source=source)
+    return (*lamp, *_into_eye(design), *_from_eye(design), *_sensor(design, frames))
+
+
+def cornea_mw(factors: Sequence[Factor]) -> float:
+    """Return the power of the whole ring at the eye, mW, of which the pupil passes a share."""
+    return product(to_cornea(factors))
+
+
+def to_cornea(factors: Sequence[Factor]) -> Sequence[Factor]:
+    """Return the first factors of a chain, up to the power of the whole ring at the eye."""
+    return factors[: [factor.name for factor in factors].index("share in the pupil")]
 
 
 def product(factors: Sequence[Factor]) -> float:
@@ -86,21 +104,26 @@ def retina_mw_per_cm2(factors: Sequence[Factor]) -> float:
     return product(factors[: names.index("lit retina") + 1])
 
 
-def _to_eye(design: Design, level: float) -> list[Factor]:
-    magnification = design.relay.angular_magnification
-    inside = share_in_pupil(design.chain, magnification, design.emitter_mm, design.pupil_mm)
-    lit_cm2 = pi * (design.eye_mm / 10 * tan(radians(design.optics.field_deg / 2))) ** 2
+def _lamp(design: Design, level: float) -> list[Factor]:
+    half_deg = half_cone_deg(design.optics.field_deg, design.relay.angular_magnification)
+    places = "ring of hardware/optics.toml" if design.chain == design.path.ring else "head file"
     return [
         Factor("drive", level, "", 0.0, "safety", "full drive, or what the light limits permit", 1.0),
-        Factor("LEDs", len(ring(design.chain)), "", 0.0, "LED", "head file"),
-        Factor("power of an LED", design.led.power_mw, "mW", 0.35, "LED", "data sheet; a factor of two until measured"),
-        Factor("share in the cone", sin(radians(RELAY_HALF_CONE_DEG)) ** 2, "", 0.1, "coupling",
-               "sin^2 of 12.5 deg, Lambertian emitter", 1.0),
-        Factor("share in the pupil", inside, "", 0.1, "coupling", "image of ring and emitter in the eye's pupil", 1.0),
+        Factor("LEDs", len(ring(design.chain)), "", 0.0, "LED", places),
+        Factor("power of an LED", design.led.power_mw, "mW", 0.35, "LED", "estimate; a factor of two until measured"),
+        Factor("share in the cone", sin(radians(half_deg)) ** 2, "", 0.1, "coupling",
+               f"sin^2 of {half_deg:.1f} deg, Lambertian emitter", 1.0),
         Factor("polariser", 0.42, "", 0.1, "polarisers", "film, unpolarised light", 1.0),
         Factor("splitter to the eye", 0.5, "", 0.05, "splitter", "50:50 plate", 1.0),
         Factor("relay to the eye", 0.9, "", 0.03, "coupling", "four doublets, coated", 1.0),
-        Factor("lit retina", 1 / lit_cm2, "/cm2", 0.1, "eye",
+    ]  # fmt: skip
+
+
+def _into_eye(design: Design) -> list[Factor]:
+    return [
+        Factor("share in the pupil", design.share_in_pupil, "", 0.1, "coupling",
+               f"image of ring and emitter in a pupil of {design.pupil_mm:g} mm", 1.0),
+        Factor("lit retina", 1 / lit_area_cm2(design.optics.field_deg, design.eye_mm), "/cm2", 0.1, "eye",
                f"{design.optics.field_deg:g} deg, f = {design.eye_mm:g} mm"),
     ]  # fmt: skip
 

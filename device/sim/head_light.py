@@ -15,7 +15,7 @@ from device.errors import SpecError
 from device.optics import field_extent
 from device.optics.budget import Design, design_of_head
 from device.optics.illumination import LED
-from device.optics.light_budget import CELL_UM, chain, product, retina_mw_per_cm2
+from device.optics.light_budget import CELL_UM, chain, product
 from device.optics.light_path import LightPath, load_light_path
 from device.optics.matrix import lamps_of, ring
 from device.values import Colour
@@ -36,14 +36,12 @@ def head_light(spec: InstrumentSpec, colour: Colour) -> HeadLight:
     lamp, without LEDs of that colour, or without the tables [optics] and [sim].
     """
     design = _design(spec, colour)
-    factors = chain(design)
-    mean_e = product(factors) * (design.pitch_um / CELL_UM) ** 2
+    mean_e = product(chain(design)) * (design.pitch_um / CELL_UM) ** 2
     leds = f"{len(ring(design.chain))} {colour} LEDs of {design.led.power_mw:g} mW"
-    origin = f"{leds}, not measured: right within a factor of two"
-    beam = None if spec.light.radiometry is None else spec.light.radiometry.beam(colour)
-    if spec.light.radiometry is not None and beam is not None:
-        mean_e *= beam.retina_mw_per_cm2 / retina_mw_per_cm2(factors)
-        origin = f"{beam.retina_mw_per_cm2:g} mW/cm2 on the retina, measured: {spec.light.radiometry.measured}"
+    origin = f"{leds}, not measured: 90 % of heads and eyes within a factor of 2.5"
+    beam = design.measured
+    if design.radiometry is not None and beam is not None:
+        origin = f"{beam.retina_mw_per_cm2:g} mW/cm2 on the retina, measured: {design.radiometry.measured}"
     diameter_px = 1000 * field_extent.extent_mm(design.relay, design.optics.field_deg) / design.pitch_um
     return HeadLight(mean_e, pi * diameter_px**2 / 4, f"the budget's mean is {mean_e:.0f}: {origin}")
 

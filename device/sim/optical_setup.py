@@ -19,7 +19,7 @@ from device.config.head_file import InstrumentSpec, OpticsSpec
 from device.config.scene import SimSpec
 from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
-from device.optics.illumination import PEAK_UM
+from device.optics.illumination import MEAN_OVER_PEAK, PEAK_UM
 from device.sim.fundus import Fundus
 from device.sim.head_light import HeadLight, head_light
 from device.sim.sensor import SensorModel
@@ -31,7 +31,6 @@ TRIM: dict[Colour, float] = {"red": 1.5, "green": 1.0, "blue": 0.9, "amber": 1.2
 TABLE_E, TABLE_PITCH_UM = 20000.0, 5.04  # reference light of the tabulated etas: peak electrons and pixel pitch
 LIT_SHARE = 0.37  # of the peak: the mean of the lit pixels of a retina behind this diffuser
 SENSOR_SHARE = 0.15  # of the peak: the mean of the paper's whole sensor
-DISC_SHARE = 0.30  # of the peak: the mean of the disc d + 2 s (OPTICS.md 4.7)
 
 Place = tuple[float, float]  # on the retina, in the eye's view: degrees to the right of the axis, and down
 
@@ -94,7 +93,7 @@ class Scene:
         """
         budget, peak_e = self.budget, self.sim.peak_e
         if budget is not None:
-            return budget.mean_e / DISC_SHARE
+            return budget.mean_e / MEAN_OVER_PEAK
         assert peak_e != "budget"
         return TRIM[self.colour] * peak_e
 

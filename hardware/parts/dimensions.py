@@ -25,9 +25,9 @@ class Bought:
     diffuser_mm: float = 25.0  # measure; Edmund's catalogue calls 47-989 a disc of 25 mm
     diffuser_thick_mm: float = 0.76  # measure; a film on polycarbonate
     diffuser_index: float = 1.58
-    board_mm: float = 38.0  # Raspberry Pi HQ and Global Shutter camera, their mechanical drawings
+    board_mm: float = 38.0  # measure; Raspberry Pi HQ and Global Shutter camera, their mechanical drawings
     board_thick_mm: float = 1.4
-    board_holes_mm: float = 30.0  # square of four, 2.5 mm wide, 4 mm from the edges
+    board_holes_mm: float = 30.0  # measure; square of four, 2.5 mm wide, 4 mm from the edges
     image_above_board_mm: float = 1.2  # measure: depth gauge on the cover glass, less the two lengths of glass below
     package_mm: float = 12.0
     cover_glass_mm: float = 0.5  # measure, or the sensor's data sheet

@@ -13,6 +13,7 @@ from device.optics.illumination import LED, Led, led_at
 from device.optics.light_budget import ENOUGH_E, chain, log_sd, product
 from device.values import Colour
 from services.lab.light_report import expected_beam, half_period_um, limit_shares, permitted_level
+from services.lab.optics_report import widest_iris_mm
 
 BELOW = 1.645  # standard deviations above the 5 % quantile of a log-normal product
 SUPPLY_MA = 500.0  # below the least limit of the load switch, TPS2553 with 43.2 kOhm: 544 mA
@@ -73,7 +74,8 @@ def search(base: Design) -> list[Candidate]:
     """Return all candidates of the grid around a design, those with enough light first, then by seconds of light.
 
     Left out: rings whose current the supply does not give, whose image does not clear the cornea's reflex, or does not
-    fit into the pupil to more than a half, and irises wider than the pupil's margin permits.
+    fit into the pupil to more than a half; irises wider than the pupil's margin permits, or whose caustic is too wide
+    for the sensor to be calibrated.
     """
     limits = light_limits()
     found = [one for one in _candidates(base, limits) if one is not None]
@@ -94,9 +96,11 @@ def _candidate(
 ) -> Candidate | None:  # fmt: skip
     around = ChainSpec(rows=1, cols=1, pitch_mm=1, axis=(0, -ring_mm / 2), leds=(0,))  # one LED stands for the ring
     design = replace(
-        base, chain=around, colour=choice.colour, led=choice.led, emitter_mm=choice.emitter_mm, exposure_s=exposure_s,
-        optics=base.optics.model_copy(update={"iris_um": iris_um}),
+        base, radiometry=None, chain=around, colour=choice.colour, led=choice.led, emitter_mm=choice.emitter_mm,
+        exposure_s=exposure_s, optics=base.optics.model_copy(update={"iris_um": iris_um}),
     )  # fmt: skip
+    if iris_um / 1000 > widest_iris_mm(base):
+        return None
     inner_mm = design.relay.angular_magnification * (ring_mm - choice.emitter_mm) / 2
     if inner_mm <= reflex_free_mm(design.optics.field_deg / 2) or design.relay.pupil_margin_mm(design.pupil_mm) < 0:
         return None
@@ -105,8 +109,7 @@ def _candidate(
     shares = limit_shares(design, replace(all_of_them, waist_w_per_cm2=one.waist_w_per_cm2), limits)
     level = permitted_level(shares)
     factors = chain(whole, level, frames)
-    inside = next(factor.value for factor in factors if factor.name == "share in the pupil")
-    if inside <= 0.5:
+    if whole.share_in_pupil <= 0.5:
         return None
     electrons, worst = product(factors), max(shares, key=lambda share: share.used)
     return Candidate(
@@ -122,6 +125,7 @@ def table(base: Design, most: int = 25) -> str:
     lines = [
         f"{len(found)} heads, {len(enough)} of them with at least {ENOUGH_E:g} electrons in a cell of 10 um; "
         "measured ring, guard factor 1.3",
+        "another iris than the head's is another print, another ring another LED cap and board",
         f"{'LED':<17}{'colour':<7}{'n':>3}{'ring':>7}{'iris':>6}{'ms':>5}{'x':>3}{'drive':>7}{'electrons':>10}"
         f"{'5 %':>8}{'um':>5}  most used limit",
     ]

@@ -1,28 +1,41 @@
-"""Light budget of a head as text and plot: the chain of factors, what limits it, and the limits of light at an eye."""
+"""Light budget of a head as text and plot: the chain of factors, what limits it, and the limits of light at an eye.
 
-from dataclasses import dataclass
-from math import floor, log10, pi, radians, tan
+The limits are judged for the worst eye, whose pupil passes the light of the whole ring, as `diffuscope light` judges a
+meter's reading; the electrons are those that the design's pupil lets in.
+"""
 
-from device.config.radiometry import WAIST_CM2
+from dataclasses import dataclass, replace
+from math import ceil, floor, log10, radians
+
+import numpy as np
+
+from device.config.radiometry import LED_FWHM_UM, WAIST_CM2
+from device.errors import SettingError
 from device.light_safety.hazard import Beam, Hazard, Limits, light_limits, worst_beam
-from device.optics.budget import Design
-from device.optics.illumination import half_period_deg
+from device.optics.budget import Design, lit_area_cm2
+from device.optics.illumination import MEAN_OVER_PEAK, half_period_deg, within_simulated_range
 from device.optics.light_budget import (
     CELL_UM,
+    DRAWS,
     ENOUGH_E,
     Factor,
+    Spread,
     chain,
+    cornea_mw,
     possible_gains,
     product,
-    retina_mw_per_cm2,
     simulated,
+    to_cornea,
 )
-from device.optics.matrix import ring
+from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
 from device.values import Illumination
 from services.lab.plot import STYLE, line, text
 
 GUARD = 1.3  # factor of a measured ring, the least that a head file may have
 REFERENCE_CELL_UM = 5.04
+SMALL_PUPIL_MM = 7.0  # beside that of the design: what dilates less
+HOLE_MARGIN_MM = 0.3  # of a meter's hole, so that it need not be centred to better than 0.15 mm
+WEIGHT_SPREAD = 0.2  # of ln A(lambda) over a bin of 15 nm of green LEDs, by the slope of ln 10 / 50 nm
 
 
 @dataclass(frozen=True)
@@ -40,13 +53,81 @@ class LimitShare:
         return self.value / self.limit
 
 
+@dataclass(frozen=True)
+class FullDrive:
+    """Builds of a design at full drive by Monte Carlo: photochemical share of the limit, and which exceed it.
+
+    `no_go`: share of the builds above the limit, 0 to 1. `electrons`: in a cell of 10 um, where such a build has its
+    current lowered to the limit.
+    """
+
+    share: Spread
+    no_go: float
+    electrons: Spread
+
+
+def meter_hole_mm(design: Design) -> float:
+    """Return the diameter of the hole before a power meter at the eye's pupil, mm: the whole ring shines through it.
+
+    A smaller one, such as a pupil of 7 mm, cuts the spots of the LEDs off, and the meter would miss most of the light.
+    """
+    magnification = design.relay.angular_magnification
+    ring_mm = ring_at_pupil_mm(design.chain, magnification) + magnification * design.emitter_mm
+    return float(ceil(ring_mm + HOLE_MARGIN_MM))
+
+
+def expected_mw(design: Design) -> float:
+    """Return the power that the light budget expects behind the meter's hole at full drive, mW."""
+    return cornea_mw(chain(design))
+
+
 def expected_beam(design: Design) -> Beam:
-    """Return the beam that the budget expects, times the guard factor of a measured ring."""
-    factors = chain(design)
-    names = [factor.name for factor in factors]
-    cornea_mw = product(factors[: names.index("lit retina")]) / len(ring(design.chain))
-    return Beam(
-        design.led.wavelength_um, GUARD * retina_mw_per_cm2(factors) / 1000, GUARD * cornea_mw / WAIST_CM2 / 1000
+    """Return the beam that the budget expects in an eye that takes in the whole ring, or else the measured one.
+
+    The guard factor of a measured ring is in it.
+    """
+    table, measured = design.radiometry, design.measured
+    if table is not None and measured is not None:
+        scale = table.guard_factor / 1000
+        retina, waist = measured.retina_mw_per_cm2, measured.waist_mw_per_cm2
+        return Beam(measured.wavelength_um, scale * retina, scale * waist, measured.fwhm_um)
+    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.path.eye.focal_mm)
+    scale, power_mw = GUARD / 1000, expected_mw(design)
+    waist = power_mw / len(ring(design.chain)) / WAIST_CM2
+    return Beam(design.led.wavelength_um, scale * power_mw / lit_cm2, scale * waist, LED_FWHM_UM)
+
+
+def at_full_drive(design: Design, frames: int = 1) -> FullDrive:
+    """Return what builds of a design give at full drive, each factor of the chain log-normal and drawn once a build.
+
+    The share has those of the chain up to the cornea, and of an unmeasured ring the wavelength's within a bin.
+    """
+    factors, rng = chain(design, frames=frames), np.random.default_rng(0)
+    before = len(to_cornea(factors))
+    spreads = np.array([factor.spread for factor in factors])
+    logs = rng.standard_normal((DRAWS, len(factors))) * spreads
+    weight = 0.0 if design.measured else WEIGHT_SPREAD
+    bins = weight * rng.standard_normal(DRAWS)
+    used = limit_shares(design, expected_beam(design), light_limits())[0].used
+    share = used * np.exp(logs[:, :before].sum(axis=1) + bins)
+    electrons = product(factors) * np.exp(logs.sum(axis=1)) * np.minimum(1, 1 / share)
+    (low, half, high), (low_e, half_e, high_e) = (np.quantile(one, (0.05, 0.5, 0.95)) for one in (share, electrons))
+    return FullDrive(
+        Spread(float(half), float(low), float(high)), float((share > 1).mean()),
+        Spread(float(half_e), float(low_e), float(high_e)),
+    )  # fmt: skip
+
+
+def refuse_dark(design: Design) -> None:
+    """Raise SettingError for a design whose pupil passes no light of the ring: it has no budget."""
+    if design.share_in_pupil > 0:
+        return
+    magnification = design.relay.angular_magnification
+    begins_mm = inner_ring_at_pupil_mm(design.chain, magnification) - magnification * design.emitter_mm
+    raise SettingError(
+        f"no light reaches the sensor: a pupil of {design.pupil_mm:g} mm passes nothing of this ring, whose image at "
+        f"the eye begins at a diameter of {begins_mm:.2f} mm",
+        f"Give a pupil wider than {begins_mm:.2f} mm (--pupil-mm), or a head with a narrower ring.",
     )
 
 
@@ -73,35 +154,44 @@ def permitted_level(shares: tuple[LimitShare, ...]) -> float:
 
 def half_period_um(design: Design, electrons_per_cell: float) -> float:
     """Return the expected half-period on the retina, um, of a picture with that light (OPTICS.md 4.3)."""
-    electrons = electrons_per_cell * (REFERENCE_CELL_UM / CELL_UM) ** 2
-    return radians(half_period_deg(electrons, REFERENCE_CELL_UM)) * design.eye_mm * 1000
+    return radians(half_period_deg(_peak_e(electrons_per_cell), REFERENCE_CELL_UM)) * design.eye_mm * 1000
+
+
+def _peak_e(electrons_per_cell: float) -> float:
+    """Return the electrons of the brightest pixel of REFERENCE_CELL_UM by the mean in a cell of 10 um."""
+    return electrons_per_cell * (REFERENCE_CELL_UM / CELL_UM) ** 2 / MEAN_OVER_PEAK
 
 
 def table(design: Design, frames: int = 1) -> str:
-    """Return chain, uncertainty, limits, permitted drive and gains of a design as text."""
+    """Return chain, uncertainty, limits, permitted drive and gains of a design as text; errors as `refuse_dark`."""
+    refuse_dark(design)
     factors, limits = chain(design, frames=frames), light_limits()
     return "\n".join([
         f"{design.title}: {design.colour}, {frames} frame(s) of {1000 * design.exposure_s:g} ms, "
         f"electrons in a cell of {CELL_UM:g} um",
-        *_chain_lines(factors), "", *_limit_lines(design, limits, frames), "", *_gain_lines(factors),
+        *_chain_lines(design, factors, frames), "",
+        *_limit_lines(design, limits, frames), *_build_lines(design, frames), "",
+        *_gain_lines(factors),
     ])  # fmt: skip
 
 
-def _chain_lines(factors: tuple[Factor, ...]) -> list[str]:
+def _chain_lines(design: Design, factors: tuple[Factor, ...], frames: int) -> list[str]:
     lines = [f"{'factor':<26}{'value':>10} {'unit':<5}{'sd of ln':>8}  {'belongs to':<11}source"]
     lines += [
         f"{one.name:<26}{one.value:>10.4g} {one.unit:<5}{one.spread:>8.2f}  {one.cause:<11}{one.source}"
         for one in factors
     ]
-    spread = simulated(factors)
+    spread, small = simulated(factors), product(chain(replace(design, pupil_mm=SMALL_PUPIL_MM), frames=frames))
     return [
         *lines,
-        f"{'product':<26}{product(factors):>10.0f} e-   90 % of draws: {spread.low:.0f} to {spread.high:.0f}",
+        f"{'product':<26}{product(factors):>10.0f} e-   90 % of draws: {spread.low:.0f} to {spread.high:.0f}, with a "
+        f"pupil of {design.pupil_mm:g} mm; with one of {SMALL_PUPIL_MM:g} mm {small:.0f}",
     ]
 
 
 def _limit_lines(design: Design, limits: Limits, frames: int) -> list[str]:
-    lines = [f"{'limit, standard x share':<26}{'limit':>12} {'unmeasured ring':>22} {'as expected, x 1.3':>22}"]
+    found = "as expected, x 1.3" if design.radiometry is None or design.measured is None else "as measured"
+    lines = [f"{'limit, standard x share':<26}{'limit':>12} {'unmeasured ring':>22} {found:>22}   all light enters"]
     beams = (unmeasured_beam(design), expected_beam(design))
     both = [limit_shares(design, beam, limits) for beam in beams]
     for worst, expected in zip(*both, strict=True):
@@ -117,10 +207,28 @@ def _limit_lines(design: Design, limits: Limits, frames: int) -> list[str]:
         "permitted drive": [f"{level:.3g}" for level in levels],
         "dose of a picture, J/cm2": [f"{dose:.2g} = {100 * dose / stop:.2g} %" for dose in doses],
         "electrons in a cell": [f"{one:.0f}" for one in electrons],
-        "half-period, um": [f"{half_period_um(design, one):.0f}" for one in electrons],
+        "half-period, um": [_half_period(design, one) for one in electrons],
         f"enough ({ENOUGH_E:g} e-)": ["yes" if one >= ENOUGH_E else "no" for one in electrons],
     }
     return [*lines, *(f"{name:<39} {first:>22} {second:>22}" for name, (first, second) in rows.items())]
+
+
+def _half_period(design: Design, electrons: float) -> str:
+    """Return the half-period, with a mark where no simulation supports it."""
+    known = within_simulated_range(_peak_e(electrons), REFERENCE_CELL_UM)
+    return f"{'' if known else 'not simulated: '}{half_period_um(design, electrons):.0f}"
+
+
+def _build_lines(design: Design, frames: int) -> list[str]:
+    found = at_full_drive(design, frames)
+    share, electrons = found.share, found.electrons
+    return [
+        f"photochemical limit at full drive, as expected: 90 % of builds use {100 * share.low:.0f} to "
+        f"{100 * share.high:.0f} %, {100 * found.no_go:.0f} % of builds are NO GO",
+        "  such a build needs less current, of a constant-current ring by another resistor; all within the limit:",
+        f"  median {electrons.median:.0f} electrons, 90 % {electrons.low:.0f} to {electrons.high:.0f}, half-period "
+        f"{_half_period(design, electrons.median)} um",
+    ]
 
 
 def _gain_lines(factors: tuple[Factor, ...]) -> list[str]:
@@ -132,7 +240,11 @@ WIDE, BAR, LEFT = 640, 26, 130
 
 
 def gains_svg(design: Design, frames: int = 1) -> str:
-    """Return bars, logarithmic from 1 to 100, of the possible gains of light by cause, and the light itself, as SVG."""
+    """Return bars, logarithmic from 1 to 100, of the possible gains of light by cause, and the light itself, as SVG.
+
+    Errors as `refuse_dark`.
+    """
+    refuse_dark(design)
     factors = chain(design, frames=frames)
     gains = {cause: gain for cause, gain in possible_gains(factors).items() if gain > 1}
     spread, scale, y = simulated(factors), (WIDE - LEFT - 70) / log10(100), 92.0
@@ -151,8 +263,3 @@ def gains_svg(design: Design, frames: int = 1) -> str:
         f'aria-label="Possible gains of light by cause"><style>{STYLE}</style>'
         f'<rect class="ground" width="{WIDE}" height="{y:.0f}"/>{"".join(parts)}</svg>\n'
     )
-
-
-def lit_area_cm2(field_deg: float, eye_mm: float = 17.0) -> float:
-    """Return the lit area of a retina, cm2, for a full field angle: the chain's factor `lit retina`, inverted."""
-    return pi * (eye_mm / 10 * tan(radians(field_deg / 2))) ** 2

@@ -1,30 +1,27 @@
 """Power meter's reading of a ring: its plausibility, its shares of the limits, and the lines of the head file."""
 
 from dataclasses import dataclass, replace
-from math import ceil
 from typing import get_args
 
 from device.config.head_file import InstrumentSpec
-from device.config.radiometry import WAIST_CM2, BeamSpec, RadiometrySpec
+from device.config.radiometry import LED_FWHM_UM, WAIST_CM2, BeamSpec, RadiometrySpec
 from device.errors import SettingError, SpecError
-from device.light_safety.hazard import LED_POWER_UNCERTAINTY, Hazard, light_limits, radiometry
-from device.optics.budget import Design
+from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
+from device.optics.budget import Design, lit_area_cm2
 from device.optics.illumination import TRANSMISSION_TO_EYE
-from device.optics.light_budget import chain, product
-from device.optics.matrix import lamps_of, ring_at_pupil_mm
+from device.optics.matrix import lamps_of
 from device.values import Colour
-from services.lab.light_report import LimitShare, limit_shares, lit_area_cm2, permitted_level
+from services.lab.light_report import LimitShare, expected_beam, expected_mw, limit_shares, permitted_level
 
 PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
-HOLE_MARGIN_MM = 0.3  # of the meter's hole, so that it need not be centred to better than 0.15 mm
 
 
 @dataclass(frozen=True)
 class MeterReading:
     """Reading of the whole ring in one colour at full drive: power through `meter_hole_mm`, mW, and in the waist.
 
-    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date. `scaled` makes it
-    of a reading at less than full drive.
+    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date; `fwhm_nm` is the
+    spectrum's width. `scaled` makes it of a reading at less than full drive.
     """
 
     colour: Colour
@@ -33,6 +30,7 @@ class MeterReading:
     peak_nm: float
     meter: str
     guard_factor: float = 1.3
+    fwhm_nm: float = 1000 * LED_FWHM_UM
 
     def scaled(self, level: float) -> "MeterReading":
         """Return the reading at full drive of one that was taken at `level` (0 to 1] of it: the drive is a PWM."""
@@ -78,35 +76,18 @@ def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> Metere
     lamp = (lamps_of(spec) or {}).get(reading.colour)
     if lamp is None:
         raise SpecError(f"{spec.name} has no {reading.colour} LEDs", "Give the head file whose ring was measured.")
-    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw(design))
-    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.eye_mm)
+    unmeasured = replace(design, led=lamp.led, radiometry=None)
+    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw(unmeasured))
+    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.path.eye.focal_mm)
     beam = BeamSpec(
-        wavelength_um=reading.peak_nm / 1000, retina_mw_per_cm2=reading.power_mw / lit_cm2,
-        waist_mw_per_cm2=reading.waist_mw_per_cm2,
+        wavelength_um=reading.peak_nm / 1000, fwhm_um=reading.fwhm_nm / 1000,
+        retina_mw_per_cm2=reading.power_mw / lit_cm2, waist_mw_per_cm2=reading.waist_mw_per_cm2,
     )  # fmt: skip
     found = RadiometrySpec(
         measured=reading.meter, guard_factor=reading.guard_factor, **{reading.colour: beam}
     )  # the other colours stay at their worst
-    limits = light_limits()
-    beams = radiometry(found, design.optics.field_deg, lamps=lamps_of(spec))
-    shares = limit_shares(design, Hazard(beams, limits).beams[reading.colour], limits)
+    shares = limit_shares(design, expected_beam(replace(design, radiometry=found)), light_limits())
     return MeteredLight(found, shares, permitted_level(shares))
-
-
-def meter_hole_mm(design: Design) -> float:
-    """Return the diameter of the hole before a power meter at the eye's pupil, mm: the whole ring shines through it.
-
-    A smaller one, such as a pupil of 7 mm, cuts the spots of the LEDs off, and the meter would miss most of the light.
-    """
-    magnification = design.relay.angular_magnification
-    ring_mm = ring_at_pupil_mm(design.chain, magnification) + magnification * design.emitter_mm
-    return float(ceil(ring_mm + HOLE_MARGIN_MM))
-
-
-def expected_mw(design: Design) -> float:
-    """Return the power that the light budget expects behind the meter's hole at full drive, mW."""
-    factors = chain(replace(design, pupil_mm=meter_hole_mm(design)))
-    return product(factors[: [factor.name for factor in factors].index("lit retina")])
 
 
 def _refuse_implausible(reading: MeterReading, wavelength_um: float, usual_mw: float) -> None:
@@ -140,6 +121,7 @@ def words(reading: MeterReading, found: MeteredLight) -> str:
     return "\n".join([
         *(f"{one.name:<14} {one.value:>9.3g} of {one.limit:g} {one.unit}: {one.used:.0%}" for one in found.shares),
         verdict, "", "[light.radiometry]", f'measured = "{reading.meter}"', f"guard_factor = {reading.guard_factor:g}",
-        f"[light.radiometry.{reading.colour}]", f"wavelength_um = {beam.wavelength_um:g}",
+        f"[light.radiometry.{reading.colour}]",
+        f"wavelength_um = {beam.wavelength_um:g}", f"fwhm_um = {beam.fwhm_um:g}",
         f"retina_mw_per_cm2 = {beam.retina_mw_per_cm2:.4g}", f"waist_mw_per_cm2 = {beam.waist_mw_per_cm2:g}",
     ])  # fmt: skip

@@ -10,7 +10,7 @@ the promised resolution (OPTICS.md 4.3), so a dim head fails on light and not al
 
 import json
 from dataclasses import asdict, dataclass, replace
-from math import radians
+from math import exp, radians
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
 from device.optics import retina_chart
 from device.optics.budget import optical_budget
-from device.optics.illumination import half_period_deg
+from device.optics.illumination import MEAN_OVER_PEAK, half_period_deg
+from device.optics.light_budget import chain, log_sd
 from device.recon.assessment.image_quality import MISMATCHES
 from device.values import ExposureSettings, Illumination, Image
 from services import resources
@@ -33,19 +34,20 @@ from services.lab.optics_report import design_of
 from services.lab.reconstruct_file import reconstruct_file
 from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_raw
 
-PEAK_TO_MEAN = 3.35  # electrons of the brightest pixel over the mean of the lit disc: hardware/README.md
 FILL_SHARE = 0.5  # of the full well, that the brightest pixel is to reach
 WIDER = 1.2  # of the promised field: room for a field that is larger than promised
 RESOLVED = 0.2  # least modulation of resolved bars; 0.15 is Rayleigh's dip of 26 %, as contrast
 LEAST_AGREEMENT = 0.5  # 0.95 in a good picture, 0.78 at 170 electrons per pixel of 5.04 um, 0.06 in noise
 BARS_OVER_FORMULA = 0.6  # resolved period over that of the formula, which is of vessels: 0.46 to 0.6 in simulation
-LIGHT_FACTOR, SCALE_TOLERANCE, FIELD_TOLERANCE, STEP, GREY_TOLERANCE = 2.0, 0.025, 0.05, 1.27, 0.15
+SCALE_TOLERANCE, FIELD_TOLERANCE, STEP, GREY_TOLERANCE = 0.025, 0.05, 1.27, 0.15
+PAPER_SPREAD = 0.1  # of ln of the reflectance of printing paper (an estimate)
+TWO_SIDED_95 = 1.96  # standard deviations
 MOST_SATURATED = 0.01
 REASONS = {
     "resolution": "one step of the chart; OPTICS.md 4.3 for this light, and bars of full contrast (simulated)",
     "scale": "lens 25.0 or 25.2 mm (0.8 %), print (0.5 %), diffuser to sensor 6.0 +- 0.05 mm (0.8 %)",
     "field": "the holes of the LED cap, printed to 0.1 mm of 2.2 mm",
-    "light": "the LEDs' power is known within a factor of two until a power meter has measured it (OPTICS.md 5.2)",
+    "light": "95 % by the chain of OPTICS.md 4.6: polarisers, pupil, paper, and the LEDs' power until it is measured",
     "grey": "tone of a print: a laser printer's dots grow by up to 15 %",
 }
 REMEDIES = {
@@ -59,13 +61,17 @@ REMEDIES = {
 
 @dataclass(frozen=True)
 class Promise:
-    """What a head file promises of the chart; `lit_e` is the mean charge per pixel of the lit disc in one exposure."""
+    """What a head file promises of the chart; `lit_e` is the mean charge per pixel of the lit disc in one exposure.
+
+    `light_factor` is the factor within which 95 % of such heads are, by the light's chain: less for a measured ring.
+    """
 
     px_per_deg: float
     field_deg: float
     extent_px: float
     lit_e: float
     pitch_um: float
+    light_factor: float
 
 
 @dataclass(frozen=True)
@@ -128,7 +134,12 @@ def promise_of(spec: InstrumentSpec, exposure_s: float) -> Promise:
     white = replace(design, eye_mm=retina_chart.EYE_MM, led=replace(design.led, reflectance=reflectance))
     budget = optical_budget(replace(white, exposure_s=exposure_s))
     extent_px = 1000 * budget.extent_mm / design.pitch_um
-    return Promise(budget.px_per_deg, field_deg, extent_px, budget.electrons_per_px, design.pitch_um)
+    factors = [
+        replace(factor, spread=PAPER_SPREAD) if factor.name == "radiance of the fundus" else factor
+        for factor in chain(white)
+    ]
+    factor = exp(TWO_SIDED_95 * log_sd(factors))
+    return Promise(budget.px_per_deg, field_deg, extent_px, budget.electrons_per_px, design.pitch_um, factor)
 
 
 def mean_tone(field_deg: float) -> float:
@@ -145,7 +156,7 @@ def mean_tone(field_deg: float) -> float:
 def usual_exposure_s(spec: InstrumentSpec) -> float:
     """Return the exposure at which the brightest pixel reaches half of the full well, at most that of the head, s."""
     lit_e = promise_of(spec, spec.camera.exposure_s).lit_e
-    share = FILL_SHARE * spec.camera.full_well_e / (PEAK_TO_MEAN * lit_e)
+    share = FILL_SHARE * spec.camera.full_well_e * MEAN_OVER_PEAK / lit_e
     return float(spec.camera.exposure_s * min(1.0, share))
 
 
@@ -194,7 +205,7 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
     contrast = {int(group.period_um): modulation(made.picture, fit, group) for group in groups}
     rows = (
         _resolution(contrast, peak_e, promise), _scale(fit, promise), _field(wide, fit, promise),
-        _light(mean_e, promise), _grey(made.picture, fit),
+        light_row(mean_e, promise), _grey(made.picture, fit),
     )  # fmt: skip
     return ModelEyeResult(spec.name, frame.exposure_s, rows, contrast, fit, made.report.warnings, made.simulated)
 
@@ -291,9 +302,10 @@ def _field(wide: Image, fit: ChartFit, promise: Promise) -> Row:
     return _row("field", measured, field, field * (1 - FIELD_TOLERANCE), field * (1 + FIELD_TOLERANCE), "deg")
 
 
-def _light(mean_e: float, promise: Promise) -> Row:
-    light = promise.lit_e
-    return _row("light", mean_e, light, light / LIGHT_FACTOR, light * LIGHT_FACTOR, "e-/pixel")
+def light_row(mean_e: float, promise: Promise) -> Row:
+    """Return the figure of the light: mean electrons of a pixel of the lit disc against the promise."""
+    light, factor = promise.lit_e, promise.light_factor
+    return _row("light", mean_e, light, light / factor, light * factor, "e-/pixel")
 
 
 def _grey(picture: Image, fit: ChartFit) -> Row:

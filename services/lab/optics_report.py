@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from device.calibration.procedure.point_source import BORDER
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.sensors import known_sensors
 from device.errors import SettingError
@@ -35,6 +36,11 @@ def design(head: Path | None, sensor: str | None, eye_mm: float | None, pupil_mm
 def design_of(spec: InstrumentSpec) -> Design:
     """Return the design of a head's specification, with the light path of `hardware/optics.toml`."""
     return design_of_head(load_light_path(resources.LIGHT_PATH), spec)
+
+
+def widest_iris_mm(chosen: Design) -> float:
+    """Return the diameter of the widest iris whose caustic the calibration takes on this sensor: its border is dark."""
+    return (1 - 2 * BORDER) * chosen.sides_mm[1]
 
 
 def table(chosen: Design) -> str:
@@ -86,8 +92,11 @@ def _eye(chosen: Design, budget: OpticalBudget) -> list[Row]:
     filled = f"the iris stays filled within {budget.filled_field_deg:.1f} deg"
     if budget.pupil_margin_mm < 0:
         filled = "this pupil never fills the iris"
+    iris, widest_mm = f"of a pupil of {chosen.pupil_mm:g} mm", widest_iris_mm(chosen)
+    if chosen.relay.iris_mm > widest_mm:
+        iris += f"; TOO WIDE to be calibrated on this sensor, at most {widest_mm:.2f} mm at the diffuser"
     return [
-        ("iris at the pupil", f"{budget.iris_at_eye_mm:.2f} mm", f"of a pupil of {chosen.pupil_mm:g} mm"),
+        ("iris at the pupil", f"{budget.iris_at_eye_mm:.2f} mm", iris),
         ("pupil margin at the iris", f"{budget.pupil_margin_mm:.2f} mm", filled),
         ("ring at the pupil", f"{budget.ring_at_pupil_mm:.2f} mm", ring),
         ("first lens, clear", f"{budget.first_lens_mm:.1f} mm", _clear(budget.first_lens_mm, path.lens_mm)),
@@ -102,11 +111,15 @@ def _clear(needed_mm: float, there_mm: float) -> str:
 def _light(chosen: Design, budget: OpticalBudget) -> list[Row]:
     light = budget.light
     note = "photon-limited" if budget.within_simulated_range else "photon-limited; so little light was never simulated"
-    if not budget.within_simulated_range and budget.electrons_per_px * (5.04 / chosen.pitch_um) ** 2 > 2e3:
+    if not budget.within_simulated_range and light.image_nw == 0:
+        note = "no light of this ring passes the pupil"
+    elif not budget.within_simulated_range and budget.electrons_per_px * (5.04 / chosen.pitch_um) ** 2 > 2e3:
         note = "photon-limited; so much light was never simulated"
+    known = "as measured" if chosen.measured else "a guess within a factor of two"
+    inside = f"of it {chosen.share_in_pupil:.2f} in a pupil of {chosen.pupil_mm:g} mm"
     return [
-        ("light at the cornea", f"{light.cornea_mw:.3f} mW", f"{chosen.colour}, full drive; a guess within a factor 2"),
-        ("light on the retina", f"{light.retina_mw_per_cm2:.3f} mW/cm2", ""),
+        ("light at the cornea", f"{light.cornea_mw:.3f} mW", f"{chosen.colour}, full drive; {known}"),
+        ("light on the retina", f"{light.retina_mw_per_cm2:.3f} mW/cm2", inside),
         ("light in the image", f"{light.image_nw:.2f} nW", "of a human fundus, through crossed polarisers"),
         ("electrons in a pixel", f"{budget.electrons_per_px:.0f} e-", f"in {1000 * chosen.exposure_s:g} ms,"
          f" {light.electrons_per_px_s:.0f} e-/s; quantum efficiency of the paper's sensor"),

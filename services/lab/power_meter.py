@@ -16,13 +16,14 @@ from pathlib import Path
 
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
+from device.config.radiometry import LED_FWHM_UM
 from device.errors import SettingError
 from device.head import hazard_of, open_light, refuse_without_lamp, with_calibrated_light
 from device.light_safety.dose_ledger import Ledger
 from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
+from device.optics.budget import lit_area_cm2
 from device.values import Illumination
-from services.lab.light_report import GUARD, lit_area_cm2
-from services.lab.measured_light import expected_mw, meter_hole_mm
+from services.lab.light_report import GUARD, expected_mw, meter_hole_mm
 from services.lab.optics_report import design_of
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -37,7 +38,7 @@ class MeterRun:
     """What shines in pulses of `on_s` with equal pauses, and powers behind a hole of `hole_mm` while it is lit, mW.
 
     `expected_mw` is that of the light budget. No reading may exceed `assumed_mw`, which the guard counts for this
-    level, or `permitted_mw`, with which an eye has the instrument's limit, by the LEDs' wavelength and with a factor of
+    level, or `permitted_mw`, with which an eye has the instrument's limit, by the LEDs' spectrum and with a factor of
     1.3 for the meter's error.
     """
 
@@ -71,9 +72,10 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     hazard.refuse(glow)
     limits, beam = hazard.limits, hazard.beams[colour]
     lit_cm2 = lit_area_cm2(design.optics.field_deg, design.eye_mm)
+    spectrum = beam.wavelength_um, beam.fwhm_um or LED_FWHM_UM
     most_w_per_cm2 = min(
-        limits.photochemical_w_per_cm2 / limits.photochemical_weight.at(beam.wavelength_um),
-        limits.thermal_w_per_cm2 / limits.thermal_weight.at(beam.wavelength_um),
+        limits.photochemical_w_per_cm2 / limits.photochemical_weight.of_spectrum(*spectrum),
+        limits.thermal_w_per_cm2 / limits.thermal_weight.of_spectrum(*spectrum),
     )
     on_s = ON_SHARE * spec.light.max_on_s
     return MeterRun(
@@ -146,7 +148,7 @@ def words(head: Path, run: MeterRun, verdict: MeterVerdict) -> str:
     return "\n".join([
         f"GO at this level: {shown}, {times:.2g} times what is expected"
         + ("" if usual else "; look at polarisers, LEDs and the meter's place before you go on"),
-        "Measure the brightest disc of 1 mm in the waist as well, and the peak wavelength. Then:",
+        "Measure the brightest disc of 1 mm in the waist as well, and peak and width of the spectrum. Then:",
         f"diffuscope light --head {head} --colour {run.glow.colour} --level {run.glow.level:g} "
-        f'--power-mw {verdict.power_mw:.4g} --waist-mw-per-cm2 W --peak-nm L --meter "NAME, DATE"',
+        f'--power-mw {verdict.power_mw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
     ])  # fmt: skip

@@ -7,6 +7,7 @@ from functools import cache
 import pytest
 
 from device.config.head_file import OUTPUT_MA, load_head
+from hardware.gate.board import read_board
 from hardware.gate.failures import GATE, Failure, after_stop, failures, table
 from hardware.gate.netlist import Netlist, Pin, read
 from tests.project_files import ROOT, text
@@ -113,6 +114,40 @@ def test_failures_that_do_not_leave_the_leds_dark_are_those_of_the_document() ->
     numbers = re.search(r"for ever: (\d+) failures.*?(\d+) leave the LEDs dark", words, re.S)
     assert numbers is not None
     assert [int(one) for one in numbers.groups()] == [len(found), len(found) - len(listed)]
+
+
+def ohms(drawn: Netlist, one: str, other: str) -> list[str]:
+    """Return the values of the resistors between two nets."""
+    ends = {ref: {drawn.nets[ref, "1"], drawn.nets[ref, "2"]} for ref in drawn.values if ref[0] == "R"}
+    return [drawn.values[ref] for ref, nets in ends.items() if nets == {one, other}]
+
+
+def reached(drawn: Netlist, net: str) -> set[str | None]:
+    """Return the nets to which resistors lead from a net."""
+    nets = {net}
+    while more := {
+        other for ref in drawn.values if ref[0] == "R"
+        for here, other in itertools.permutations((drawn.nets[ref, "1"], drawn.nets[ref, "2"])) if here in nets
+    } - nets:  # fmt: skip
+        nets |= more
+    return nets
+
+
+def test_resistances_of_the_check_before_the_computer_are_those_of_the_schematic() -> None:
+    """Between supplies and ground no resistor conducts; heartbeat and gated supply have one to ground each."""
+    rows = re.findall(r"^\| (J\d) (\d+) and (\d+) \| (\S+), (\S+) \| ([^|,]+)", text("hardware/assembly.md"), re.M)
+    assert len(rows) == 5
+    pads, drawn = read_board("gate").pads, netlist()
+    for plug, one, other, first, second, shown in rows:
+        assert (pads[plug, one].net, pads[plug, other].net) == (first, second)
+        if shown.startswith("above"):
+            assert second not in reached(drawn, first), f"{first} to {second}"
+        else:
+            assert ohms(drawn, first, second) == [shown.replace(" ", "").strip()]
+    along = sorted((pad.place_mm[1], pad.net) for (ref, _), pad in pads.items() if ref == "J1")
+    for (_, one), (_, other) in itertools.pairwise(along):
+        assert one is not None
+        assert other not in reached(drawn, one), "the other neighbours"
 
 
 def test_every_component_of_the_gate_fails_in_the_table() -> None:

@@ -5,19 +5,22 @@ import re
 from collections import Counter
 from dataclasses import replace
 from functools import cache
-from math import radians, tan
+from math import degrees, radians, sqrt, tan
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
 from device.config.head_file import ChainSpec, load_head
+from device.config.radiometry import LED_FWHM_UM
+from device.light_safety.hazard import light_limits
 from device.optics.budget import design_of_head, optical_budget
 from device.optics.light_path import load_light_path, relay_of
 from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm, ring_for_pupil
 from device.optics.ray_trace import Surface
 from device.optics.traced_relay import traced_relay
 from services.lab.light_path_plot import draw_light_path
+from services.lab.light_report import at_full_drive, expected_mw
 from tests.drawings import boxes, overlapping
 from tests.project_files import ROOT, text
 from tests.test_project_files import code_in, unknown_words
@@ -223,6 +226,37 @@ def test_figures_of_the_assembly_match_the_optics() -> None:
     assert [figure for figure in figures if figure not in guide] == []
 
 
+def test_faces_of_the_lens_rims_in_the_guide_are_those_of_the_lens_data() -> None:
+    """Rims by the makers' radii in tubes of 152.4 mm, the same room at both ends; the gaps are those of step 1."""
+    path = load_light_path(HARDWARE / "optics.toml")
+
+    def rim_mm(name: str) -> float:
+        lens = path.lens[name]
+        first, last = (abs(radius) - sqrt(radius**2 - (lens.diameter_mm / 2) ** 2)
+                       for radius in (lens.radii_mm[0], lens.radii_mm[-1]))  # fmt: skip
+        return sum(lens.thick_mm) - first - last
+
+    wide, long = rim_mm("AC508-075-A"), rim_mm("AC508-100-A")
+    steps = [wide, 14.6, wide, 64.1, long, 10.4, long]
+    faces = [(152.4 - sum(steps)) / 2 + sum(steps[:n]) for n in range(len(steps) + 1)]
+    *begin, last = [f"{face:.1f}" for face in faces]
+    guide = " ".join(text("hardware/assembly.md").split())
+    assert f"are {wide:.1f} mm (75) and {long:.1f} mm (100) thick" in guide
+    assert f"from the eye's end, at {', '.join(begin)} and {last} mm" in guide
+
+
+def test_expected_readings_in_the_guide_are_those_of_the_budget() -> None:
+    path = load_light_path(HARDWARE / "optics.toml")
+    design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
+    full, first = expected_mw(design), 0.126 * expected_mw(design)
+    guide = " ".join(text("hardware/assembly.md").split())
+    assert f"{full:.3f} mW at full drive, so {first:.3f} mW lit and {first / 2:.3f} mW as the mean" in guide
+    weight = light_limits().photochemical_weight
+    times = weight.of_spectrum(0.525, LED_FWHM_UM) / weight.at(0.525)
+    assert f"{1000 * LED_FWHM_UM:.0f} nm counts {times:.2f} times its peak" in guide
+    assert f"as {100 * at_full_drive(design).no_go:.0f} % of builds" in guide
+
+
 def test_dioptre_steps_of_the_model_eye_match_the_guide() -> None:
     """The guide has the vergence 1/s - 1/f at 21 and 29 mm behind a 25 mm lens, and the caustic's width."""
     relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
@@ -233,6 +267,42 @@ def test_dioptre_steps_of_the_model_eye_match_the_guide() -> None:
         assert re.search(rf"{dpt:.2f}( dioptres)? of {kind}", guide)
         assert re.search(rf"{100 * shrinks_per_dpt * dpt:.1f} % {goes}", guide)
     assert f"bright disc, {7.7 * relay.pupil_magnification:.1f} mm" in guide
+
+
+def test_frame_of_a_torch_in_the_guide_matches_the_optics() -> None:
+    """A torch 18 cm off the axis at 1 m moves the disc of the caustic by that tangent through relay and diffuser."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    moved_um = 0.18 * relay.angular_magnification * path.optics.diffuser_to_sensor_um
+    guide = text("hardware/assembly.md")
+    shift = re.search(r"1 m before the head: 18 cm to the right.*? is about (\d+) pixels right", guide)
+    assert shift is not None
+    assert float(shift[1]) == pytest.approx(moved_um / 3.45, rel=0.03)  # rounded to ten pixels
+
+
+def test_other_pinholes_of_the_guide_match_the_optics() -> None:
+    """Width over focal length, and the first null of a disc (OPTICS.md 2.5) in the field."""
+    relay = relay_of(path := load_light_path(HARDWARE / "optics.toml"), path.optics)
+    guide = " ".join(text("hardware/assembly.md").split())
+    mm_per_deg = relay.diffuser_to_sensor_mm * tan(radians(relay.angular_magnification))
+    widths_deg = {um: degrees(um / 25_000) for um in (200, 250, 275, 300)}
+    nulls = [1.22 / (path.optics.diffuser_to_sensor_um / 1000 * relay.angular_magnification * radians(deg)) * mm_per_deg
+             for deg in widths_deg.values()]  # fmt: skip
+    first, *others = [f"{deg:.2f} for {um}" for um, deg in widths_deg.items()]
+    assert f"in degrees: {first} um, {', '.join(others)}." in guide
+    assert f"{(275 / 200) ** 2:.1f} times for 200 um" in guide
+    *begin, last = [f"{null:.2f}" for null in nulls]
+    assert f"end at {', '.join(begin)} and {last} cycles" in guide
+
+
+def test_width_of_the_meter_in_the_guide_matches_the_optics() -> None:
+    """Behind the pupil the light of the field spreads from the ring of spots, by the widest emitter of a head."""
+    path = load_light_path(HARDWARE / "optics.toml")
+    design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
+    spots_mm = ring_at_pupil_mm(design.chain, 0.75) + 0.75 * design.emitter_mm
+    spread = 2 * tan(radians(path.optics.field_deg / 2))
+    claim = (f"{spots_mm:.1f} mm wide and {spread:.1f} mm more for each millimetre that it lies behind the card: "
+             f"{spots_mm + spread:.1f} mm at 1 mm, {spots_mm + 14 * spread:.1f} mm at 14 mm")  # fmt: skip
+    assert claim in " ".join(text("hardware/assembly.md").split())
 
 
 def printed() -> set[str]:

@@ -1,5 +1,6 @@
 """Tests of the light hazard: figures of the photon budget, limits, and damaged limit files."""
 
+from math import exp, log, sqrt
 from pathlib import Path
 
 import pytest
@@ -95,10 +96,21 @@ def test_an_unmeasured_colour_has_worst_case_radiometry() -> None:
     assert worst_beam("red", field_deg=20).retina_w_per_cm2 > 2 * worst["red"].retina_w_per_cm2
 
 
+def test_weight_of_a_spectrum_is_its_mean() -> None:
+    """Where A(lambda) is 10^((450 - lambda) / 50), a Gaussian weighs exp((sigma ln 10 / 50)^2 / 2) times its peak."""
+    weight = light_limits().photochemical_weight
+    sigma_nm = 10 / sqrt(8 * log(2))
+    mean = weight.at(0.55) * exp((sigma_nm * log(10) / 50) ** 2 / 2)
+    assert weight.of_spectrum(0.55, 0.01) == pytest.approx(mean, rel=1e-4)
+    assert weight.of_spectrum(0.55, 0) == weight.at(0.55)
+    assert weight.of_spectrum(0.525, 0.035) > 1.26 * weight.at(0.525), "below 500 nm it grows faster"
+    assert weight.of_spectrum(0.40, 0.035) < weight.at(0.40), "nothing below the table"
+
+
 def test_a_measured_colour_has_its_guard_factor_and_others_the_worst_case() -> None:
     green = BeamSpec(wavelength_um=0.53, retina_mw_per_cm2=0.2, waist_mw_per_cm2=3)
     found = radiometry(RadiometrySpec(measured="power meter, 2026-11", guard_factor=1.5, green=green))
-    assert found["green"] == Beam(0.53, pytest.approx(0.3e-3), pytest.approx(4.5e-3))
+    assert found["green"] == Beam(0.53, pytest.approx(0.3e-3), pytest.approx(4.5e-3), 0.035)
     assert found["red"] == worst_beam("red")
 
 

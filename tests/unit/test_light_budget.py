@@ -1,17 +1,19 @@
 """Light budget: the chain is the photon budget taken apart, and no head of the search exceeds a limit."""
 
+import re
 from dataclasses import replace
-from math import exp
+from math import exp, radians, sin
 from pathlib import Path
 
 import pytest
 
 from device.config.head_file import InstrumentSpec, SinkSpec, load_head
-from device.errors import LightLimit
+from device.config.radiometry import LED_FWHM_UM
+from device.errors import LightLimit, SettingError
 from device.head import hazard_of
 from device.light_safety.hazard import Hazard, light_limits
 from device.optics.budget import Design, design_of_head, optical_budget
-from device.optics.illumination import LED, led_at
+from device.optics.illumination import LED, led_at, photon_budget
 from device.optics.light_budget import (
     CELL_UM,
     ENOUGH_E,
@@ -23,9 +25,12 @@ from device.optics.light_budget import (
     simulated,
 )
 from device.optics.light_path import load_light_path
-from device.optics.matrix import share_in_pupil
+from device.optics.matrix import ring, share_in_pupil
 from device.values import Colour, Illumination
 from services.lab import head_search, light_report
+from services.lab.light_report import at_full_drive, expected_beam, expected_mw, half_period_um
+from services.lab.optics_report import widest_iris_mm
+from tests.project_files import text
 
 HARDWARE = Path(__file__).parents[2] / "hardware"
 PATH = load_light_path(HARDWARE / "optics.toml")
@@ -51,10 +56,14 @@ def test_the_chain_is_the_photon_budget_times_the_share_in_the_pupil(path: Path)
     chosen = design_of_head(PATH, load_head(path))
     budget = optical_budget(chosen)
     inside = share_in_pupil(chosen.chain, 0.75, chosen.emitter_mm, chosen.pupil_mm)
-    cell = budget.electrons_per_px * (CELL_UM / chosen.pitch_um) ** 2
+    leds = len(ring(chosen.chain))
+    whole = photon_budget("green", chosen.pitch_um, 33.4, chosen.eye_mm, chosen.relay, leds, chosen.led)
+    cell = whole.electrons_per_px_s * chosen.exposure_s * (CELL_UM / chosen.pitch_um) ** 2
+    assert budget.electrons_per_px == pytest.approx(inside * whole.electrons_per_px_s * chosen.exposure_s)
+    assert budget.light.cornea_mw == whole.cornea_mw
     assert product(chain(chosen)) == pytest.approx(cell * inside, rel=1e-9)
     assert product(chain(chosen, 0.5, 4)) == pytest.approx(2 * cell * inside, rel=1e-9)
-    assert retina_mw_per_cm2(chain(chosen)) == pytest.approx(budget.light.retina_mw_per_cm2 * inside, rel=1e-9)
+    assert retina_mw_per_cm2(chain(chosen)) == pytest.approx(whole.retina_mw_per_cm2 * inside, rel=1e-9)
 
 
 def test_the_monte_carlo_has_the_quantiles_of_a_log_normal_product() -> None:
@@ -128,6 +137,40 @@ def test_the_search_exceeds_no_limit_and_ranks_enough_light_first() -> None:
     assert all(one.leds * one.choice.current_ma <= head_search.SUPPLY_MA for one in found)
 
 
+def test_the_search_leaves_out_an_iris_whose_caustic_the_sensor_does_not_hold() -> None:
+    """The calibration wants a sixteenth of the sensor's side dark at each edge: 3.28 mm of the IMX296's 3.75."""
+    small = design("imx296")
+    assert widest_iris_mm(small) == pytest.approx(14 / 16 * 1088 * 3.45e-3)
+    assert max(one.iris_um for one in head_search.search(small)) == 3200
+    large = replace(small, rows=1456)
+    assert max(one.iris_um for one in head_search.search(large)) == 4000
+
+
+@pytest.mark.parametrize("name", ["imx296", "imx296_power"])
+def test_a_pupil_that_passes_no_light_is_refused_with_a_remedy(name: str) -> None:
+    chosen = replace(design(name), pupil_mm=6.0)
+    for show in (light_report.table, light_report.gains_svg):
+        with pytest.raises(SettingError, match="no light reaches the sensor: a pupil of 6 mm") as refused:
+            show(chosen)
+        begins_mm = float(re.findall(r"wider than ([\d.]+) mm", refused.value.remedy)[0])
+        assert replace(chosen, pupil_mm=begins_mm - 0.01).share_in_pupil == 0
+        show(replace(chosen, pupil_mm=begins_mm + 0.1))
+
+
+def test_a_wider_field_has_a_wider_cone_in_budget_and_hazard() -> None:
+    """50 degrees need the cone of 37.5: sin^2 of its half is 2.2 times that of 25 degrees."""
+    spec = head("imx296_power")
+    assert spec.optics is not None
+    wide = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 50.0})})
+    times = (sin(radians(50 * 0.375)) / sin(radians(12.5))) ** 2
+    usual, more = (expected_mw(design_of_head(PATH, one)) for one in (spec, wide))
+    assert more / usual == pytest.approx(times, rel=0.01)  # 12.5 degrees are 12.525, rounded by the paper
+    waists = [hazard_of(one).beams["green"].waist_w_per_cm2 for one in (spec, wide)]
+    assert waists[1] / waists[0] == pytest.approx(times, rel=0.01)
+    narrow = spec.model_copy(update={"optics": spec.optics.model_copy(update={"field_deg": 20.0})})
+    assert hazard_of(narrow).beams["green"].waist_w_per_cm2 == waists[0], "the cap of an unmeasured head may be another"
+
+
 def test_the_chain_agrees_with_two_published_instruments() -> None:
     """OPTICS.md 4.6: 0.13 mJ/cm2 in about 1 s from 0.25 mW at 48 degrees; a phone's flash of 20 to 50 lm at 15 cm."""
     lit = replace(design("imx296"), optics=design("imx296").optics.model_copy(update={"field_deg": 48.0}))
@@ -140,6 +183,45 @@ def test_the_chain_agrees_with_two_published_instruments() -> None:
         for lumens in (20, 50)
     )
     assert low < 1.40 < high
+
+
+def test_documents_have_the_figures_of_the_chosen_head() -> None:
+    chosen = design("imx296_power")
+    built, shares = at_full_drive(chosen), light_report.limit_shares(chosen, expected_beam(chosen), light_limits())
+    low, high = (f"{100 * one:.0f}" for one in (built.share.low, built.share.high))
+    small = replace(chosen, pupil_mm=7.0)
+    bound = simulated(chain(chosen))
+    facts = {
+        "electrons": f"{spaced(product(chain(chosen)))} electrons", "small pupil": f"{spaced(product(chain(small)))}",
+        "within": f"{spaced(built.electrons.median)}", "no go": f"{100 * built.no_go:.0f} % of builds are NO GO",
+        "share": f"{100 * shares[0].used:.0f} % of", "range": f"{low} to {high} %",
+        "half-period": f"{half_period_um(chosen, built.electrons.median):.0f} (um )?instead of "
+        f"{half_period_um(design('imx296'), product(chain(design('imx296')))):.0f} um",
+    }  # fmt: skip
+    decision = " ".join(text("hardware/decisions/0006-ring-of-high-power-leds.md").split())
+    readme, optics = (" ".join(text(name).split()) for name in ("hardware/README.md", "device/optics/OPTICS.md"))
+    for words in (readme, decision):
+        assert [what for what, figure in facts.items() if not re.search(figure, words)] == []
+    quantiles = [spaced(one) for one in (bound.low, bound.high, built.electrons.low, built.electrons.high)]
+    for words in (readme, optics):
+        assert "{} to {}".format(*quantiles[:2]) in words
+        assert "{} to {}".format(*quantiles[2:]) in words
+    row = f"| {spaced(product(chain(chosen)))} | {quantiles[0]} to {quantiles[1]} | {facts['small pupil']} | "
+    assert f"{row}{half_period_um(chosen, product(chain(chosen))):.0f} um | {100 * shares[0].used:.0f} % | " in optics
+    assert f"{100 * shares[2].used:.0f} % |" in optics.partition(row)[2][:40]
+    assert f"a Gaussian of full width {1000 * LED_FWHM_UM:.0f} nm" in optics
+
+
+@pytest.mark.parametrize("path", HEADS, ids=lambda path: path.stem)
+def test_readme_has_the_electrons_of_a_smaller_pupil(path: Path) -> None:
+    chosen = replace(design_of_head(PATH, load_head(path)), pupil_mm=7.0)
+    mean_e = product(chain(chosen)) * (chosen.pitch_um / CELL_UM) ** 2
+    assert re.search(rf"^\| `{path.name}` \| \d+ \| \d+ \| {mean_e:.0f} \|$", text("hardware/README.md"), re.M)
+
+
+def spaced(electrons: float) -> str:
+    """Return a number of electrons to ten, as the documents write it: 11 980."""
+    return re.sub(r"^(\d\d)(\d{3})$", r"\1 \2", f"{round(electrons, -1):.0f}")
 
 
 def test_gains_and_report_name_every_cause(tmp_path: Path) -> None:

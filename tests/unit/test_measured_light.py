@@ -1,7 +1,9 @@
 """`diffuscope light`: a reading decides go or no go as the guard does, and one that cannot be right is refused."""
 
 from dataclasses import replace
+from math import exp, log
 from pathlib import Path
+from statistics import NormalDist
 
 import pytest
 from hypothesis import given
@@ -11,16 +13,17 @@ from typer.testing import CliRunner
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, SettingError, SpecError
 from device.head import hazard_of
+from device.light_safety.hazard import light_limits
+from device.optics.light_budget import chain, log_sd, product
 from device.optics.matrix import share_in_pupil
 from device.values import Illumination
 from services.cli import app
+from services.lab.light_report import at_full_drive, expected_beam, expected_mw, limit_shares, meter_hole_mm
 from services.lab.measured_light import (
     MeteredLight,
     MeterReading,
-    expected_mw,
     in_colour,
     judge,
-    meter_hole_mm,
     words,
 )
 from services.lab.optics_report import design_of
@@ -40,6 +43,46 @@ def test_the_expected_light_is_a_go_and_twice_as_much_is_none() -> None:
     bright = judged(replace(READING, power_mw=2.6, waist_mw_per_cm2=86))
     assert not bright.is_go
     assert 0.5 < bright.permitted_level < 1
+
+
+@pytest.mark.parametrize("name", ["imx296", "imx296_power"])
+def test_budget_and_command_give_one_share_of_the_limit(name: str) -> None:
+    """The budget's own power behind the meter's hole, as a reading, has the budget's share: that of the worst eye."""
+    spec = load_head(HEADS / f"{name}.toml")
+    design = design_of(spec)
+    expected = limit_shares(design, expected_beam(design), light_limits())
+    reading = MeterReading("green", expected_mw(design), 1.0, 1000 * design.led.wavelength_um, "x")
+    found = judge(spec, design, reading)
+    assert [one.used for one in found.shares[:2]] == pytest.approx([one.used for one in expected[:2]])
+    assert found.is_go == (expected[0].used <= 1)
+
+
+def test_share_of_no_go_is_that_of_the_normal_distribution() -> None:
+    """Of ln: LED, cone, polariser, splitter and relay of the chain, and the wavelength in the LEDs' bin."""
+    design = design_of(SPEC)
+    used = limit_shares(design, expected_beam(design), light_limits())[0].used
+    sd = (0.35**2 + 2 * 0.1**2 + 0.05**2 + 0.03**2 + 0.2**2) ** 0.5
+    found = at_full_drive(design)
+    assert found.no_go == pytest.approx(NormalDist().cdf(log(used) / sd), abs=0.015)  # four sigma of 20 000 draws
+    assert found.share.low == pytest.approx(used * exp(-1.645 * sd), rel=0.03)
+    assert found.electrons.median < product(chain(design))
+
+
+def test_a_measured_ring_is_the_budget_of_its_head() -> None:
+    """Half of the expected power, as a reading, halves the electrons; limits and spread are those of the reading."""
+    design = design_of(SPEC)
+    found = judge(SPEC, design, replace(READING, power_mw=expected_mw(design) / 2))
+    light = SPEC.light.model_copy(update={"radiometry": found.radiometry})
+    measured = design_of(SPEC.model_copy(update={"light": light}))
+    assert product(chain(measured)) == pytest.approx(product(chain(design)) / 2)
+    assert limit_shares(measured, expected_beam(measured), light_limits()) == found.shares
+    assert log_sd(chain(measured)) < log_sd(chain(design)) - 0.05
+    assert any(READING.meter in factor.source for factor in chain(measured))
+
+
+def test_a_wider_spectrum_uses_more_of_the_limit() -> None:
+    narrow, wide = (judged(replace(READING, fwhm_nm=nm)).shares[0].used for nm in (0, 35))
+    assert wide / narrow == pytest.approx(1.32, abs=0.005)
 
 
 @given(st.floats(0.05, 13), st.sampled_from([1.3, 2.0]))

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from math import atan, degrees
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,17 +13,22 @@ import tifffile
 from typer.testing import CliRunner
 
 from device.config.head_file import OpticsSpec, load_head
+from device.config.radiometry import BeamSpec, RadiometrySpec
 from device.config.scene import ObjectSpec, SimSpec
 from device.errors import FrameError, PsfError
 from device.optics import retina_chart
+from device.optics.illumination import photon_budget
+from device.optics.light_budget import chain, product
 from device.optics.retina_chart import BAR_GROUPS, EYE_MM, GREY, INK, MARKS, RINGS, BarGroup, chart_svg, srgb
 from device.sim import scene_files
 from device.sim.objects import draw_object
 from services.cli import app
-from services.lab.model_eye import ModelEyeFrame, check_model_eye
+from services.lab.model_eye import ModelEyeFrame, check_model_eye, light_row, mean_tone, promise_of
 from services.lab.model_eye_fit import fit_chart, lit_diameter_px
+from services.lab.optics_report import design_of
 from tests.simulated import small_head_toml
 
+HEADS = Path(__file__).parents[2] / "hardware" / "heads"
 EXPOSURE_S = 0.005
 SCENE = """\
 [sim]
@@ -160,6 +166,24 @@ def test_quarter_of_the_light_is_a_miss_with_remedy(folder: Path) -> None:
     assert status == 1
     assert re.findall(r"^FAIL +(\w+)", output, re.M) == ["light"]
     assert "--exposure-s" in output
+
+
+def test_promised_light_is_the_budget_of_white_paper_and_half_of_it_fails_a_measured_head() -> None:
+    """The model eye has the pupil of the budget, whose edge cuts this ring; a measured ring has a narrower range."""
+    head = load_head(HEADS / "imx296_power.toml")
+    design = design_of(head)
+    led = replace(design.led, reflectance=retina_chart.PAPER_REFLECTANCE * mean_tone(33.4))
+    cells = product(chain(replace(design, eye_mm=EYE_MM, led=led)))
+    right = promise_of(head, 0.1)
+    assert right.lit_e == pytest.approx(cells * (3.45 / 10) ** 2)
+    beam = BeamSpec(wavelength_um=0.525, retina_mw_per_cm2=0.6, waist_mw_per_cm2=20)
+    table = RadiometrySpec(measured="2026-11-26, meter", guard_factor=1.3, green=beam)
+    measured = promise_of(head.model_copy(update={"light": head.light.model_copy(update={"radiometry": table})}), 0.1)
+    estimated = photon_budget("green", 3.45, leds=4, led=design.led).retina_mw_per_cm2
+    assert measured.lit_e == pytest.approx(right.lit_e * 0.6 / estimated)
+    assert light_row(measured.lit_e, measured).ok
+    assert not light_row(measured.lit_e / 2, measured).ok
+    assert measured.light_factor < right.light_factor == pytest.approx(2.57, abs=0.01)
 
 
 def test_another_scale_fails_on_scale_only(tmp_path: Path) -> None:

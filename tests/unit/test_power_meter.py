@@ -1,5 +1,6 @@
 """`diffuscope meter`: pulses within the guard's limits, counted in the ledger, and a reading above a limit refused."""
 
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +11,16 @@ from typer.testing import CliRunner
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.errors import LightLimit, SettingError, SpecError
+from device.head import hazard_of
 from device.light_safety.dose_ledger import MemoryLedger
+from device.light_safety.guard import AFTERGLOW_S
 from device.light_safety.hazard import light_limits
 from device.values import EYES
 from services.cli import app
-from services.lab.measured_light import MeterReading, judge
+from services.lab.measured_light import MeterReading, in_colour, judge
 from services.lab.optics_report import design_of
 from services.lab.power_meter import judge_reading, pulse, run_of, words
+from tests.project_files import text
 from tests.simulated import small_head_toml
 
 HEADS = Path(__file__).parents[2] / "hardware" / "heads"
@@ -55,6 +59,21 @@ def test_a_spent_ledger_ends_the_train() -> None:
     with pytest.raises(LightLimit):
         pulse(run, ledger, clock, pulses.append)
     assert 0 < len(pulses) < run.count
+
+
+@pytest.mark.parametrize(("head", "colours"), [("imx296_power", ("green", "amber")), ("imx296", ("green", "red"))])
+def test_guide_has_the_runs_that_a_day_permits(head: str, colours: tuple[str, ...]) -> None:
+    """Whole runs of two minutes at the highest drive, with what the last pulse reserves beyond its own light."""
+    spec, stop_j_per_cm2 = load_head(HEADS / f"{head}.toml"), light_limits().stop_without_visit_j_per_cm2
+    runs = {"green": "-", "amber": "-", "red": "-"}
+    for colour in colours:
+        run = run_of(in_colour(spec, colour), None, 120)
+        second = hazard_of(run.spec).dose_j_per_cm2(run.glow, 1)
+        reserved = second * (run.spec.light.max_on_s + AFTERGLOW_S - run.on_s)
+        runs[colour] = f"{(stop_j_per_cm2 - reserved) // (second * run.on_s * run.count):.0f}"
+    row = re.search(rf"^\| `heads/{head}.toml` \| (\S+) \| (\S+) \| (\S+) \| ", text("hardware/assembly.md"), re.M)
+    assert row is not None
+    assert row.groups() == tuple(runs.values())
 
 
 @pytest.mark.parametrize(("head", "why"), [("bench", "no lamp of its own"), ("imx296_power", "no blue LEDs")])

@@ -12,7 +12,7 @@ CABLE_MM = (18.0, 2.0)
 
 
 def camera_cover(d: Dimensions) -> Part:
-    """A box over board and spacer, down to the cell: what its rim overlaps lets no light in."""
+    """A box over board and spacer, down to the cell: its rim lets no light in, and the cable leaves upwards."""
     back = d.board_z_mm + d.bought.board_thick_mm
     begin, end = d.cell_rear_z_mm + d.fit.slide_mm, back + ROOM_MM + d.fit.wall_mm
     inside, half = d.bought.board_mm + 2 * d.fit.slide_mm, d.bought.board_holes_mm / 2
@@ -21,5 +21,5 @@ def camera_cover(d: Dimensions) -> Part:
     at = [(i * half, j * half) for i, j in FOUR]
     shell += joined(rod(PILLAR_MM, (back, end), place) for place in at)
     wide, high = CABLE_MM
-    slot = box((-wide / 2, wide / 2), (-inside, 0), (back + d.fit.slide_mm, back + d.fit.slide_mm + high))
+    slot = box((-wide / 2, wide / 2), (0, inside), (back + d.fit.slide_mm, back + d.fit.slide_mm + high))
     return shell - slot - joined(rod(d.fit.m25_mm, (begin, end), place) for place in at)
