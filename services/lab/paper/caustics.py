@@ -10,7 +10,7 @@ from device.sim.render import convolved_with_disc, psf
 from device.sim.world import World
 from device.values import Image
 from services.lab.paper.bench import Bench
-from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, below, within
+from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, attempted, below, within
 from services.lab.paper.pictures import plane, trend
 
 PITCH_UM = 5.04
@@ -19,6 +19,12 @@ MIDDLE = 0.6  # share of the iris image in which contrast is measured
 SEEDS = (1, 2, 3, 4)
 DISTANCES_MM = (1, 2, 3, 4, 5, 6, 7, 8)
 WALK = {15.0: 1.0, 25.0: 1.0, 26.0: 0.969, 28.0: 0.624, 30.0: 0.180}  # OPTICS.md 6.3; the paper's three are 15, 25, 30
+PRINTED = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}
+TRACED_NOTE = (
+    "Why 18 % of the light are left at 30 degrees here, and 21.5 % in T: T takes the beam's outline as the lenses bend "
+    "it, which is no circle there; the simulator moves a round beam by the traced walk of its middle. The paper has "
+    "6.3 %; T says which distance brings the trace to it."
+)
 
 
 def contrast(point: Image, optics: OpticsSpec) -> float:
@@ -55,10 +61,12 @@ def run_caustic(bench: Bench) -> Outcome:
     claims = (
         within("contrast of the caustic at 6 mm", over_z[6], 1.1, 1.5),
         within("contrast through the 275 um dot", through_dot, 0.7, 0.95),
-        below("largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10, "not sensitive to distance"),
+        below("largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10,
+              "precise control is not required").adapted(
+            "the paper prints no number; read as: contrast within 10 %, for four random surfaces in the simulator"),
         above("likeness of red and green caustic", _correlation(colours["red"], colours["green"]), 0.95),
         above("likeness of green and blue caustic", _correlation(colours["green"], colours["blue"]), 0.95),
-    )
+    )  # fmt: skip
     shown = (
         plane("caustic of a point, green", colours["green"], _bright(colours["green"])),
         plane(
@@ -103,22 +111,27 @@ def run_walk(bench: Bench) -> Outcome:
         bench.progress(f"S8: a dot at {angle_deg:g} degrees")
         point = psf(setup, (angle_deg, 0.0))
         share = float(point.sum(dtype=np.float64)) / full
-        printed = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}.get(angle_deg, "")
+        printed = PRINTED.get(angle_deg, "")
         low, high = expected - 0.002, expected + 0.002
         quoted = printed if expected == 1 else ""
-        claim = within(f"light of a dot at {angle_deg:g} degrees", share, low, high, quoted, 4)
-        claims.append(claim.put_in("the walk of T, rendered").limit_from("overlap of two discs, +- 0.002 of pixels"))
+        claim = within(f"light of a dot at {angle_deg:g} degrees, by two discs", share, low, high, quoted, 4)
+        claims.append(claim.put_in("the simulator was given the walk of T").limit_from(
+            f"{expected:g}: overlap of iris and beam, two discs; +- 0.002 of pixels"))  # fmt: skip
         rows.append((f"{angle_deg:g}", f"{share:.4f}", f"{expected:g}", printed))
         if angle_deg >= 25:
             shown.append(plane(f"caustic at {angle_deg:g} degrees", point))
+    paper = attempted("light of a dot at 30 degrees, by the paper", share, 0.053, 0.073, PRINTED[30.0], 4)
+    paper = paper.because("the walk is that of T, whose nominal layout is ours").limit_from("the paper's value +- 0.01")
+    claims.append(paper)
     sheet = Table(("degrees", "share of the iris lit", "two discs, traced walk", "paper"), tuple(rows))
-    return Outcome(tuple(claims), tuple(shown), (sheet,))
+    return Outcome(tuple(claims), tuple(shown), (sheet,), (TRACED_NOTE,))
 
 
 EXPERIMENTS = (
     Experiment(
         "S0", "The caustic",
-        "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour.",
+        "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour. "
+        "Contrast is the standard deviation over the mean, in the middle 60 % of the iris's image.",
         "Figures 1 and 3a; \"precise control of this distance is not required\".", run_caustic,
     ),
     Experiment(
