@@ -187,15 +187,7 @@ class SimulatedFrame:
     def inside(self) -> Mask:
         """Mask of the field, or of the object cut out of it, without its edge, on the samples of the scores."""
         field = self._disc(field_radius_px(self.calibration) / self.samples_px - RIM_PX) > 0.5
-        return np.asarray(field & self._cut(RIM_PX))
-
-    def _cut(self, rim_px: float) -> Mask:
-        """Return the mask of the rectangle to which the object is cut, less a rim; true everywhere without a cut."""
-        rows, cols = (np.abs(np.arange(n) - (n - 1) / 2) for n in self.truth.shape)
-        if self.cut_deg is None:
-            return np.ones(self.truth.shape, np.bool_)
-        across, down = (side * self.px_per_deg / 2 - rim_px for side in self.cut_deg)
-        return np.asarray((rows[:, None] < down) & (cols[None, :] < across))
+        return np.asarray(field & rectangle(field.shape, self.cut_deg, self.px_per_deg, RIM_PX))
 
     def _disc(self, radius_px: float) -> Image:
         rows, cols = self.truth.shape
@@ -222,7 +214,8 @@ class SimulatedFrame:
         The outline is that of the field, or of the object cut out of it. For continuous pictures;
         `screen.flat_field_corrected` differs: it fits the peaks of dots.
         """
-        outline = self._disc(field_radius_px(self.calibration) / self.samples_px) * self._cut(0.0)
+        disc_of_field = self._disc(field_radius_px(self.calibration) / self.samples_px)
+        outline = disc_of_field * rectangle(picture.shape, self.cut_deg, self.px_per_deg)
         return flat_field_correct(picture, np.asarray(outline, np.float32), EVEN_DEG * self.px_per_deg)
 
     def column(self, right_deg: float) -> int:
@@ -232,6 +225,17 @@ class SimulatedFrame:
     def row(self, down_deg: float) -> int:
         """Return the index of the sample row `down_deg` below the axis."""
         return round(float((self.truth.shape[0] - 1) / 2 + down_deg * self.px_per_deg))
+
+
+def rectangle(
+    shape: tuple[int, ...], sides_deg: tuple[float, float] | None, px_per_deg: float, rim_px: float = 0.0
+) -> Mask:
+    """Return the mask (rows, cols) of a centred rectangle less a rim; sides (right, down). True everywhere for None."""
+    if sides_deg is None:
+        return np.ones(shape, np.bool_)
+    rows, cols = (np.abs(np.arange(n) - (n - 1) / 2) for n in shape)
+    across, down = (side * px_per_deg / 2 - rim_px for side in sides_deg)
+    return np.asarray((rows[:, None] < down) & (cols[None, :] < across))
 
 
 def with_changes(spec: InstrumentSpec, changes: HeadChanges) -> InstrumentSpec:

@@ -69,17 +69,11 @@ def run_caustic(bench: Bench) -> Outcome:
     )  # fmt: skip
     shown = (
         plane("caustic of a point, green", colours["green"], _bright(colours["green"])),
-        plane(
-            "through the 275 um dot, as calibrated", convolved_with_disc(colours["green"], DOT_ON_SENSOR_UM / PITCH_UM)
-        ),
-        trend(
-            "The caustic is sharp over millimetres",
-            "mean of four diffusers, 0.5 degrees, 70 um",
-            "diffuser to sensor, mm",
-            "contrast: deviation over mean",
-            {"contrast": over_z},
-        ),
-    )
+        plane("through the 275 um dot, as calibrated",
+              convolved_with_disc(colours["green"], DOT_ON_SENSOR_UM / PITCH_UM)),
+        trend("The caustic is sharp over millimetres", "mean of four diffusers, 0.5 degrees, 70 um",
+              "diffuser to sensor, mm", "contrast: deviation over mean", {"contrast": over_z}),
+    )  # fmt: skip
     return Outcome(claims, shown)
 
 

@@ -29,7 +29,7 @@ from services.lab.paper import (  # fmt: skip
 )
 from services.lab.paper.bench import Bench
 from services.lab.paper.outcome import Claim, Experiment, Figure, Label, Outcome, Status, Table
-from services.lab.paper.style import CLAIMED, STYLE
+from services.lab.paper.style import CLAIMED, GLOSSARY, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
 ORDER = (
@@ -159,6 +159,7 @@ def html(ran: Sequence[ExperimentRun], merged: int) -> str:
             f'<p class="verdict">{verdict} {size}; {total_s:.0f} s of computing.</p>',
             f"<p>Labels of the {len(every)} rows: {_labels(every)}.</p>" if every else "",
             CLAIMED,
+            GLOSSARY,
             f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
             *(_section(one) for one in ran),
             "</main></html>\n",

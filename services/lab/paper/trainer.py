@@ -23,8 +23,8 @@ SLIGHT = (
     "the value"
 )
 MONOTONE_NOTE = (
-    "By the paper's solver the PCC falls with the distance from rest, but for M = -2 dpt, where it is that of the PSF at "
-    "rest within 0.002: the paper speaks of degradation at the extreme errors only, and that is what the third row asks."
+    "By the paper's solver the PCC falls with the distance from rest, but for M = -2 dpt, where it is that of the PSF "
+    "at rest within 0.002. The paper speaks of degradation at the extreme errors only, as the third row does."
 )
 SCALES = np.linspace(0.985, 1.015, 13)
 ADAPTED = "a drawn retina instead of the HEINE trainer, in even light, and so without the paper's flat-field correction"
@@ -185,7 +185,7 @@ def run_psfs(bench: Bench) -> Outcome:
         below("PCC lost, worst PSF, the default schedule", shipped[0.0] - min(shipped.values()), 0.01, "", 4),
         below("error of its refraction, in its own sd, worst PSF", max(map(abs, off_sd.values())), 3.0, "", 1)
         .limit_from("three standard deviations"),
-        above("least PCC lost from one PSF to the next farther off, flat-sub", min(_losses(flat, FARTHER_DPT)), 0.0)
+        above("least PCC lost from a PSF to the next farther off, flat-sub", min(_losses(flat, FARTHER_DPT)), 0.0)
         .limit_from("monotone"),
         below("PCC lost with the PSF stretched back, paper's solver", restored, 0.01, "", 4),
     )  # fmt: skip
@@ -204,9 +204,9 @@ def _paper_psfs(pcc: dict[float, float]) -> tuple[Claim, ...]:
     near, far, rest = pcc[PSFS_DPT[0]], pcc[PSFS_DPT[-1]], pcc[0.0]
     quote, extremes = "slight degradation", "degradation begins at the extreme errors"
     return (
-        above("PCC with the PSF at 29 mm (Rx -5.5) over PCC at rest, paper's solver", far / rest, 0.86, quote)
+        above("PCC over PCC at rest, PSF at 29 mm (Rx -5.5), paper's solver", far / rest, 0.86, quote)
         .limit_from(SLIGHT),
-        above("PCC with the PSF at 21 mm (Rx +7.6) over PCC at rest, paper's solver", near / rest, 0.86, quote)
+        above("PCC over PCC at rest, PSF at 21 mm (Rx +7.6), paper's solver", near / rest, 0.86, quote)
         .limit_from(SLIGHT),
         above("least PCC lost from 4 dpt to the extreme PSFs, paper's solver", min(_losses(pcc, EXTREMES_DPT)), 0.0,
               extremes).limit_from("any degradation"),
