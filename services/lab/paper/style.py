@@ -38,10 +38,12 @@ cross-validation (GCV).</dd>
 cropped frame, with the calibrated PSF.</dd>
 <dt>default schedule</dt><dd>What the instrument runs: a quick look by <code>evidence</code>, the refraction of the eye
 from the frame, then our default with the PSF stretched to that eye.</dd>
-<dt>detail</dt><dd>PCC after subtraction of a blur of 2 degrees from picture and truth. Vessel contrast: depth of the
-vessels against their surroundings, over the mean.</dd>
+<dt>detail</dt><dd>PCC after subtraction of a blur of 2 degrees from picture and truth. Vessel contrast: how much
+darker vessels are than their surroundings, as a share of these.</dd>
 <dt>sample</dt><dd>10 um on the sensor, 0.13 degrees at the eye.</dd>
-<dt>head</dt><dd>Camera, optics and LED ring in one head file. LuMini: the paper's ring of LEDs, a SparkFun matrix.</dd>
+<dt>head</dt><dd>Camera, optics and LED ring, described by one head file; named by that file (imx296, paper, ...).
+LuMini: the LED matrix of SparkFun from which the paper's ring is taken.</dd>
+<dt>M, Rx, dpt</dt><dd>Mean sphere of the eye's wavefront, its spectacle correction (of opposite sign), dioptres.</dd>
 <dt>T, S1 to S13, ...</dt><dd>The sections below; a letter in brackets refers to one.</dd>
 </dl>
 """

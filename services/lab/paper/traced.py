@@ -154,7 +154,9 @@ def _illumination(relay: TracedRelay) -> tuple[Claim, ...]:
         within("field lit by an LED's cone of 24.75 degrees, traced, degrees", field_deg, 32.0, 34.0, "33", 2)
         .put_in("the paper prints no cone: 24.75 is its 33 over f2 / f1; only the 0.3 degrees more are traced")
         .limit_from("the paper's 33 +- 1"),
-        within("ring of 9.5 mm at the pupil, mm", ring_mm, 6.9, 7.7, "approximately the pupil, 7.7", 2),
+        within("ring of 9.5 mm at the pupil, mm", ring_mm, 6.9, 7.7, "approximately the pupil, 7.7", 2)
+        .adapted(f"read as: up to a tenth smaller than the pupil, so that it enters; {LAYOUT}")
+        .limit_from("the pupil's 7.7, less a tenth"),
     )  # fmt: skip
 
 
