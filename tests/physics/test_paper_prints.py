@@ -30,12 +30,13 @@ def test_every_assertion_holds(key: str) -> None:
 
 
 def test_the_half_width_of_a_lattice_is_that_of_its_falloff() -> None:
-    """Dots whose brightness falls to half at 14 degrees; they are 2.2 degrees apart, and found within a sample."""
+    """Dots that are even within 10 degrees and fall to half at 14; they are 2.2 degrees apart."""
     take = BENCH.expose("paper_dots", WIDE_LATTICE)
     right_deg = (np.arange(take.truth.shape[1]) - (take.truth.shape[1] - 1) / 2) / take.px_per_deg
-    found_deg, half_deg = lattice_deg(take, take.truth * np.float32(0.5) ** np.float32(right_deg / 14) ** 2)
+    light = np.float32(0.5) ** np.maximum((np.abs(right_deg) - 10) / 4, 0).astype(np.float32)
+    found_deg, half_deg = lattice_deg(take, take.truth * light)
     assert half_deg == pytest.approx(28, abs=0.5)
-    floor_deg = 14 * np.sqrt(np.log2(1 / FLOOR))  # the angle with the least brightness of a dot
+    floor_deg = 10 + 4 * np.log2(1 / FLOOR)  # the angle with the least brightness of a dot
     assert found_deg / 2 == pytest.approx(floor_deg, abs=2.2)
 
 

@@ -159,7 +159,8 @@ def _notes(gains: dict[str, list[float]], strained: dict[str, Trial]) -> tuple[s
         "|H| is the transfer function of the PSF of sum 1, from 5 to 14.5 cycles/mm on the sensor (vessels of 90 to "
         "260 um). Its rms there stands for the paper's \"image contrast\": the share of an object's detail that "
         "reaches the raw frame. Evenness is its geometric mean over its rms: 1 if |H| is the same at all these "
-        "frequencies, near 0 if some are missing. The rows are ratios of two elements.",
+        "frequencies, near 0 if some are missing. The rows on |H| "
+        "are ratios of two elements, those on PCC are differences.",
         "Not shown: a real array. The lenses here are ideal, without gaps, aberrations, scatter and wrong thickness; "
         "wider lenses gain more (600 um) until one lens is left, which is a camera that must be focused. A diffuser "
         "is cheap and needs no alignment. Nothing was built or measured.",

@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from device.clock import SystemClock
 from device.recon.methods import METHODS
+from device.recon.model.fft_plans import processor_name
 from device.recon.model.preprocessing import Preprocessor
 from device.recon.model.resampling import to_sensor
 from device.recon.solvers.wiener import TIKHONOV, ClosedForm, Prior
@@ -81,7 +82,8 @@ def run_rules(bench: Bench) -> Outcome:
     seconds, (rows_px, cols_px) = closed_form_s(bench, timed), timed.shape
     shown, swept = trade(bench, bench.expose(SWEPT))
     claim = below(f"one picture of {rows_px} x {cols_px} by the paper's solver, s", seconds, PAPER_S, "0.26 s").adapted(
-        "on this computer instead of MATLAB on a Mac: one thread, one mu, counts in memory to picture, median of ten"
+        f"on this computer ({processor_name()}) instead of MATLAB on a Mac: one thread, one mu, counts in memory to "
+        "picture, median of ten"
     )
     claims = (claim.limit_from("the paper's time for 1080 x 1920"),)
     return Outcome(claims, shown, (Table(head, rows), swept), (NOTE, TRADE))

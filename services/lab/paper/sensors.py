@@ -136,8 +136,9 @@ EXPERIMENTS = (
     ),
     Experiment(
         "S11", "Refraction from the frame",
-        "The refraction of six random eyes, without and with astigmatism, estimated from the stretch of the caustic in "
-        "the fundus frame alone. M is the mean sphere; J0 and J45 are the two parts of the cylinder.",
+        "The refraction of six random eyes, without astigmatism (round: J0 = J45 = 0) and with it, estimated from the "
+        "stretch of the caustic in the fundus frame alone. M is the mean sphere; J0 and J45 are the two parts "
+        "of the cylinder.",
         "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
         run_refraction,
     ),

@@ -7,9 +7,11 @@ CLAIMED = """
 <b>Adapted</b>: the paper's statement, but an object, a condition, a setting or the reading of its words is ours (how).
 <b>Put in</b>: the simulation was given that number, so the row shows only that the program keeps it.
 <b class=open>Not reproduced</b>: the paper's number or word is missed, with the reason or what was tried; it does not
-count as held. <b>Ours</b>: no result of the paper: it says nothing of it, or names it as an outlook.</li>
-<li>The column "the paper says" quotes the paper only for what was done as the paper does it: a row on another solver
-than the paper's has no quotation.</li>
+count as held. <b>Ours</b>: no result of the paper: it says nothing of it, or names it as an outlook, which is then
+quoted.</li>
+<li>The column "the paper says" has the statement that a row is about. It is empty on rows of our solvers, whose values
+are no result of the paper. It does not say that the statement was tested as the paper made it: the label says that, and
+rows that are adapted, put in or not reproduced have the statement as well.</li>
 <li>"A over B" is a ratio; a difference is called minus, loss or rise.</li>
 <li>A limit has its reason under it, or a star: it was set after the value had been seen, so that a later change of the
 program is noticed. A star says nothing about the paper.</li>
@@ -41,8 +43,10 @@ from the frame, then our default with the PSF stretched to that eye.</dd>
 <dt>detail</dt><dd>PCC after subtraction of a blur of 2 degrees from picture and truth. Vessel contrast: how much
 darker vessels are than their surroundings, as a share of these.</dd>
 <dt>sample</dt><dd>10 um on the sensor, 0.13 degrees at the eye.</dd>
-<dt>head</dt><dd>Camera, optics and LED ring, described by one head file; named by that file (imx296, paper, ...).
-LuMini: the LED matrix of SparkFun from which the paper's ring is taken.</dd>
+<dt>cap, cone, field</dt><dd>The paper's LEDs lie under a 3D-printed cap that limits the angle of their light. Cone:
+that full angle, at the LED. Field: the full angle at the eye; a cone lights a field f2 / f1 = 4/3 times as wide.</dd>
+<dt>head</dt><dd>Camera, optics and LED ring, described by one head file. LuMini: the LED matrix of SparkFun from which
+the paper's ring is taken.</dd>
 <dt>M, Rx, dpt</dt><dd>Mean sphere of the eye's wavefront, its spectacle correction (of opposite sign), dioptres.</dd>
 <dt>T, S1 to S13, ...</dt><dd>The sections below; a letter in brackets refers to one.</dd>
 </dl>

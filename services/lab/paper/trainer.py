@@ -18,15 +18,15 @@ PSFS_DPT = (-7.619, -4.0, -2.0, 0.0, 2.0, 4.0, 5.517)  # wavefronts of the scree
 EXTREMES_DPT = ((4.0, 5.517), (-4.0, -7.619))  # pairs of PSFs, nearer to rest and farther from it
 FARTHER_DPT = ((0.0, 2.0), (2.0, 4.0), (0.0, -2.0), (-2.0, -4.0), *EXTREMES_DPT)
 NOT_REQUIRED = "precise control is not required"
-SLIGHT = (
-    "slight: twice the loss that S5 allows, since 7.6 dpt is about twice as far from rest as 4; our reading, set after "
-    "the value"
-)
+LOST_AT_4_DPT = 0.07  # PCC lost over PCC at rest that is read as not significant, set after the values
 MONOTONE_NOTE = (
     "By the paper's solver the PCC falls with the distance from rest, but for M = -2 dpt, where it is that of the PSF "
-    "at rest within 0.002. The paper speaks of degradation at the extreme errors only, as the third row does."
+    "at rest within 0.002. The paper says that degradation begins to appear at the extreme errors; by PCC a good part "
+    "of it is there at 4 dpt (fourth row), and what follows beyond is in the third row."
 )
 SCALES = np.linspace(0.985, 1.015, 13)
+NEVER_BEFORE = 0.1  # share of a loss that is read as none
+SCREENS = "worst of the seven PSFs, whose screens are at 21 to 29 mm"
 ADAPTED = "a drawn retina instead of the HEINE trainer, in even light, and so without the paper's flat-field correction"
 SIGNS = (
     "M is the wavefront of the eye, Rx its spectacle correction; they have opposite signs: positive M and negative Rx "
@@ -96,7 +96,7 @@ class Eyes:
     def sheet(self) -> Table:
         """All values as a table."""
         rows = (
-            (f"{m:+g}", *(f"{line[m]:.3f}" for line in self.lines.values()), f"{self.off_sd[m]:+.1f}")
+            (f"{m:+g}", *(f"{line[m]:.4f}" for line in self.lines.values()), f"{self.off_sd[m]:+.1f}")
             for m in self.paper
         )
         return Table(("M of the eye, dpt", *self.lines, "refraction error, sd"), tuple(rows))
@@ -126,9 +126,10 @@ def run_eyes(bench: Bench) -> Outcome:
               "wavefront M of the eye, dpt", "PCC", eyes.lines),
     )  # fmt: skip
     note = (
-        "The paper explains the tolerance by lenslets with a large depth of focus. It is not that: the blur is the "
-        "ordinary blur circle, 0.55 degrees at 4 dpt, and the resolution is about 0.6 degrees already. The PSF "
-        "stretched by the known refraction, which costs nothing, brings all of it back."
+        "The paper explains the tolerance by lenslets with a large depth of focus. The simulator has it without them: "
+        "there the blur is the ordinary blur circle, 0.55 degrees at 4 dpt, and the resolution is about 0.6 degrees "
+        "already. Whether a real diffuser's lenslets add to it is not tested. The PSF stretched by the known "
+        "refraction, which costs nothing, brings all of it back here."
     )
     claims = (*_paper_eyes(eyes, at_rest.pcc, sizes), *_own_eyes(eyes, own_sizes))
     return Outcome(claims, shown, (eyes.sheet,), (note, SIGNS))
@@ -137,11 +138,13 @@ def run_eyes(bench: Bench) -> Outcome:
 def _paper_eyes(eyes: Eyes, at_rest: float, sizes: Sequence[float]) -> tuple[Claim, ...]:
     worst = min(eyes.paper[-4.0], eyes.paper[4.0]) / at_rest
     return (
-        above("PCC at 4 dpt over PCC at rest, paper's solver", worst, 0.93, "no significant degradation").limit_from(
-            "not significant: at most 7 %, less than the 11 % between the positions of one print (S4); our reading, "
-            "set after the value"),
+        above("PCC at 4 dpt over PCC at rest, paper's solver", worst, 1 - LOST_AT_4_DPT, "no significant degradation")
+        .adapted(f"not significant read as: at most {LOST_AT_4_DPT:.0%} of PCC, less than the 11 % between the "
+                 f"positions of one print (S4); {ADAPTED}"),
         below("change of magnification within 4 dpt, paper's solver", _largest_change(sizes), 0.003,
-              "invariant magnification", 4).limit_from("a third of a sample at 12 degrees from the axis"),
+              "invariant magnification", 4)
+        .adapted(f"that the optics keep the angle of a point is put in; tested is that the PSF of 0 dpt adds no change "
+                 f"to the picture; {ADAPTED}").limit_from("a third of a sample at 12 degrees from the axis"),
     )  # fmt: skip
 
 
@@ -187,7 +190,7 @@ def run_psfs(bench: Bench) -> Outcome:
         .limit_from("three standard deviations"),
         above("least PCC lost from a PSF to the next farther off, flat-sub", min(_losses(flat, FARTHER_DPT)), 0.0)
         .limit_from("monotone"),
-        below("PCC lost with the PSF stretched back, paper's solver", restored, 0.01, "", 4),
+        below("PCC lost with the PSF stretched back, paper's solver", restored, 0.01, "", 4).ours(SCREENS),
     )  # fmt: skip
     shown = (
         *compared(take, pictures),
@@ -201,16 +204,24 @@ def run_psfs(bench: Bench) -> Outcome:
 
 def _paper_psfs(pcc: dict[float, float]) -> tuple[Claim, ...]:
     """Return the claims on the paper's solver, by its PCC for each M of the PSF."""
-    near, far, rest = pcc[PSFS_DPT[0]], pcc[PSFS_DPT[-1]], pcc[0.0]
-    quote, extremes = "slight degradation", "degradation begins at the extreme errors"
+    quote, before = "slight degradation at -5.5 and +7.6 dpt", "begins to appear at the extreme errors"
+    places = (("29 mm (Rx -5.5)", PSFS_DPT[-1]), ("21 mm (Rx +7.6)", PSFS_DPT[0]))
+    early = max((pcc[0.0] - pcc[near]) / (pcc[0.0] - pcc[far]) for near, far in EXTREMES_DPT)
     return (
-        above("PCC over PCC at rest, PSF at 29 mm (Rx -5.5), paper's solver", far / rest, 0.86, quote)
-        .limit_from(SLIGHT),
-        above("PCC over PCC at rest, PSF at 21 mm (Rx +7.6), paper's solver", near / rest, 0.86, quote)
-        .limit_from(SLIGHT),
+        *(above(f"PCC over PCC at rest, PSF at {where}, paper's solver", pcc[m_dpt] / pcc[0.0], _slight(m_dpt), quote)
+          .adapted(f"slight read as: PCC at most {1 - _slight(m_dpt):.1%} lower, which is {LOST_AT_4_DPT:.0%} for each "
+                   f"4 dpt as in S5; {ADAPTED}") for where, m_dpt in places),
         above("least PCC lost from 4 dpt to the extreme PSFs, paper's solver", min(_losses(pcc, EXTREMES_DPT)), 0.0,
-              extremes).limit_from("any degradation"),
+              quote).adapted(f"read as: a further loss of PCC beyond 4 dpt; {ADAPTED}").limit_from("any degradation"),
+        below("share of the extreme PSFs' lost PCC that is lost at 4 dpt", early, NEVER_BEFORE, before)
+        .as_attempt().because("by PCC the degradation begins nearer to rest; a person may see it later")
+        .limit_from("begins at the extremes: a tenth of it before, our reading"),
     )  # fmt: skip
+
+
+def _slight(m_dpt: float) -> float:
+    """Return the least PCC over PCC at rest that is read as slight degradation: LOST_AT_4_DPT for each 4 dpt."""
+    return round(1 - LOST_AT_4_DPT * abs(m_dpt) / 4, 3)
 
 
 def _losses(pcc: dict[float, float], pairs: Sequence[tuple[float, float]]) -> list[float]:
