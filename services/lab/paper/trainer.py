@@ -139,8 +139,8 @@ def _paper_eyes(eyes: Eyes, at_rest: float, sizes: Sequence[float]) -> tuple[Cla
     worst = min(eyes.paper[-4.0], eyes.paper[4.0]) / at_rest
     return (
         above("PCC at 4 dpt over PCC at rest, paper's solver", worst, 1 - LOST_AT_4_DPT, "no significant degradation")
-        .adapted(f"not significant read as: at most {LOST_AT_4_DPT:.0%} of PCC, less than the 11 % between the "
-                 f"positions of one print (S4); {ADAPTED}"),
+        .adapted(f"not significant read as: at most {100 * LOST_AT_4_DPT:.0f} % of PCC, less than the 11 % between "
+                 f"the positions of one print (S4); {ADAPTED}"),
         below("change of magnification within 4 dpt, paper's solver", _largest_change(sizes), 0.003,
               "invariant magnification", 4)
         .adapted(f"that the optics keep the angle of a point is put in; tested is that the PSF of 0 dpt adds no change "
@@ -209,8 +209,8 @@ def _paper_psfs(pcc: dict[float, float]) -> tuple[Claim, ...]:
     early = max((pcc[0.0] - pcc[near]) / (pcc[0.0] - pcc[far]) for near, far in EXTREMES_DPT)
     return (
         *(above(f"PCC over PCC at rest, PSF at {where}, paper's solver", pcc[m_dpt] / pcc[0.0], _slight(m_dpt), quote)
-          .adapted(f"slight read as: PCC at most {1 - _slight(m_dpt):.1%} lower, which is {LOST_AT_4_DPT:.0%} for each "
-                   f"4 dpt as in S5; {ADAPTED}") for where, m_dpt in places),
+          .adapted(f"slight read as: PCC at most {100 - 100 * _slight(m_dpt):.1f} % lower, which is "
+                   f"{100 * LOST_AT_4_DPT:.0f} % for each 4 dpt as in S5; {ADAPTED}") for where, m_dpt in places),
         above("least PCC lost from 4 dpt to the extreme PSFs, paper's solver", min(_losses(pcc, EXTREMES_DPT)), 0.0,
               quote).adapted(f"read as: a further loss of PCC beyond 4 dpt; {ADAPTED}").limit_from("any degradation"),
         below("share of the extreme PSFs' lost PCC that is lost at 4 dpt", early, NEVER_BEFORE, before)
