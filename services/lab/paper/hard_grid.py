@@ -27,11 +27,11 @@ def run_grid(bench: Bench) -> Outcome:
     found = grid.run(eyes, columns=(DEFAULT_SCHEDULE,), progress=lambda line: bench.progress(f"S13: {line}"))
     (share, refractions), frames = covered(found.cells), len(found.cells)
     losing = [cell for cell in found.cells if lost(cell)]
-    losses, told = len(losing), sum(bool(cell.warnings) for cell in losing)
+    losses, warned = len(losing), sum(bool(cell.warnings) for cell in losing)
     unsaid = [cell for cell in losing if not cell.warnings and explanation(cell, NAMED[cell.case])]
     rules = {
         "crash": f"of {frames} frames, those at which the program failed",
-        "hidden": f"{losses} losses above .05 less {told} with a message, {len(unsaid)} explained only",
+        "hidden": f"{losses} losses above .05 less {warned} with a message, {len(unsaid)} explained only",
         "refraction": f"of {refractions} refractions, those beyond 3 standard deviations",
         "message": f"of {frames} frames, those with a false message",
         "quality": f"of {losses} losses above .05, those with a better quality figure",

@@ -88,7 +88,11 @@ def run_rulers(bench: Bench) -> Outcome:
         cutline(sparse, -1.6, {"paper's solver": white}, "White ruler, across the ticks"),
         cutline(dense, -1.6, {"paper's solver": black, DEFAULT: ours}, "Black ruler, across the ticks"),
     )
-    note = (
+    return Outcome(claims, shown, (Table(("picture", "PCC", "PSNR, dB", "SSIM"), rows),), (_rulers_note(even),))
+
+
+def _rulers_note(even: tuple[Scores, Scores]) -> str:
+    return (
         "The paper calls the black ruler on white the positive one in its results and the dense one in its discussion. "
         "Here the white ruler is white on black, the black one black on white. The pictures are cut at zero, as a "
         "printed figure is. The paper's statement has three parts, and no setting here has all of them: without "
@@ -96,7 +100,6 @@ def run_rulers(bench: Bench) -> Outcome:
         f"both, as in the paper, the PCC are similar ({even[0].pcc:.2f} and {even[1].pcc:.2f}), but PSNR and SSIM of "
         "the white ruler are no better: our correction spoils a picture that is mostly black."
     )
-    return Outcome(claims, shown, (Table(("picture", "PCC", "PSNR, dB", "SSIM"), rows),), (note,))
 
 
 def _two_rulers(white: Scores, black: Scores, even: tuple[Scores, Scores]) -> tuple[Claim, ...]:
