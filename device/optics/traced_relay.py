@@ -284,10 +284,23 @@ def field_of_cone_deg(relay: TracedRelay, cone_deg: float, led_mm: float) -> flo
     return abs(edges[1] - edges[0])
 
 
-def f_theta_error(relay: TracedRelay, angle_deg: float) -> tuple[float, float]:
-    """Return the relative error of the paper's scale, linear in the angle, and of the tangent's, at a field angle.
+def displacement_error(relay: TracedRelay, angle_deg: float) -> tuple[float, float]:
+    """Return by how much the traced displacement on the sensor is larger than two formulas have it, at a field angle.
 
-    Linear: angle behind = a angle. Tangent: tan(angle behind) = a tan(angle), with a of angles near the axis.
+    Relative, negative: smaller. The displacement is f_d tan(angle behind the relay); the formulas are the paper's,
+    f_d a angle (rad), and an ideal relay's, f_d a tan(angle), with a of angles near the axis.
+    """
+    near = relay.angle_behind_deg(NEAR_DEG) / NEAR_DEG
+    traced = tan(radians(relay.angle_behind_deg(angle_deg)))
+    return traced / (near * radians(angle_deg)) - 1, traced / (near * tan(radians(angle_deg))) - 1
+
+
+def f_theta_error(relay: TracedRelay, angle_deg: float) -> tuple[float, float]:
+    """Return by how much the traced angle behind the relay is larger than two laws have it, at a field angle.
+
+    Relative, negative: smaller. Both compare angles; the displacement on a flat sensor is the tangent of the angle
+    (`displacement_error`). Linear: angle behind = a angle. Tangent: tan(angle behind) = a tan(angle), with a of angles
+    near the axis.
     """
     near, far = relay.angle_behind_deg(NEAR_DEG) / NEAR_DEG, relay.angle_behind_deg(angle_deg)
     ideal = degrees(atan(near * tan(radians(angle_deg))))

@@ -3,10 +3,12 @@
 The experiments are those of `diffuscope paper`, with 2 x 2 pixels merged, which still samples the caustic.
 """
 
+import numpy as np
 import pytest
 
-from services.lab.paper.bench import Bench
+from services.lab.paper.bench import Bench, rectangle
 from services.lab.paper.report import EXPERIMENTS
+from services.lab.paper.screen import CUT, HRF_DEG
 
 pytestmark = pytest.mark.paper
 
@@ -20,3 +22,11 @@ def test_every_assertion_holds(key: str) -> None:
     broken = [f"{claim.what}: {claim.value:.4g}, not {claim.limit}" for claim in wrong]
     assert claims
     assert not broken, "\n".join(broken)
+
+
+def test_the_flat_field_of_a_cut_picture_ends_at_its_outline() -> None:
+    """An even cut picture stays even; inside the outline of the full disc its edges would be brightened by up to 2."""
+    take = BENCH.expose("paper_retina", CUT)
+    even = rectangle(take.truth.shape, HRF_DEG, take.px_per_deg).astype(np.float32)
+    corrected = take.flat_field_corrected(even)[take.inside]
+    assert np.ptp(corrected) < 1e-3 * corrected.mean(), "single precision"

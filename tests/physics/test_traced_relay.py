@@ -1,7 +1,7 @@
 """Ray trace: closed forms, Snell's law, reciprocity, conserved étendue, catalogue data, and the series made from it."""
 
 from dataclasses import replace
-from math import asin, degrees, inf, radians, sin, sqrt
+from math import asin, degrees, inf, radians, sin, sqrt, tan
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from device.errors import SpecError
-from device.optics.eye import TRACED_TO_DEG, beam_walk_mm, flat_screen_dpt, petzval_mm
+from device.optics.eye import TRACED_TO_DEG, Relay, beam_walk_mm, flat_screen_dpt, petzval_mm
+from device.optics.field_extent import extent_mm
 from device.optics.lens_data import lens_surfaces
 from device.optics.light_path import LightPath, load_light_path
 from device.optics.ray_trace import Surface, at_plane, moved, paraxial, rays, reversed_surfaces, trace
 from device.optics.traced_relay import (
     Deviation,
+    displacement_error,
     f_theta_error,
     field_of_cone_deg,
     retina_point,
@@ -158,6 +160,19 @@ def test_the_field_is_linear_in_the_angle_not_in_its_tangent() -> None:
     assert abs(linear) < 0.005
     assert tangent < -0.025
     assert field_of_cone_deg(RELAY, 25.05, 5.02) == pytest.approx(33.4, rel=0.015)
+
+
+def test_the_displacement_lies_between_the_papers_formula_and_the_ideal_relay() -> None:
+    """OPTICS.md 6.3 and the notes of `diffuscope paper` print these figures to 0.1 %, the extents d + 2 s too."""
+    over_formula, over_ideal = displacement_error(RELAY, 25)
+    assert over_formula == pytest.approx(0.034, abs=5e-4)
+    assert over_ideal == pytest.approx(-0.032, abs=5e-4)
+    assert displacement_error(RELAY, 16.7)[0] == pytest.approx(0.012, abs=5e-4)
+    grown = [by * (extent_mm(Relay(), 50) - 3.2) / extent_mm(Relay(), 50) for by in (tan(radians(25)) / radians(25) - 1,
+                                                                                    over_formula)]  # fmt: skip
+    assert grown == pytest.approx([0.038, 0.019], abs=5e-4)
+    near, far = (tan(radians(RELAY.angle_behind_deg(angle))) for angle in (0.05, 25))
+    assert far / near == pytest.approx(500 * (1 + over_formula), rel=1e-6), "the paper's formula is linear in the angle"
 
 
 def test_the_series_of_eye_py_are_those_of_the_trace() -> None:

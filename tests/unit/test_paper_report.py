@@ -48,7 +48,7 @@ def test_number_that_is_not_reproduced_is_not_counted_as_held() -> None:
     page = html(both, 1)
     assert missed.status == "not reproduced"
     assert not missed.holds
-    assert "1 of 1 assertions hold; numbers of the paper that are not reproduced: 1. These are marked." in page
+    assert "1 of 1 assertions hold; statements of the paper that are not reproduced: 1. These are marked." in page
     assert '<a href="#X1">X1</a> A &lt;made up&gt; title <b class=open>not reproduced</b>' in page
     assert "<td>not reproduced</td><td>SSIM .59</td><td><b class=label-not-reproduced>not reproduced</b></td>" in page
     assert "NR" in table(both)
@@ -66,11 +66,27 @@ def test_every_row_has_a_label_and_the_reason_of_its_limit_or_a_star() -> None:
     page = html(ran(*rows), 1)
     assert "Labels of the 5 rows: 1 as written, 1 put in, 1 not reproduced, 2 ours." in page
     assert "&gt; 0.88<small>half a pixel</small>" in page
+    assert "1 of 2 rows on the paper's own statements hold (1 as written, 0 adapted), 1 are not reproduced." in page
+    assert "The other 3 rows do not test the paper (1 put in, 2 ours)." in page
     assert page.count("&gt; 0.88&nbsp;*") == 3
     assert "<b class=label-not-reproduced>not reproduced</b><small>no figure</small>" in page
     adapted = Experiment("X1", "t", "s", "p", lambda bench: Outcome(rows), "a drawn retina").labelled(Outcome(rows))
     assert [claim.label for claim in adapted.claims] == ["adapted", "ours", "put in", "ours", "not reproduced"]
     assert adapted.claims[0].why == "a drawn retina"
+
+
+def test_a_statement_that_does_not_hold_is_not_counted_as_held() -> None:
+    rows = above("a", 0.8, 0.88, "said"), above("b", 0.9, 0.88, "said").adapted("how"), above("c", 0.9, 0.88, "said")
+    words = "2 of 3 rows on the paper's own statements hold (1 as written, 1 adapted), 0 are not reproduced."
+    assert words in html(ran(*rows), 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "printed"),
+    [(0.0, 3, "0"), (3.2e-7, 6, "3e-07"), (-4e-5, 4, "-4e-05"), (6e-5, 4, "0.0001"), (0.0, 0, "0"), (1.26, 1, "1.3")],
+)
+def test_a_small_value_is_not_printed_as_zero(value, digits, printed) -> None:
+    assert f"<td class=n>{printed}</td>" in html(ran(above("a", value, -1, "", digits)), 1)
 
 
 def test_page_is_self_contained_and_escapes_its_texts() -> None:

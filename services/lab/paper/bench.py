@@ -36,6 +36,8 @@ SAMPLE_UM = 10.08  # sample pitch of the scores: two of the paper's pixels
 RIM_PX = 2.0  # width of the blurred field edge, which is excluded from scores
 EVEN_DEG, DETAIL_DEG = 4.0, 2.0
 
+DEFAULT, SCHEDULE = "our default", "the default schedule"  # names of solvers in the report, explained in style.GLOSSARY
+
 ProgressCallback = Callable[[str], None]
 HeadChanges: TypeAlias = Mapping[str, bool | int | float | str | tuple[float, float]]  # by dotted keys
 
@@ -185,11 +187,7 @@ class SimulatedFrame:
     def inside(self) -> Mask:
         """Mask of the field, or of the object cut out of it, without its edge, on the samples of the scores."""
         field = self._disc(field_radius_px(self.calibration) / self.samples_px - RIM_PX) > 0.5
-        if self.cut_deg is None:
-            return field
-        across, down = (side * self.px_per_deg / 2 - RIM_PX for side in self.cut_deg)
-        rows, cols = (np.abs(np.arange(n) - (n - 1) / 2) for n in field.shape)
-        return np.asarray(field & (rows[:, None] < down) & (cols[None, :] < across))
+        return np.asarray(field & rectangle(field.shape, self.cut_deg, self.px_per_deg, RIM_PX))
 
     def _disc(self, radius_px: float) -> Image:
         rows, cols = self.truth.shape
@@ -211,12 +209,14 @@ class SimulatedFrame:
         return float(np.corrcoef(picture[self.inside], self.truth[self.inside])[0, 1])
 
     def flat_field_corrected(self, picture: Image) -> Image:
-        """Return a picture divided by its own Gaussian blur (sigma EVEN_DEG), times its mean; zero outside the field.
+        """Return a picture divided by its own Gaussian blur (sigma EVEN_DEG), times its mean; zero outside the outline.
 
-        For continuous pictures; `screen.flat_field_corrected` differs: it fits the peaks of dots.
+        The outline is that of the field, or of the object cut out of it. For continuous pictures;
+        `screen.flat_field_corrected` differs: it fits the peaks of dots.
         """
-        field = self._disc(field_radius_px(self.calibration) / self.samples_px)
-        return flat_field_correct(picture, field, EVEN_DEG * self.px_per_deg)
+        disc_of_field = self._disc(field_radius_px(self.calibration) / self.samples_px)
+        outline = disc_of_field * rectangle(picture.shape, self.cut_deg, self.px_per_deg)
+        return flat_field_correct(picture, np.asarray(outline, np.float32), EVEN_DEG * self.px_per_deg)
 
     def column(self, right_deg: float) -> int:
         """Return the index of the sample column `right_deg` to the right of the axis."""
@@ -225,6 +225,17 @@ class SimulatedFrame:
     def row(self, down_deg: float) -> int:
         """Return the index of the sample row `down_deg` below the axis."""
         return round(float((self.truth.shape[0] - 1) / 2 + down_deg * self.px_per_deg))
+
+
+def rectangle(
+    shape: tuple[int, ...], sides_deg: tuple[float, float] | None, px_per_deg: float, rim_px: float = 0.0
+) -> Mask:
+    """Return the mask (rows, cols) of a centred rectangle less a rim; sides (right, down). True everywhere for None."""
+    if sides_deg is None:
+        return np.ones(shape, np.bool_)
+    rows, cols = (np.abs(np.arange(n) - (n - 1) / 2) for n in shape)
+    across, down = (side * px_per_deg / 2 - rim_px for side in sides_deg)
+    return np.asarray((rows[:, None] < down) & (cols[None, :] < across))
 
 
 def with_changes(spec: InstrumentSpec, changes: HeadChanges) -> InstrumentSpec:

@@ -9,9 +9,11 @@ from device.optics.illumination import LED
 from device.sim.render import convolved_with_disc, psf
 from device.sim.world import World
 from device.values import Image
-from services.lab.paper.bench import Bench
-from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, below, within
+from services.lab.paper.bench import Bench, SimulatedFrame
+from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, attempted, below, within
 from services.lab.paper.pictures import plane, trend
+from services.lab.paper.printed import WIDE_LATTICE
+from services.lab.paper.screen import DOT_MU, apply_floor
 
 PITCH_UM = 5.04
 DOT_ON_SENSOR_UM = 49.5  # image of the 275 um dot of the screen, magnification 0.18 (OPTICS.md 1.1)
@@ -19,6 +21,17 @@ MIDDLE = 0.6  # share of the iris image in which contrast is measured
 SEEDS = (1, 2, 3, 4)
 DISTANCES_MM = (1, 2, 3, 4, 5, 6, 7, 8)
 WALK = {15.0: 1.0, 25.0: 1.0, 26.0: 0.969, 28.0: 0.624, 30.0: 0.180}  # OPTICS.md 6.3; the paper's three are 15, 25, 30
+PRINTED = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}
+WALK_GIVEN = "the simulator was given the walk of T"
+WHERE = {
+    26.0: "; the paper has no number here", 28.0: "; the paper has no number here",
+    30.0: "; the paper's 6.3 % is missed, which the next row counts",
+}  # fmt: skip
+TRACED_NOTE = (
+    "Why 18 % of the light are left at 30 degrees here, and 21.5 % in T: T takes the beam's outline as the lenses bend "
+    "it, which is no circle there; the simulator moves a round beam by the traced walk of its middle. The paper has "
+    "6.3 %; T says which distance brings the trace to it."
+)
 
 
 def contrast(point: Image, optics: OpticsSpec) -> float:
@@ -55,23 +68,19 @@ def run_caustic(bench: Bench) -> Outcome:
     claims = (
         within("contrast of the caustic at 6 mm", over_z[6], 1.1, 1.5),
         within("contrast through the 275 um dot", through_dot, 0.7, 0.95),
-        below("largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10, "not sensitive to distance"),
+        below("largest change of contrast from 5 to 8 mm", max(map(abs, near)), 0.10,
+              "precise control is not required").adapted(
+            "the paper prints no number; read as: contrast within 10 %, for four random surfaces in the simulator"),
         above("likeness of red and green caustic", _correlation(colours["red"], colours["green"]), 0.95),
         above("likeness of green and blue caustic", _correlation(colours["green"], colours["blue"]), 0.95),
-    )
+    )  # fmt: skip
     shown = (
         plane("caustic of a point, green", colours["green"], _bright(colours["green"])),
-        plane(
-            "through the 275 um dot, as calibrated", convolved_with_disc(colours["green"], DOT_ON_SENSOR_UM / PITCH_UM)
-        ),
-        trend(
-            "The caustic is sharp over millimetres",
-            "mean of four diffusers, 0.5 degrees, 70 um",
-            "diffuser to sensor, mm",
-            "contrast: deviation over mean",
-            {"contrast": over_z},
-        ),
-    )
+        plane("through the 275 um dot, as calibrated",
+              convolved_with_disc(colours["green"], DOT_ON_SENSOR_UM / PITCH_UM)),
+        trend("The caustic is sharp over millimetres", "mean of four diffusers, 0.5 degrees, 70 um",
+              "diffuser to sensor, mm", "contrast: deviation over mean", {"contrast": over_z}),
+    )  # fmt: skip
     return Outcome(claims, shown)
 
 
@@ -103,27 +112,60 @@ def run_walk(bench: Bench) -> Outcome:
         bench.progress(f"S8: a dot at {angle_deg:g} degrees")
         point = psf(setup, (angle_deg, 0.0))
         share = float(point.sum(dtype=np.float64)) / full
-        printed = {15.0: "fully lit", 25.0: "fully lit", 30.0: "6.3 %"}.get(angle_deg, "")
+        printed = PRINTED.get(angle_deg, "")
         low, high = expected - 0.002, expected + 0.002
         quoted = printed if expected == 1 else ""
-        claim = within(f"light of a dot at {angle_deg:g} degrees", share, low, high, quoted, 4)
-        claims.append(claim.put_in("the walk of T, rendered").limit_from("overlap of two discs, +- 0.002 of pixels"))
+        claim = within(f"light of a dot at {angle_deg:g} degrees, by two discs", share, low, high, quoted, 4)
+        claims.append(claim.put_in(WALK_GIVEN + WHERE.get(angle_deg, "")).limit_from(
+            f"{expected:g}: overlap of iris and beam, two discs; +- 0.002 of pixels"))  # fmt: skip
         rows.append((f"{angle_deg:g}", f"{share:.4f}", f"{expected:g}", printed))
         if angle_deg >= 25:
             shown.append(plane(f"caustic at {angle_deg:g} degrees", point))
+    paper = attempted("light of a dot at 30 degrees, by the paper", share, 0.053, 0.073, PRINTED[30.0], 4)
+    paper = paper.because("the walk is that of T, whose nominal layout is ours").limit_from("the paper's value +- 0.01")
+    claims.append(paper)
     sheet = Table(("degrees", "share of the iris lit", "two discs, traced walk", "paper"), tuple(rows))
-    return Outcome(tuple(claims), tuple(shown), (sheet,))
+    return Outcome((*claims, *_cost_of_walk(bench)), tuple(shown), (sheet,), (TRACED_NOTE,))
+
+
+def _cost_of_walk(bench: Bench) -> tuple[Claim, ...]:
+    """Return the claims on what the walk costs the paper's solver, whose PSF is that of the axis, in two ranges."""
+    bench.progress("S8: dots over 61 degrees without and with the walk")
+    found = []
+    for walks in (False, True):
+        take = bench.expose("paper_dots", {**WIDE_LATTICE, "sim.eye.surface": "curved", "sim.eye.walks": walks})
+        picture = apply_floor(bench.tikhonov(take, DOT_MU), 0.0)
+        found.append([pcc_between(take, picture, *reach) for reach in ((0.0, 25.0), (25.0, 31.0))])
+    near, far = (still - walking for still, walking in zip(*found, strict=True))
+    how = "the walk of T was given, its cost is computed; the paper prints no score"
+    return (
+        below("PCC lost by the walk, dots within 25 degrees, paper's solver", near, 0.01,
+              "LSI approximately maintained", 4).adapted(how),
+        above("PCC lost by the walk, dots beyond 25 degrees, paper's solver", far, 0.05,
+              "violation of LSI").adapted(how),
+    )  # fmt: skip
+
+
+def pcc_between(take: SimulatedFrame, picture: Image, from_deg: float, to_deg: float) -> float:
+    """Return Pearson's correlation of a picture with the truth between two angles to the axis, inside the field."""
+    down, right = ((np.arange(n) - (n - 1) / 2) / take.px_per_deg for n in picture.shape)
+    angle_deg = np.hypot(down[:, None], right[None, :])
+    ring = take.inside & (angle_deg >= from_deg) & (angle_deg < to_deg)
+    return _correlation(picture[ring], take.truth[ring])
 
 
 EXPERIMENTS = (
     Experiment(
         "S0", "The caustic",
-        "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour.",
+        "A diffuser of half a degree makes a caustic with high contrast, at any distance around 6 mm, in every colour. "
+        "Contrast is the standard deviation over the mean, in the middle 60 % of the iris's image.",
         "Figures 1 and 3a; \"precise control of this distance is not required\".", run_caustic,
     ),
     Experiment(
         "S8", "The beam walks over the iris",
-        "Up to 25 degrees the beam fills the iris; at 30 degrees a fifth of it is left (T).",
-        "Section \"Optical design\": 6.3 % of the aperture is lit at 30 degrees.", run_walk,
+        "Up to 25 degrees the beam fills the iris; at 30 degrees a fifth of it is left (T). What that costs is seen in "
+        "dots as wide as those of S7 on a curved screen.",
+        "Section \"Optical design\": linear shift-invariance (LSI) is approximately maintained up to 25 degrees and "
+        "violated beyond; 6.3 % of the aperture is lit at 30 degrees.", run_walk,
     ),
 )  # fmt: skip

@@ -21,7 +21,8 @@ KINDS = ("diffuser", "microlenses", "lenslets")
 NAMES = {"diffuser": "diffuser", "microlenses": "square array", "lenslets": "aperiodic lenslets"}
 BAND_CYCLES_PER_MM = (5.0, 14.5)  # of the sensor: vessels of 90 to 260 um on the retina of a human eye
 MYOPIA_DPT = 4.0  # the paper's tolerance
-FUTURE, EVEN = "contrast significantly improved", "caustic better evenly distributed"
+IMPROVED, EVEN = "contrast significantly improved", "caustic better evenly distributed"
+FUTURE = "the paper names it and leaves it to future work"
 HOW = "ideal lenses in the simulator, whose focal length is the distance to the sensor"
 
 
@@ -83,10 +84,10 @@ def run_lenslets(bench: Bench) -> Outcome:
         *(_passes(kind, passed) for kind in KINDS[1:]),
         above("evenness of |H|, diffuser over square array", passed["diffuser"][1] / passed["microlenses"][1], 1.0,
               EVEN, 2).adapted(HOW).limit_from("the paper's ordering"),
-        *(above(f"PCC, {NAMES[kind]} over diffuser, least of {len(SEEDS)} eyes", min(gain), 0.0).ours(
-            "the paper leaves it to future work").limit_from("better in every eye") for kind, gain in gains.items()),
-        above(f"the same for aperiodic lenslets and an eye of {MYOPIA_DPT:g} dpt", kept, 0.0).ours(
-            "refraction estimated from the frame").limit_from("better"),
+        *(above(f"PCC, {NAMES[kind]} minus diffuser, least of {len(SEEDS)} eyes", min(gain), 0.0).ours(FUTURE)
+          .limit_from("better in every eye") for kind, gain in gains.items()),
+        above(f"PCC, aperiodic lenslets minus diffuser, an eye of {MYOPIA_DPT:g} dpt", kept, 0.0).ours(
+            f"{FUTURE}; refraction estimated from the frame").limit_from("better"),
     )  # fmt: skip
     return Outcome(claims, tuple(_shown(found)), (_table(found, passed),), _notes(gains, strained))
 
@@ -94,8 +95,8 @@ def run_lenslets(bench: Bench) -> Outcome:
 def _passes(kind: str, passed: dict[str, list[float]]) -> Claim:
     ratio = passed[kind][0] / passed["diffuser"][0]
     return (
-        above(f"detail passed (rms of |H|), {NAMES[kind]} over diffuser", ratio, 1.0, FUTURE, 1)
-        .adapted(HOW)
+        above(f"rms of |H|, {NAMES[kind]} over diffuser", ratio, 1.0, IMPROVED, 1)
+        .ours(FUTURE)
         .limit_from("the paper's ordering")
     )
 
@@ -155,6 +156,11 @@ def _notes(gains: dict[str, list[float]], strained: dict[str, Trial]) -> tuple[s
         "is uneven as the paper says, and whose copies of the retina the prior must tell apart.",
         f"An eye of {MYOPIA_DPT:g} dpt with the PSF of a relaxed one, the refraction estimated from the frame: "
         f"PCC {eye['diffuser']} behind the diffuser, {eye['lenslets']} behind lenslets.",
+        "|H| is the transfer function of the PSF of sum 1, from 5 to 14.5 cycles/mm on the sensor (vessels of 90 to "
+        "260 um). Its rms there stands for the paper's \"image contrast\": the share of an object's detail that "
+        "reaches the raw frame. Evenness is its geometric mean over its rms: 1 if |H| is the same at all these "
+        "frequencies, near 0 if some are missing. The rows on |H| "
+        "are ratios of two elements, those on PCC are differences.",
         "Not shown: a real array. The lenses here are ideal, without gaps, aberrations, scatter and wrong thickness; "
         "wider lenses gain more (600 um) until one lens is left, which is a camera that must be focused. A diffuser "
         "is cheap and needs no alignment. Nothing was built or measured.",

@@ -14,8 +14,8 @@ Label = Literal["as written", "adapted", "put in", "not reproduced", "ours"]
 class Claim:
     """One measured number with its limits, its status, its relation to the paper, and the paper's value.
 
-    `attempted`: the number is the paper's, and the simulation may miss it. Outside its limits the number is reported as
-    not reproduced: it does not count as held, and the run does not fail. `why`: how the paper's experiment was adapted,
+    `attempted`: the statement is the paper's, and the simulation may miss it. Outside its limits it is reported as not
+    reproduced: it does not count as held, and the run does not fail. `why`: how the paper's experiment was adapted,
     why the number is put in, or why it is not reproduced. `derived`: reason of the limit; empty if it was set after the
     value was seen.
     """
@@ -44,8 +44,12 @@ class Claim:
         return replace(self, given_label="ours", why=why)
 
     def because(self, why: str) -> "Claim":
-        """Return the claim with the reason for which its number is not reproduced."""
+        """Return the claim with a remark under its label: why it is not reproduced, or what it rests on."""
         return replace(self, why=why)
+
+    def as_attempt(self) -> "Claim":
+        """Return the claim as one on a statement of the paper, which the simulation may miss."""
+        return replace(self, attempted=True)
 
     def limit_from(self, reason: str) -> "Claim":
         """Return the claim with the reason of its limit."""
@@ -140,4 +144,4 @@ def within(what: str, value: float, low: float, high: float, paper: str = "", di
 
 def attempted(what: str, value: float, low: float, high: float, paper: str, digits: int = 3) -> Claim:
     """Return a claim on a number of the paper; outside the limits the number is reported as not reproduced."""
-    return Claim(what, value, f"{low:g} to {high:g}", low <= value <= high, paper, digits, attempted=True)
+    return within(what, value, low, high, paper, digits).as_attempt()

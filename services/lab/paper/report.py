@@ -29,7 +29,7 @@ from services.lab.paper import (  # fmt: skip
 )
 from services.lab.paper.bench import Bench
 from services.lab.paper.outcome import Claim, Experiment, Figure, Label, Outcome, Status, Table
-from services.lab.paper.style import CLAIMED, STYLE
+from services.lab.paper.style import CLAIMED, GLOSSARY, STYLE
 from services.lab.reconstruct_file import write_or_raise
 
 ORDER = (
@@ -113,18 +113,30 @@ def _write_pictures(folder: Path, outcome: Outcome) -> None:
 
 
 def all_hold(ran: Sequence[ExperimentRun]) -> bool:
-    """Return whether every assertion of every experiment holds; a number that is not reproduced is no assertion."""
+    """Return whether every assertion of every experiment holds; what is not reproduced is no assertion."""
     return all(claim.status != "does not hold" for one in ran for claim in one.outcome.claims)
 
 
 def summary(claims: Sequence[Claim]) -> str:
-    """Return how many assertions hold, of how many, and how many numbers of the paper are not reproduced."""
+    """Return how many assertions hold, of how many, and how many statements of the paper are not reproduced."""
     states = [claim.status for claim in claims]
     if not states:
         return "shown, nothing is asserted"
     missed = states.count("not reproduced")
     words = f"{states.count('holds')} of {len(states) - missed} assertions hold"
-    return words + (f"; numbers of the paper that are not reproduced: {missed}" if missed else "")
+    return words + (f"; statements of the paper that are not reproduced: {missed}" if missed else "")
+
+
+def on_the_paper(claims: Sequence[Claim]) -> str:
+    """Return in words how many rows on the paper's own statements hold, and how many rows are on none of these."""
+    found = Counter(claim.label for claim in claims)
+    held = Counter(claim.label for claim in claims if claim.holds)
+    tested = found["as written"] + found["adapted"] + found["not reproduced"]
+    return (
+        f"{held['as written'] + held['adapted']} of {tested} rows on the paper's own statements hold "
+        f"({held['as written']} as written, {held['adapted']} adapted), {found['not reproduced']} are not reproduced. "
+        f"The other {len(claims) - tested} rows do not test the paper ({found['put in']} put in, {found['ours']} ours)."
+    )
 
 
 def table(ran: Sequence[ExperimentRun]) -> str:
@@ -156,9 +168,11 @@ def html(ran: Sequence[ExperimentRun], merged: int) -> str:
             '<p class="lead">Li, McKay, Durr, Tian: "A diffuser-based computational imaging funduscope", every '
             "experiment "
             "repeated in the simulator. <b>All pictures on this page are simulated.</b></p>",
-            f'<p class="verdict">{verdict} {size}; {total_s:.0f} s of computing.</p>',
+            f'<p class="verdict">{on_the_paper(every)}</p>' if every else "",
+            f"<p>All rows together: {verdict} {size}; {total_s:.0f} s of computing.</p>",
             f"<p>Labels of the {len(every)} rows: {_labels(every)}.</p>" if every else "",
             CLAIMED,
+            GLOSSARY,
             f"<h2>Contents</h2><ul class=toc>{toc}</ul>",
             *(_section(one) for one in ran),
             "</main></html>\n",
@@ -230,4 +244,8 @@ def _figure(shown: Figure) -> str:
 
 
 def _value(claim: Claim) -> str:
-    return f"{claim.value:.{claim.digits}f}"
+    """Return the value in its digits; one that would be printed as zero in scientific notation, zero itself as 0."""
+    printed = f"{claim.value:.{claim.digits}f}"
+    if float(printed) != 0 or claim.digits == 0:
+        return printed
+    return f"{claim.value:.0e}" if claim.value else "0"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.lab.paper.bench import SAMPLE_UM, Bench, HeadChanges, SimulatedFrame
+from services.lab.paper.bench import DEFAULT, SAMPLE_UM, Bench, HeadChanges, SimulatedFrame
 from services.lab.paper.outcome import Claim, Experiment, Figure, Outcome, Table, above, below
 from services.lab.paper.pictures import compared, trend
 
@@ -14,11 +14,12 @@ SLACK = 0.01  # tolerance of a PCC below the measured one
 SENSORS: dict[str, tuple[int, int, float, int]] = {  # rows, cols, pitch in um, n x n pixels combined
     "IMX296": (1088, 1456, 3.45, 1), "IMX477": (3040, 4056, 1.55, 3), "OV9281": (800, 1280, 3.0, 1),
 }  # fmt: skip
-SEEN = {  # measured PCC of this retina, the smaller of full and merged pixels: flat-sub, ours, gain over the paper's
-    "IMX296": (0.910, 0.961, 0.393), "IMX477": (0.937, 0.958, 0.495), "OV9281": (0.805, 0.921, 0.568),
+SEEN = {  # measured PCC of this retina, the smaller of full and merged pixels: `evidence`, our default
+    "IMX296": (0.910, 0.961), "IMX477": (0.937, 0.958), "OV9281": (0.805, 0.921),
 }  # fmt: skip
 TOO_SMALL = ("OV9281",)  # for the PSF itself: 3.4 mm wide on a side of 2.4 mm
 EYES = 6
+FUTURE = "an outlook of the paper, which shows no refraction"
 SPAN_DPT, CYLINDER_DPT = 5.0, 0.5
 
 
@@ -49,7 +50,7 @@ def whole_psf(bench: Bench, take: SimulatedFrame, name: str, coarse: bool) -> Si
 
 
 def run_sensors(bench: Bench) -> Outcome:
-    """Solve each sensor by the paper's solver, by `evidence` (flat-sub) and by `variation` (ours)."""
+    """Solve each sensor by the paper's solver, by `evidence` and by `variation` (our default)."""
     claims: list[Claim] = []
     shown: list[Figure] = []
     rows, cut = [], 0.0
@@ -61,26 +62,23 @@ def run_sensors(bench: Bench) -> Outcome:
             cut = take.score(plain.solve(take, "variation")).pcc
             take = whole_psf(plain, take, name, bench.merged > 1)
         _, paper, scores = plain.best_mu(take)
-        flat, ours = (plain.solve(take, method) for method in ("evidence", "variation"))
-        found = scores.pcc, take.score(flat).pcc, take.score(ours).pcc
+        filtered, ours = (plain.solve(take, method) for method in ("evidence", "variation"))
+        found = scores.pcc, take.score(filtered).pcc, take.score(ours).pcc
         claims += [
-            above(f"{name}, PCC of flat-sub", found[1], round(SEEN[name][0] - SLACK, 3)),
-            above(f"{name}, PCC of ours", found[2], round(SEEN[name][1] - SLACK, 3)),
-            above(
-                f"{name}, ours over the paper's solver, PCC", found[2] - found[0], round(SEEN[name][2] - 2 * SLACK, 3)
-            ),
+            above(f"{name}, PCC of evidence", found[1], round(SEEN[name][0] - SLACK, 3)),
+            above(f"{name}, PCC of our default", found[2], round(SEEN[name][1] - SLACK, 3)),
         ]
-        shown += compared(take, {"paper's solver": paper, "ours": ours}, name)
+        shown += compared(take, {"paper's solver": paper, DEFAULT: ours}, name)
         rows.append((name, *(f"{pcc:.3f}" for pcc in found)))
-    sheet = Table(("sensor", "paper's solver", "flat-sub", "ours"), tuple(rows))
+    sheet = Table(("sensor, PCC", "paper's solver", "evidence", DEFAULT), tuple(rows))
     note = (
         "The rule D > d + 2s of the paper holds for its sensor's long side only: the short one has 5.44 mm where 5.82 "
-        "are needed at 33.4 degrees. With a solver that knows of the crop it is no rule any more."
+        "are needed at 33.4 degrees. With a solver that models the crop, a smaller sensor still gives a picture, "
+        "at the PCC above."
     )
     parts = (
         "The OV9281 does not even hold the PSF (3.4 mm on 2.4), so its PSF is taken in parts, as by a point that "
-        "moves. "
-        f"With what it sees of a point on the axis alone our default has {cut:.2f}."
+        f"moves. With what it sees of a point on the axis alone our default has {cut:.2f}."
     )
     return Outcome(tuple(claims), tuple(shown), (sheet,), (note, parts))
 
@@ -93,11 +91,11 @@ def run_refraction(bench: Bench) -> Outcome:
     found = {kind: _refractions(bench, kind, of) for kind, of in truth.items()}
     errors = {kind: found[kind] - of for kind, of in truth.items()}
     claims = [
-        below(f"mean sphere of {kind}, rms error, dpt", rms(error[:, 0]), 0.15, "promised, not shown")
+        below(f"mean sphere of {kind}, rms error, dpt", rms(error[:, 0]), 0.15).ours(FUTURE)
         for kind, error in errors.items()
     ]
     cylinders = np.concatenate([error[:, 1:] for error in errors.values()])
-    claims.append(below("J0 and J45 of all eyes, rms error, dpt", rms(cylinders), 0.15, "promised, not shown"))
+    claims.append(below("J0 and J45 of all eyes, rms error, dpt", rms(cylinders), 0.15).ours(FUTURE))
     curve = {kind: dict(zip(eyes[:, 0].tolist(), error[:, 0].tolist(), strict=True)) for kind, error in errors.items()}
     shown = (
         trend("Error of the refraction that the frame tells", "no beacon; wavefront M", "M of the eye, dpt",
@@ -109,7 +107,8 @@ def run_refraction(bench: Bench) -> Outcome:
     )
     note = (
         "The estimate is that of the instrument: spectrum of the frame, field edge, then the frame itself. "
-        "One diffuser model makes and reads these frames: a simulation, not a measurement."
+        "One diffuser model makes and reads these frames, and the PSF is that of an ideal point: a simulation of drawn "
+        "retinas, not a measurement."
     )
     table = Table(("M", "J0", "J45", "found, round", "found, astigmatic"), rows)
     return Outcome(tuple(claims), shown, (table,), (note,))
@@ -137,8 +136,10 @@ EXPERIMENTS = (
     ),
     Experiment(
         "S11", "Refraction from the frame",
-        "The stretch of the caustic that a frame carries tells the eye's mean sphere.",
+        "The refraction of six random eyes, without astigmatism (round: J0 = J45 = 0) and with it, estimated from the "
+        "stretch of the caustic in the fundus frame alone. M is the mean sphere; J0 and J45 are the two parts "
+        "of the cylinder.",
         "Abstract: \"this technology could enable combined ocular aberrometry and funduscopic screening\".",
-        run_refraction, "the paper promises it; on drawn retinas, with the PSF of an ideal point",
+        run_refraction,
     ),
 )  # fmt: skip
