@@ -348,14 +348,13 @@ def _summary(seconds: list[float]) -> tuple[float, float]:
 
 
 def _label(made: Point | Choice, methods: Mapping[str, Method]) -> tuple[str, str, str]:
-    rounds = (
-        f"{made.rounds} round{'s' if made.rounds != 1 else ''}" if methods[made.method].round_pairs else "closed form"
-    )
-    seconds = made.seconds_median
+    """Return the lines below a thumbnail: time and accuracy, method and bin, rounds."""
+    ms = made.seconds_median * 1e3
+    rounds = f"{made.rounds} round{'' if made.rounds == 1 else 's'}" if methods[made.method].round_pairs else ""
     return (
-        f"{seconds * 1e3:.{0 if seconds >= 0.01 else 1}f} ms, {made.psnr_db:.1f} dB",
+        f"{ms:.{0 if ms >= 10 else 1}f} ms, {made.psnr_db:.1f} dB",
         f"{made.method}, bin {made.bin}",
-        rounds,
+        rounds or "closed form",
     )
 
 

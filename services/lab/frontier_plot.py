@@ -49,14 +49,15 @@ def _time_plot(
     choice, budget_s = found.choice, found.budget_s
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
     words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
+    kinds = {name: kind for kind, name in enumerate(dict.fromkeys((*METHODS, *methods)))}  # the choice is built in
     series = (
         *_best_mus(found),
         *(
-            _series(points, method, kind, words, letters)
-            for kind, method in enumerate(methods.values())
+            _series(points, method, kinds[method.name], words, letters)
+            for method in methods.values()
             if any(p.method == method.name for p in points)
         ),
-        _chosen(found, list(methods), LETTERS[len(letters)] if letters else ""),
+        _chosen(found, kinds[found.choice.method], LETTERS[len(letters)] if letters else ""),
         *_peers(found),
         *_bursts_in_time(found),
     )
@@ -98,7 +99,7 @@ def _best_mus(found: Frontier) -> tuple[Series, ...]:
     return (Series("tikhonov, best mu", (marks,), 0),) if marks else ()
 
 
-def _chosen(found: Frontier, names: Sequence[str], letter: str) -> Series:
+def _chosen(found: Frontier, kind: int, letter: str) -> Series:
     """Return the instrument's choice: a line from its time without the refraction to the whole time."""
     choice = found.choice
     tooltip = (
@@ -107,7 +108,7 @@ def _chosen(found: Frontier, names: Sequence[str], letter: str) -> Series:
     )
     start = Mark(choice.solve_s, choice.psnr_db, weight=0.0)
     whole = Mark(choice.seconds_median, choice.psnr_db, letter, tooltip, LETTER_WEIGHT)
-    return Series("chosen", ((start, whole),), names.index(choice.method), named=False)
+    return Series("chosen", ((start, whole),), kind, named=False)
 
 
 def _light_plot(found: Frontier) -> Plot:
