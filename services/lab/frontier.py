@@ -7,7 +7,7 @@ alike; the median of the repeats counts.
 
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -32,7 +32,7 @@ from device.values import Calibration, Image, Mask, Reconstruction
 from services.instrument.measured_frontier import MeasuredFrontier
 from services.lab.frontier_light import LightCase, light_case, measure_light
 from services.lab.frontier_oracle import best_mus
-from services.lab.frontier_plot import draw_frontier
+from services.lab.frontier_plot import draw_frontier, drawn_points
 from services.lab.frontier_result import (
     BestMu,
     Choice,
@@ -44,8 +44,11 @@ from services.lab.frontier_result import (
     Point,
     ScoredRegion,
     frontier_text,
+    pareto_front,
 )
+from services.lab.frontier_thumbnails import Shown, nearest_points, thumbnail_panel
 from services.lab.peers import LenslessPeer
+from services.lab.plot import Panel
 from services.lab.reconstruct_file import require_writable, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_calibration, load_raw, name_of
 
@@ -107,10 +110,11 @@ def frontier(request: FrontierRequest, progress: ProgressCallback, peer: Lensles
     _refuse_invalid(request)
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
     methods = available_methods()
-    found = measure_frontier(_case(request), request.plans, request.budget_s, request.repeats, progress, methods, peer)
+    bench = _Bench(_case(request), Planner(request.plans), SystemClock(), progress, methods)
+    found = _measured(bench, request.budget_s, request.repeats, peer)
     text = frontier_text(found)
     write_or_raise(request.json, lambda: request.json.write_text(text, encoding="utf-8"))
-    picture = draw_frontier(found, methods)
+    picture = draw_frontier(found, methods, bench.thumbnails(found))
     write_or_raise(request.plot, lambda: request.plot.write_text(picture, encoding="utf-8"))
     return found
 
@@ -123,7 +127,11 @@ def measure_frontier(
 
     A `peer` solves the same frame; the bursts of a case that has them follow.
     """
-    bench = _Bench(case, Planner(plans), SystemClock(), progress, methods)
+    return _measured(_Bench(case, Planner(plans), SystemClock(), progress, methods), budget_s, repeats, peer)
+
+
+def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer | None) -> Frontier:
+    case = bench.case
     points, choice = bench.measure(budget_s, repeats)
     front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
     points = tuple(replace(point, pareto=on) for point, on in zip(points, front, strict=True))
@@ -141,7 +149,7 @@ def measure_frontier(
         best_mu=bench.best_mus(),
         budget_s=budget_s,
         choice=choice,
-        dominated=tuple(method for method in methods if method not in kept),
+        dominated=tuple(method for method in bench.methods if method not in kept),
         peers=() if peer is None else bench.peer_points(peer),
         light=bench.light_points(),
     )
@@ -160,21 +168,6 @@ def measure_scene(
     """Return the frontier of one simulated exposure of a head, as `measure_frontier` does."""
     found = measure_frontier(scene_case(spec), plans, budget_s, repeats, progress)
     return MeasuredFrontier.model_validate_json(frontier_text(found))
-
-
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """Return for each (cost, worth) whether it is on the Pareto front.
-
-    A pair dominates another if its cost is at most as high, its worth at least as high, and one of both is better.
-    """
-    order = sorted(range(len(points)), key=lambda k: (points[k][0], -points[k][1]))
-    on, best, at_s = [False] * len(points), -np.inf, -np.inf
-    for k in order:
-        cost, worth = points[k]
-        on[k] = worth > best or (worth == best and cost == at_s)  # equal pairs do not dominate each other
-        if worth > best:
-            best, at_s = worth, cost
-    return on
 
 
 def table(found: Frontier) -> str:
@@ -214,6 +207,7 @@ class _Bench:
         self, case: Case, planner: Planner, clock: Clock, progress: ProgressCallback, methods: Mapping[str, Method]
     ) -> None:
         self.case, self.planner, self.clock, self.progress = case, planner, clock, progress
+        self.methods, self.chosen = methods, np.zeros(case.shape, np.float32)
         geometry = case.calibration.geometry
         self.detail_px = HIGHPASS_DEG * geometry.px_per_deg if geometry else HIGHPASS_PX
         self.inside, self.where = scored_region(case)
@@ -255,8 +249,29 @@ class _Bench:
         case = self.case
         bins = sorted({recipe.bin for recipe in self.recipes if recipe.method == "tikhonov"})
         return best_mus(
-            case.counts, case.calibration, self.planner, case.truth, self.inside, bins, self.judge, self.moved
+            case.counts,
+            case.calibration,
+            self.planner,
+            case.truth,
+            self.inside,
+            bins,
+            self.judge,
+            self.moved,
+            self.clock,
         )
+
+    def thumbnails(self, found: Frontier) -> Panel:
+        """Return the thumbnails of the best pictures within some times and of the chosen one, after `measure`."""
+        choice, shown = found.choice, []
+        for p in nearest_points(drawn_points(found), choice.seconds_median):
+            recipe = next(
+                one for one in self.recipes if (one.method, one.bin, one.rounds or 0) == (p.method, p.bin, p.rounds)
+            )
+            lines = _label(p, self.methods)
+            shown.append(Shown(lines, self.moved(_grey(self._reconstruct(recipe).picture))))
+        lines = _label(choice, self.methods)
+        shown.append(Shown((lines[0], lines[1], f"{lines[2]}, chosen"), self.chosen))
+        return thumbnail_panel(shown, self.case.truth, self.inside)
 
     def light_points(self) -> tuple[LightPoint, ...]:
         """Return the bursts of the case; none if it has no frames for them."""
@@ -289,7 +304,7 @@ class _Bench:
             Point(recipe.method, recipe.bin, recipe.rounds or 0, *_summary(seconds), **asdict(scores))
             for recipe, seconds, scores in zip(self.recipes, times, scored, strict=True)
         )
-        report = last.report
+        report, self.chosen = last.report, self.moved(_grey(last.picture))
         refract_s = float(np.median([each.report.seconds["refract"] for each in made]))
         solve_s = _summary(own)[0] - refract_s
         scores = self.score(last)
@@ -320,7 +335,8 @@ class _Bench:
     def region(self) -> ScoredRegion:
         """Return the scored region and the settings of the scores."""
         return ScoredRegion(
-            what=self.where, pixels=int(self.judge.inside.sum()), intensity_fit=FIT, psnr_range=RANGE,
+            what=self.where, field_known=bool(np.isfinite(field_radius_px(self.case.calibration))),
+            pixels=int(self.judge.inside.sum()), intensity_fit=FIT, psnr_range=RANGE,
             truth_variance=self.judge.truth_variance, ssim="sigma 1.5 px, 11 x 11, "
             "K1 0.01, K2 0.03, on the region eroded by 5 px", highpass_sigma_px=self.detail_px,
             shift_px=self.shift, truth_vessel_contrast=self.judge.truth_contrast,
@@ -329,6 +345,17 @@ class _Bench:
 
 def _summary(seconds: list[float]) -> tuple[float, float]:
     return float(np.median(seconds)), float(np.quantile(seconds, 0.95))
+
+
+def _label(made: Point | Choice, methods: Mapping[str, Method]) -> tuple[str, str, str]:
+    """Return the lines below a thumbnail: time and accuracy, method and bin, rounds."""
+    ms = made.seconds_median * 1e3
+    rounds = f"{made.rounds} round{'' if made.rounds == 1 else 's'}" if methods[made.method].round_pairs else ""
+    return (
+        f"{ms:.{0 if ms >= 10 else 1}f} ms, {made.psnr_db:.1f} dB",
+        f"{made.method}, bin {made.bin}",
+        rounds or "closed form",
+    )
 
 
 def _name(recipe: Recipe) -> str:

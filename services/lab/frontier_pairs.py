@@ -23,13 +23,12 @@ from services.lab.frontier import (
     Case,
     FrontierRequest,
     measure_frontier,
-    pareto_front,
     scored_region,
     this_machine,
     versions,
 )
 from services.lab.frontier_plot import draw_frontier
-from services.lab.frontier_result import Choice, Frontier, Machine, Point
+from services.lab.frontier_result import Choice, Frontier, Machine, Point, pareto_front
 from services.lab.pair_scores import LeftOut, PairScore, PairScorer, Row, rows, table
 from services.lab.peers import LenslessPeer
 from services.lab.reconstruct_file import require_writable, write_or_raise

@@ -1,52 +1,114 @@
 """SVG plot of a frontier measurement: PSNR against run time of every method, bin, number of rounds, and burst."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import log10
 
 from device.recon.methods import METHODS, Method
-from services.lab.frontier_result import Frontier, LightPoint, Point
-from services.lab.plot import Mark, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
+from services.lab.frontier_result import Frontier, LightPoint, Point, pareto_front
+from services.lab.frontier_thumbnails import LETTERS, nearest_points
+from services.lab.plot import Mark, Panel, Plot, Series, log_axis, stacked_svg, time_axis, value_axis
 
-BURST_KIND, BOUND_KIND = 6, 7  # of marks, the same in both plots
+PEER_KIND, BURST_KIND, BOUND_KIND = 5, 6, 7  # of marks, the same in both plots
+LETTER_WEIGHT = 1.2  # of the marks of thumbnails
+LEAST_REFRACTION_S = 0.001  # less is the decision against an estimate, not an estimate
 
 
-def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS) -> str:
+def draw_frontier(found: Frontier, methods: Mapping[str, Method] = METHODS, thumbnails: Panel | None = None) -> str:
     """Return the SVG of `found`, the result of `frontier.measure_frontier` with `methods`.
 
-    Accuracy against time; below it, if bursts were measured, accuracy against the dose.
+    Accuracy against time, `thumbnails`, whose marks have letters, and, if bursts were measured, accuracy against the
+    dose.
     """
-    time = _time_plot(found, methods)
-    return stacked_svg([time, _light_plot(found)] if found.light else [time])
+    points = drawn_points(found)
+    shown = nearest_points(points, found.choice.seconds_median) if thumbnails else ()
+    letters = dict(zip((_key(p) for p in shown), LETTERS, strict=False))
+    plots = [_time_plot(found, methods, points, letters)]
+    if found.light:
+        plots.append(_light_plot(found))
+    return stacked_svg(plots, [thumbnails] if thumbnails else [])
 
 
-def _time_plot(found: Frontier, methods: Mapping[str, Method]) -> Plot:
-    points, choice, budget_s = found.points, found.choice, found.budget_s
+def drawn_points(found: Frontier) -> tuple[Point, ...]:
+    """Return the points of the plot, with the Pareto front among them.
+
+    The method for an unknown field is left out where the field is known: the instrument never uses it there.
+    """
+    points = [p for p in found.points if not (found.region.field_known and p.method == "open")]
+    front = pareto_front([(p.seconds_median, p.psnr_db) for p in points])
+    return tuple(replace(point, pareto=on) for point, on in zip(points, front, strict=True))
+
+
+def _key(point: Point) -> tuple[str, int, int]:
+    return point.method, point.bin, point.rounds
+
+
+def _time_plot(
+    found: Frontier, methods: Mapping[str, Method], points: Sequence[Point], letters: Mapping[tuple[str, int, int], str]
+) -> Plot:
+    choice, budget_s = found.choice, found.budget_s
     edge = sorted((p.seconds_median, p.psnr_db) for p in points if p.pareto)
-    others = [(one.seconds_median, one.psnr_db) for one in found.light]
-    others += [(one.seconds, one.psnr_db) for one in found.peers]
-    seconds = [p.seconds_median for p in points] + [choice.solve_s, budget_s] + [one[0] for one in others]
-    worths = [p.psnr_db for p in points] + [choice.psnr_db] + [one[1] for one in others]
-    y = value_axis(worths, "accuracy: PSNR in dB after an affine intensity fit")
     words = "" if found.light else " (rounds)"  # the legend has no room for it beside bursts and peers
-    return Plot(
-        title=f"What accuracy costs in time{' and light' if found.light else ''}: {found.scene}",
-        subtitle=_subtitle(found),
-        description=_description(found, edge),
-        x=time_axis(seconds, "from counts in memory to the picture on the sensor grid, refraction apart"),
-        y=y,
-        series=tuple(
-            _series(points, method, words)
+    kinds = {name: kind for kind, name in enumerate(dict.fromkeys((*METHODS, *methods)))}  # the choice is built in
+    series = (
+        *_best_mus(found),
+        *(
+            _series(points, method, kinds[method.name], words, letters)
             for method in methods.values()
             if any(p.method == method.name for p in points)
-        )
-        + _peers(found)
-        + _bursts_in_time(found),
+        ),
+        _chosen(found, kinds[found.choice.method], LETTERS[len(letters)] if letters else ""),
+        *_peers(found),
+        *_bursts_in_time(found),
+    )
+    marks = [mark for one in series for trail in one.trails for mark in trail]
+    y = value_axis([mark.y for mark in marks], "accuracy: PSNR in dB after an affine intensity fit")
+    return Plot(
+        title=f"Accuracy against time{' and light' if found.light else ''}: {found.scene}",
+        subtitle=_subtitle(found),
+        description=_description(found, edge),
+        x=time_axis([mark.x for mark in marks] + [budget_s], _axis_title(found)),
+        y=y,
+        series=series,
         edge=tuple(edge),
         limit=(budget_s, f"budget {budget_s:g} s"),
-        ring=(choice.solve_s, choice.psnr_db, "chosen" if found.light else "the instrument's choice"),
+        ring=(choice.seconds_median, choice.psnr_db, "chosen"),
         right=_correlations(y.low, y.high, found.region.truth_variance),
         right_title="the same as correlation (PCC)",
     )
+
+
+def _axis_title(found: Frontier) -> str:
+    return f"from counts in memory to the picture; {_refraction(found)}"
+
+
+def _refraction(found: Frontier) -> str:
+    if found.choice.refract_s < LEAST_REFRACTION_S:
+        return "the budget leaves no time for the eye's refraction"
+    return f"the chosen one includes {found.choice.refract_s * 1e3:.0f} ms for the eye's refraction"
+
+
+def _best_mus(found: Frontier) -> tuple[Series, ...]:
+    """Return the paper's method by the paper's rule: the best mu of its range, chosen by the truth."""
+    marks = tuple(
+        Mark(one.seconds_median, one.psnr_db, f"bin {one.bin}",
+             f"tikhonov with mu {one.mu:.0e}, the best of the paper's range, bin {one.bin}: "
+             f"{one.seconds_median * 1e3:.1f} ms, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}", 0.95)
+        for one in found.best_mu
+    )  # fmt: skip
+    return (Series("tikhonov, best mu", (marks,), 0),) if marks else ()
+
+
+def _chosen(found: Frontier, kind: int, letter: str) -> Series:
+    """Return the instrument's choice: a line from its time without the refraction to the whole time."""
+    choice = found.choice
+    tooltip = (
+        f"chosen: {choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.solve_s * 1e3:.0f} ms and "
+        f"{choice.refract_s * 1e3:.0f} ms for the refraction, {choice.psnr_db:.2f} dB, PCC {choice.pcc:.3f}"
+    )
+    start = Mark(choice.solve_s, choice.psnr_db, weight=0.0)
+    whole = Mark(choice.seconds_median, choice.psnr_db, letter, tooltip, LETTER_WEIGHT)
+    return Series("chosen", ((start, whole),), kind, named=False)
 
 
 def _light_plot(found: Frontier) -> Plot:
@@ -80,7 +142,7 @@ def _frames(one: LightPoint) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:g}"
 
 
 def _subtitle(found: Frontier) -> str:
@@ -104,25 +166,29 @@ def _description(found: Frontier, edge: list[tuple[float, float]]) -> str:
         f"Each mark is one method at one bin and one number of rounds: its median time, and its PSNR against the known "
         f"truth. The best within each time: {best}. Within {found.budget_s:g} s the instrument chooses "
         f"{choice.method}, bin {choice.bin}, {choice.rounds} rounds: {choice.psnr_db:.1f} dB in "
-        f"{choice.solve_s * 1e3:.0f} ms, and looks for the eye's refraction in {choice.refract_s * 1e3:.0f} ms."
+        f"{choice.solve_s * 1e3:.0f} ms; {_refraction(found)}."
         + (f" More light, refraction included: {bursts}." if bursts else "")
     )
 
 
-def _series(points: Sequence[Point], method: Method, words: str) -> Series:
-    """Return the marks of one method; `words` follow the name of an iterative one.
+def _series(
+    points: Sequence[Point], method: Method, kind: int, words: str, letters: Mapping[tuple[str, int, int], str]
+) -> Series:
+    """Return the marks of one method; `words` follow the name of an iterative one, `letters` are those of thumbnails.
 
     A closed-form method has one trail over the bins; an iterative one has a trail over the rounds of each bin.
     """
     own = [p for p in points if p.method == method.name]
     if method.round_pairs == 0:
-        return Series(method.name, (tuple(_mark(p, method, f"bin {p.bin}") for p in own),))
+        marks = tuple(_mark(p, method, f"bin {p.bin}", letters) for p in own)
+        paper = method.name == "tikhonov"
+        return Series(f"{method.name}, GCV" if paper else method.name, (marks,), kind, hollow=paper)
     trails = []
     for n in sorted({p.bin for p in own}):
         rounds = [p for p in own if p.bin == n]
         labels = [f"bin {n}", *(str(p.rounds) if p.pareto else "" for p in rounds[1:])]
-        trails.append(tuple(_mark(p, method, label) for p, label in zip(rounds, labels, strict=True)))
-    return Series(f"{method.name}{words}", tuple(trails))
+        trails.append(tuple(_mark(p, method, label, letters) for p, label in zip(rounds, labels, strict=True)))
+    return Series(f"{method.name}{words}", tuple(trails), kind)
 
 
 def _peers(found: Frontier) -> tuple[Series, ...]:
@@ -132,7 +198,7 @@ def _peers(found: Frontier) -> tuple[Series, ...]:
              f"{one.name}: {one.seconds:.2f} s, {one.psnr_db:.2f} dB, PCC {one.pcc:.3f}", 0.9)
         for one in found.peers
     )  # fmt: skip
-    return (Series("LenslessPiCam", (marks,)),) if marks else ()
+    return (Series("LenslessPiCam", (marks,), PEER_KIND),) if marks else ()
 
 
 def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
@@ -145,10 +211,14 @@ def _bursts_in_time(found: Frontier) -> tuple[Series, ...]:
     return (Series("burst", (marks,), BURST_KIND),) if marks else ()
 
 
-def _mark(point: Point, method: Method, label: str) -> Mark:
-    ms = point.seconds_median * 1e3
+def _mark(point: Point, method: Method, label: str, letters: Mapping[tuple[str, int, int], str]) -> Mark:
     rounds = f", {point.rounds} rounds" if method.round_pairs else ""
-    tooltip = f"{point.method}, bin {point.bin}{rounds}: {ms:.1f} ms, {point.psnr_db:.2f} dB, PCC {point.pcc:.3f}"
+    tooltip = (
+        f"{point.method}, bin {point.bin}{rounds}: {point.seconds_median * 1e3:.1f} ms, {point.psnr_db:.2f} dB, "
+        f"PCC {point.pcc:.3f}"
+    )
+    if letter := letters.get(_key(point)):
+        return Mark(point.seconds_median, point.psnr_db, letter, tooltip, LETTER_WEIGHT)
     return Mark(point.seconds_median, point.psnr_db, label, tooltip, 1.0 if point.pareto else 0.75)
 
 

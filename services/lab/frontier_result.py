@@ -1,8 +1,9 @@
-"""Result of a frontier measurement, and its text as JSON; the fields are the keys of the file, in the same order."""
+"""Result of a frontier measurement and its text as JSON, whose keys are the fields in this order; the Pareto front."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from math import inf
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,14 @@ class FrameSize:
 class ScoredRegion:
     """Scored region of the frame and settings of the scores.
 
-    `what`: description of the region, with `pixels` pixels. `truth_variance`: of the truth, scaled to the range 0 to 1.
+    `what`: description of the region, with `pixels` pixels; `field_known`: it is that of the known illuminated field.
+    `truth_variance`: of the truth, scaled to the range 0 to 1.
     `shift_px`: (rows, cols) by which every picture is moved back. `truth_vessel_contrast` is None if the vessels are
     unknown. `intensity_fit`, `psnr_range` and `ssim` describe the scores in words.
     """
 
     what: str
+    field_known: bool
     pixels: int
     intensity_fit: str
     psnr_range: str
@@ -69,7 +72,7 @@ class LightPoint:
 
     `used`: frames that entered the picture. `dose_j_per_cm2`: retinal dose of all frames, weighted with the
     photochemical hazard; in the worst case where the head's light is not measured. `bound_psnr_db`: of the oracle's
-    Wiener filter on a frame of a still eye with as much light.
+    Wiener filter on a frame of a still eye with as much light. The time includes that of the refraction.
     """
 
     frames: int
@@ -97,11 +100,12 @@ class PeerPoint:
 
 @dataclass(frozen=True)
 class BestMu:
-    """Best mu of a method at one bin, selected by the truth, and its scores."""
+    """Best mu of a method at one bin, selected by the truth, with the median time of a solution and its scores."""
 
     method: str
     bin: int
     mu: float
+    seconds_median: float
     pcc: float
     psnr_db: float
     ssim: float
@@ -158,6 +162,21 @@ class Frontier:
     dominated: tuple[str, ...]
     light: tuple[LightPoint, ...] = ()
     peers: tuple[PeerPoint, ...] = ()
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return for each (cost, worth) whether it is on the Pareto front.
+
+    A pair dominates another if its cost is at most as high, its worth at least as high, and one of both is better.
+    """
+    order = sorted(range(len(points)), key=lambda k: (points[k][0], -points[k][1]))
+    on, best, at_s = [False] * len(points), -inf, -inf
+    for k in order:
+        cost, worth = points[k]
+        on[k] = worth > best or (worth == best and cost == at_s)  # equal pairs do not dominate each other
+        if worth > best:
+            best, at_s = worth, cost
+    return on
 
 
 def frontier_text(found: Frontier) -> str:

@@ -31,6 +31,8 @@ STYLE = """
 """
 KINDS = 8  # of marks and colours
 LETTER_PX, LINE_PX = 6.6, 13.0  # width of a letter and height of a line of a 12 px label
+GAP_PX = 4  # between labels; a wide font has digits of 7.5 px
+FULL_WEIGHT = 0.9  # a lighter mark has its label beside it or not at all
 Box = tuple[float, float, float, float]
 
 
@@ -49,12 +51,15 @@ class Mark:
 class Series:
     """Marks of one shape and colour; a thin line joins the marks of each trail.
 
-    `kind`: number of the shape and colour, 0 to KINDS - 1; None: the place among the series of the plot.
+    `kind`: number of the shape and colour, 0 to KINDS - 1; None: the place among the series of the plot. `hollow`: its
+    marks are outlines. `named`: the series has its name in the legend.
     """
 
     name: str
     trails: tuple[tuple[Mark, ...], ...]
     kind: int | None = None
+    hollow: bool = False
+    named: bool = True
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,16 @@ class Plot:
     height: int = field(default=600, kw_only=True)
 
 
+@dataclass(frozen=True)
+class Panel:
+    """Ready SVG elements in their own coordinates, below a plot. Width and height are in px."""
+
+    elements: tuple[str, ...]
+    description: str
+    height: int
+    width: int = 960
+
+
 LEFT, RIGHT, TOP, BOTTOM = 74, 78, 96, 62
 
 
@@ -132,27 +147,36 @@ def svg(plot: Plot) -> str:
     return stacked_svg([plot])
 
 
-def stacked_svg(plots: Sequence[Plot]) -> str:
-    """Return plots one below the other as one SVG document, with the title of the first one."""
-    wide, tall = max(plot.width for plot in plots), sum(plot.height for plot in plots)
+def stacked_svg(plots: Sequence[Plot], between: Sequence[Panel] = ()) -> str:
+    """Return plots one below the other as one SVG document, with the title of the first one.
+
+    Panels stand `between` the first plot and the others.
+    """
+    every: list[Plot | Panel] = [plots[0], *between, *plots[1:]]
+    wide, tall = max(one.width for one in every), sum(one.height for one in every)
     panels, down = [], 0
-    for plot in plots:
-        inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot)]
-        heads = [text(LEFT, 32, plot.title, "title"), text(LEFT, 54, plot.subtitle, "quiet small")]
-        panels += [f'<g transform="translate(0 {down})">', *heads, *inner, *_labels(plot), "</g>"]
-        down += plot.height
+    for one in every:
+        elements = _elements(one) if isinstance(one, Plot) else one.elements
+        panels += [f'<g transform="translate(0 {down})">', *elements, "</g>"]
+        down += one.height
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {tall}" width="{wide}" height="{tall}" '
             'role="img" aria-labelledby="plot-title plot-desc">',
             f'<title id="plot-title">{escape(plots[0].title)}</title>',
-            f'<desc id="plot-desc">{escape(" ".join(plot.description for plot in plots))}</desc>',
+            f'<desc id="plot-desc">{escape(" ".join(one.description for one in every))}</desc>',
             f"<style>{STYLE}</style>",
             f'<rect class="ground" width="{wide}" height="{tall}"/>',
             *panels,
             "</svg>\n",
         ]
     )
+
+
+def _elements(plot: Plot) -> list[str]:
+    inner = [*_frame(plot), *_edge(plot), *_limit(plot), *_series(plot), *_ring(plot), *_legend(plot)]
+    heads = [text(LEFT, 32, plot.title, "title"), text(LEFT, 54, plot.subtitle, "quiet small")]
+    return [*heads, *inner, *_labels(plot)]
 
 
 def _x(plot: Plot, value: float) -> float:
@@ -236,7 +260,7 @@ def _series(plot: Plot) -> list[str]:
             for mark, (x, y) in zip(trail, places, strict=True):
                 if not mark.weight:
                     continue
-                shape = _shape(k, x, y, 6.5 * mark.weight)
+                shape = _shape(k, x, y, 6.5 * mark.weight, series.hollow)
                 out.append(
                     f"{shape}<title>{escape(mark.tooltip)}</title></path>" if mark.tooltip else f"{shape}</path>"
                 )
@@ -244,21 +268,23 @@ def _series(plot: Plot) -> list[str]:
     return out
 
 
+HOLLOW = "fill: none; stroke: var(--ink); stroke-width: 1.8"
 # Corners, direction of the first one and size of the marks after the circle.
 OUTLINES = (
     (4, pi / 4, 1.25), (3, -pi / 2, 1.3), (4, 0, 1.3), (3, pi / 2, 1.3), (5, -pi / 2, 1.2), (6, 0, 1.15), (3, 0, 1.3),
 )  # fmt: skip
 
 
-def _shape(k: int, x: float, y: float, r: float) -> str:
+def _shape(k: int, x: float, y: float, r: float, hollow: bool = False) -> str:
     """Return the start tag of a mark of series `k`: circle, square, triangle, diamond or another polygon."""
+    style = f' style="{HOLLOW}"' if hollow else ""
     if k % KINDS == 0:
         d = f"M {x - r:.1f} {y:.1f} a {r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0 a {r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0 Z"
-        return f'<path class="mark" d="{d}">'
+        return f'<path class="mark"{style} d="{d}">'
     corners, turn, grow = OUTLINES[k % KINDS - 1]
     around = [turn + 2 * pi * c / corners for c in range(corners)]
     places = " L ".join(f"{x + grow * r * cos(a):.1f} {y + grow * r * sin(a):.1f}" for a in around)
-    return f'<path class="mark" d="M {places} Z">'
+    return f'<path class="mark"{style} d="M {places} Z">'
 
 
 def _ring(plot: Plot) -> list[str]:
@@ -273,11 +299,13 @@ def _legend(plot: Plot) -> list[str]:
     """Return one row above the frame: shape and name of each series, then the Pareto edge and the ring."""
     out, at = [], float(LEFT + 6)
     for k, series in _by_kind(plot):
+        if not series.named:
+            continue
         out += [
-            f'<g class="s{k % KINDS}">{_shape(k, at, TOP - 20, 6.0)}</path></g>',
+            f'<g class="s{k % KINDS}">{_shape(k, at, TOP - 20, 6.0, series.hollow)}</path></g>',
             text(at + 11, TOP - 16, series.name, "small"),
         ]
-        at += 11 + LETTER_PX * len(series.name) + 14
+        at += 11 + LETTER_PX * len(series.name) + 11
     if plot.edge:
         out += [line(at, TOP - 20, at + 24, TOP - 20, "edge"), text(at + 30, TOP - 16, "Pareto edge", "small")]
         at += 30 + LETTER_PX * 11 + 12
@@ -290,20 +318,28 @@ def _legend(plot: Plot) -> list[str]:
 
 
 def _labels(plot: Plot) -> list[str]:
-    """Return every label beside its mark where it overlaps no other; one without space is left out."""
+    """Return every label beside its mark where it overlaps no other text or mark; one without space is left out.
+
+    Labels of marks with more weight have the first choice; that of a light mark stands close to it.
+    """
     taken: list[Box] = [
         (_x(plot, m.x) - 6, _y(plot, m.y) - 6, _x(plot, m.x) + 6, _y(plot, m.y) + 6) for m in _marks(plot)
     ]
     if plot.ring is not None:
         x, y = _x(plot, plot.ring[0]), _y(plot, plot.ring[1])
         taken.append((x - 13, y - 13, x + 13, y + 13))
+    if plot.limit is not None:
+        x, y = _x(plot, plot.limit[0]), plot.height - BOTTOM - 8
+        taken.append((x - GAP_PX, y - LINE_PX, x + 6 + LETTER_PX * len(plot.limit[1]) + GAP_PX, y + GAP_PX))
+    labelled = [(k, mark) for k, series in _by_kind(plot) for trail in series.trails for mark in trail if mark.label]
     out = []
-    for k, series in _by_kind(plot):
-        for mark in (mark for trail in series.trails for mark in trail if mark.label):
-            place = _free_position(_x(plot, mark.x), _y(plot, mark.y), len(mark.label) * LETTER_PX, taken, plot)
-            if place is not None:
-                taken.append(place)
-                out.append(f'<g class="s{k % KINDS}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
+    for k, mark in sorted(labelled, key=lambda one: -one[1].weight):
+        reach = (0, 6, 12, 20) if mark.weight >= FULL_WEIGHT else (0,)
+        wide = len(mark.label) * LETTER_PX
+        place = _free_position(_x(plot, mark.x), _y(plot, mark.y), wide, reach, taken, plot)
+        if place is not None:
+            taken.append((place[0] - GAP_PX, place[1], place[2] + GAP_PX, place[3]))
+            out.append(f'<g class="s{k % KINDS}">{text(place[0], place[3] - 3, mark.label, "label small")}</g>')
     return out
 
 
@@ -311,8 +347,10 @@ def _marks(plot: Plot) -> list[Mark]:
     return [mark for series in plot.series for trail in series.trails for mark in trail]
 
 
-def _free_position(x: float, y: float, wide: float, taken: Sequence[Box], plot: Plot) -> Box | None:
-    for near in (0, 6, 12, 20):
+def _free_position(
+    x: float, y: float, wide: float, reach: Sequence[int], taken: Sequence[Box], plot: Plot
+) -> Box | None:
+    for near in reach:
         right, left, middle = x + 10 + near, x - 10 - near - wide, x - wide / 2
         over, under, level = y - 7 - near - LINE_PX, y + 8 + near, y - LINE_PX / 2
         for a, b in ((middle, over), (middle, under), (right, under), (left, over), (right, over), (left, under),

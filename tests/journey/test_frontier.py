@@ -67,6 +67,7 @@ def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, t
     for one in facts["best_mu"]:  # best of eight weights, compared with the estimate from the frame alone
         assert 1e-6 <= one["mu"] <= 3.2e-3
         assert one["pcc"] > validated[one["bin"]]["pcc"] - 0.01
+        assert 0 < one["seconds_median"] < 5
     assert done.stdout.count("tikhonov with the best mu") == len(validated)
     assert {p["rounds"] for p in facts["points"] if p["method"] == "variation"} == {0, 1, 2, 4, 8, 12, 20}
     edge = sorted((p["seconds_median"], p["psnr_db"]) for p in facts["points"] if p["pareto"])
@@ -84,6 +85,11 @@ def test_small_scene_gives_points_choice_and_plot(diffuscope: Run, tiny: Path, t
     assert bounds == sorted(bounds)
     assert "8 frames (8 used)" in done.stdout
     assert "8 frames, " in plot.read_text()
+    embedded = [one.get("href") or "" for one in root.iter("{http://www.w3.org/2000/svg}image")]
+    assert 3 <= len(embedded) <= 5, "pictures of two to four points, and the truth"
+    assert all(one.startswith("data:image/png;base64,") for one in embedded)
+    assert facts["region"]["field_known"] is True
+    assert "open, bin" not in plot.read_text()
     assert "Diabetic scene" in done.stderr
     assert "the instrument chooses variation" in done.stdout
     assert len([line for line in done.stderr.splitlines() if " dB, PCC " in line]) == len(facts["points"])

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.lab.frontier import pareto_front
+from services.lab.frontier_result import pareto_front
 from services.lab.plot import Mark, Plot, Series, stacked_svg, svg, time_axis, value_axis
 
 SVG = "{http://www.w3.org/2000/svg}"

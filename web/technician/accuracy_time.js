@@ -149,7 +149,9 @@ function measuring({ busy, said: progressText, problem, measured }, actions) {
 }
 
 function points({ explorer, all, capture, captures }, actions) {
-  const { points, budget_s: budget } = explorer.measured;
+  const { budget_s: budget, region } = explorer.measured;
+  // The method for an unknown field is left out where the field is known: a capture never uses it there.
+  const points = explorer.measured.points.filter((one) => one.method !== "open" || !region?.field_known);
   const rows = points.filter((one) => all || one.pareto).sort((a, b) => a.seconds_median - b.seconds_median);
   return html`
     ${plot(points, budget, actions, capture !== null)}
