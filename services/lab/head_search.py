@@ -31,10 +31,10 @@ class LedChoice:
 
 
 # Powers are estimates within a factor of two. "1 mm die" stands for undomed 1 W LEDs behind TLC5971 outputs of 60 mA,
-# one to three in parallel.
+# one to three in parallel; up to 120 mA the green one is in proportion to the current, as the head file has it.
 CHOICES = (
     LedChoice("APA102, 10 mA", "green", LED["green"], 10, 0.25),
-    LedChoice("1 mm die, 60 mA", "green", led_at(0.525, 33), 60, 1.0),
+    LedChoice("1 mm die, 60 mA", "green", led_at(0.525, 30), 60, 1.0),
     LedChoice("1 mm die, 120 mA", "green", led_at(0.525, 60), 120, 1.0),
     LedChoice("1 mm die, 180 mA", "green", led_at(0.525, 84), 180, 1.0),
     LedChoice("1 mm die, 60 mA", "amber", led_at(0.590, 15), 60, 1.0),

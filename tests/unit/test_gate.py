@@ -88,7 +88,11 @@ def test_outputs_of_the_led_driver_are_those_of_the_head_file() -> None:
             for output in outputs:
                 assert by_name[f"OUT{'RGB'[output % 3]}{output // 3}"] == f"{colour.upper()}{number}"
         assert ", ".join(map(str, leds.places)) in WIRED, colour
-    assert 41 * 1.21 / float(netlist().values["R8"]) * 1000 <= OUTPUT_MA
+    r8 = netlist().values["R8"]
+    output_ma = 41 * 1.21 / float(r8) * 1000
+    assert output_ma <= sinks.output_ma <= 1.05 * output_ma <= OUTPUT_MA, "no current is counted short"
+    assert f"1.21 V x 41 / {r8} ohm = {output_ma:.1f} mA" in WIRED
+    assert f"**current resistor** of {r8} ohm over the permitted share" in text("hardware/assembly.md")
     assert netlist().values["R6"] == "43k2"
     assert sinks.most_ma < 544, "least limit of the load switch with 43.2 k, SLVS841E table 1"
 

@@ -248,7 +248,7 @@ def test_faces_of_the_lens_rims_in_the_guide_are_those_of_the_lens_data() -> Non
 def test_expected_readings_in_the_guide_are_those_of_the_budget() -> None:
     path = load_light_path(HARDWARE / "optics.toml")
     design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
-    full, first = expected_mw(design), 0.126 * expected_mw(design)
+    full, first = expected_mw(design), 0.252 * expected_mw(design)
     guide = " ".join(text("hardware/assembly.md").split())
     assert f"{full:.3f} mW at full drive, so {first:.3f} mW lit and {first / 2:.3f} mW as the mean" in guide
     weight = light_limits().photochemical_weight

@@ -125,7 +125,13 @@ def test_the_chosen_head_has_enough_light_within_every_limit() -> None:
     level = light_report.permitted_level(shares)
     assert product(chain(chosen, level)) >= ENOUGH_E > product(chain(design("imx296")))
     assert max(share.used for share in shares) * level <= 1
-    assert sinks("imx296_power").most_ma <= head_search.SUPPLY_MA
+    assert level == 1, "a picture needs full drive"
+    assert light_report.at_full_drive(chosen).no_go < 0.2
+    ring = sinks("imx296_power")
+    assert ring.most_ma <= head_search.SUPPLY_MA
+    drawn_ma = ring.output_ma * len(ring.colours["green"].outputs[0])
+    powers = [one.led.power_mw for one in head_search.CHOICES if (one.colour, one.current_ma) == ("green", drawn_ma)]
+    assert powers == [ring.colours["green"].power_mw], "the search takes the head's LED at its current"
 
 
 def test_the_search_exceeds_no_limit_and_ranks_enough_light_first() -> None:
@@ -220,7 +226,7 @@ def test_readme_has_the_electrons_of_a_smaller_pupil(path: Path) -> None:
 
 
 def spaced(electrons: float) -> str:
-    """Return a number of electrons to ten, as the documents write it: 11 980."""
+    """Return a number of electrons to ten, as the documents write it: 15 060."""
     return re.sub(r"^(\d\d)(\d{3})$", r"\1 \2", f"{round(electrons, -1):.0f}")
 
 

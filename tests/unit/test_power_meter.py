@@ -30,11 +30,11 @@ SIM = InstrumentSpec.model_validate(tomllib.loads(small_head_toml("small")))
 
 def test_an_unmeasured_ring_shines_no_brighter_than_the_guard_permits() -> None:
     run = run_of(POWER, None, 20)
-    assert run.glow.level == pytest.approx(0.126)
+    assert run.glow.level == pytest.approx(0.252)
     assert run.count * run.on_s == pytest.approx(10, abs=run.on_s), "half of 20 s are lit"
     assert run.on_s < POWER.light.max_on_s
     with pytest.raises(LightLimit, match="brighter than an eye may see"):
-        run_of(POWER, 0.2, 20)
+        run_of(POWER, 0.26, 20)
 
 
 def test_the_train_passes_the_guard_and_is_counted_for_both_eyes() -> None:
@@ -109,7 +109,7 @@ def test_a_slow_meter_shows_half() -> None:
 
 def test_a_reading_at_a_level_is_judged_as_at_full_drive() -> None:
     full = MeterReading("green", 1.3, 43.0, 525.0, "meter X, 2026-11-25")
-    dim = replace(full, power_mw=0.126 * full.power_mw, waist_mw_per_cm2=0.126 * full.waist_mw_per_cm2).scaled(0.126)
+    dim = replace(full, power_mw=0.252 * full.power_mw, waist_mw_per_cm2=0.252 * full.waist_mw_per_cm2).scaled(0.252)
     shares = [judge(POWER, design_of(POWER), one).shares for one in (full, dim)]
     assert [one.value for one in shares[1]] == pytest.approx([one.value for one in shares[0]])
 
