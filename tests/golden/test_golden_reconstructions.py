@@ -9,8 +9,8 @@ from tests.golden import compare, reconstructions
 # Of the largest value, and of each figure: the order of sums in an FFT depends on the processor, which moves a few
 # counts of the simulated frame by one. 3e-4 of pictures and 5e-4 of figures were seen between two processors.
 TOLERANCE = 2e-3
-# In dpt, and of the axis: the conjugate gradients of the refinement end before the rounding of single precision has
-# averaged out. 0.0024 dpt and 0.6 degrees were seen with another number of BLAS threads; an sd is 0.035 dpt.
+# In dpt: the conjugate gradients of the refinement end before the rounding of single precision has
+# averaged out. 0.0024 dpt was seen with another number of BLAS threads; an sd is 0.035 dpt.
 REFRACTION_TOLERANCE = 1e-2
 
 
@@ -29,5 +29,7 @@ def test_a_picture_and_its_report_are_as_recorded(made: dict[str, Reconstruction
     assert float(np.abs(made[name].picture - recorded).max()) <= TOLERANCE * float(np.abs(recorded).max())
     kept, now = compare.read("reconstructions")[name], reconstructions.report(made[name])
     eyes = kept.pop("refraction_dpt"), now.pop("refraction_dpt")
+    for eye in eyes:
+        (eye or {}).pop("axis_deg", None)  # from j0 and j45; at a cylinder of 0.01 dpt rounding turns it
     difference = compare.difference(kept, now, TOLERANCE) or compare.difference(*eyes, REFRACTION_TOLERANCE)
     assert not difference, difference

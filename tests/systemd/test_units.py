@@ -13,6 +13,7 @@ from signal import SIGKILL, SIGSTOP
 
 import pytest
 
+from tests.appliance.device import run
 from tests.systemd.machine import UNIT, Blanked, Machine, booted
 
 pytestmark = [pytest.mark.systemd, pytest.mark.timeout(240)]
@@ -103,14 +104,16 @@ def test_usb_drive_is_writable_for_the_instrument_only(running: Machine) -> None
 
 def test_udev_rule_mounts_and_unmounts_a_usb_drive(machine: Machine) -> None:
     """udev's evaluation of the rule, for a device marked as USB drive and for another one."""
-    claims = 'KERNEL=="loop0", ENV{ID_BUS}="usb", ENV{ID_FS_TYPE}="vfat"'
+    drive = Path(run("losetup", "--find").strip()).name  # a free loop device; creates one if there is none
+    other = max(path.name for path in Path("/sys/class/block").iterdir() if not path.name.startswith("loop"))
+    claims = f'KERNEL=="{drive}", ENV{{ID_BUS}}="usb", ENV{{ID_FS_TYPE}}="vfat"'
     machine.run("sh", "-c", f"mkdir -p /run/udev/rules.d && echo '{claims}' > /run/udev/rules.d/89-claims.rules")
     machine.run("cp", "/opt/diffuscope/systemd/image/stick.rules", "/run/udev/rules.d/90-diffuscope-stick.rules")
     asked = "udevadm test --action={} /sys/class/block/{} 2>&1"
-    assert "diffuscope-stick@loop0.service" in machine.run("sh", "-c", asked.format("add", "loop0"))
-    gone = machine.run("sh", "-c", asked.format("remove", "loop0"))
-    assert "systemctl --no-block stop diffuscope-stick@loop0.service" in gone
-    none = machine.run("sh", "-c", asked.format("add", "loop1"))
+    assert f"diffuscope-stick@{drive}.service" in machine.run("sh", "-c", asked.format("add", drive))
+    gone = machine.run("sh", "-c", asked.format("remove", drive))
+    assert f"systemctl --no-block stop diffuscope-stick@{drive}.service" in gone
+    none = machine.run("sh", "-c", asked.format("add", other))
     assert "diffuscope-stick@" not in none
     warnings = [line for line in (gone + none).splitlines() if "stick.rules:" in line and " RUN " not in line]
     assert not warnings, "udev warns about the rule"
