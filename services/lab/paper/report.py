@@ -1,5 +1,6 @@
 """`diffuscope paper`: runs all experiments, several at a time, and writes the HTML report in their order."""
 
+import os
 from base64 import b64decode
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -89,6 +90,7 @@ def _run(key: str, merged: int, clock: Clock, progress: Callable[[str], None]) -
 def _run_in_processes(keys: Sequence[str], merged: int) -> Iterator[ExperimentRun]:
     """Yield the runs of experiments as they end; an error of one ends all."""
     first = sorted(keys, key=lambda key: key not in LONGEST)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # each core has a process of its own
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:  # a fork would copy the threads of the kernels
         waiting = [pool.submit(_run_alone, key, merged) for key in first]
         try:
