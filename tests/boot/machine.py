@@ -165,7 +165,7 @@ class Board:
     def wait_for_login(self, limit_s: float = PAGE_LIMIT_S) -> float:
         """Wait until SSH logs in; return the seconds since power-on."""
         begin_s = time.monotonic()
-        while self.ssh("true", check=False, limit_s=60) != "":
+        while self.ssh("echo", "ready", check=False, limit_s=60) != "ready\n":
             assert self.is_on(), f"the board ended: {self.console[-3000:]}"
             assert time.monotonic() - begin_s < limit_s, f"no login: {self.console[-3000:]}"
             time.sleep(1)

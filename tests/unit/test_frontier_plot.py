@@ -116,8 +116,8 @@ def test_choice_is_drawn_at_its_whole_time_and_the_axis_names_the_refraction():
     assert "the chosen one includes 40 ms for the eye&#x27;s refraction" in whole
     none = draw_frontier(measured(np.random.default_rng(3), refract_s=0.0))
     assert "the budget leaves no time for the eye&#x27;s refraction" in none
-    rings = [float(re.search(r'class="ring" cx="([\d.]+)"', drawing).group(1)) for drawing in (none, whole)]  # type: ignore[union-attr]
-    assert rings[1] > rings[0]
+    before, after = (float(re.findall(r'class="ring" cx="([\d.]+)"', drawing)[0]) for drawing in (none, whole))
+    assert after > before
 
 
 def test_every_thumbnail_has_its_letter_at_a_mark():

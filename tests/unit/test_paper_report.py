@@ -59,7 +59,7 @@ def test_number_that_is_not_reproduced_is_not_counted_as_held() -> None:
 
 def test_every_row_has_a_label_and_the_reason_of_its_limit_or_a_star() -> None:
     rows = (
-        above("a", 0.9, 0.88, "said"), above("b", 0.9, 0.88), above("c", 0.9, 0.88, "said").put_in("given"),
+        above("a", 0.9, 0.88, "printed"), above("b", 0.9, 0.88), above("c", 0.9, 0.88, "printed").put_in("given"),
         above("d", 0.9, 0.88).limit_from("half a pixel"), attempted("e", 0.1, 0.4, 0.6, ".5").because("no figure"),
     )  # fmt: skip
     assert [claim.label for claim in rows] == ["as written", "ours", "put in", "ours", "not reproduced"]
@@ -76,7 +76,11 @@ def test_every_row_has_a_label_and_the_reason_of_its_limit_or_a_star() -> None:
 
 
 def test_a_statement_that_does_not_hold_is_not_counted_as_held() -> None:
-    rows = above("a", 0.8, 0.88, "said"), above("b", 0.9, 0.88, "said").adapted("how"), above("c", 0.9, 0.88, "said")
+    rows = (
+        above("a", 0.8, 0.88, "printed"),
+        above("b", 0.9, 0.88, "printed").adapted("how"),
+        above("c", 0.9, 0.88, "printed"),
+    )
     words = "2 of 3 rows on the paper's own statements hold (1 as written, 1 adapted), 0 are not reproduced."
     assert words in html(ran(*rows), 1)
 
