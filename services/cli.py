@@ -55,6 +55,10 @@ SIM_HEAD = resources.HEADS / "sim.toml"
 DataSet = Annotated[Path, typer.Argument(help="Folder of a data set: DLMD, DiffuserCam, LenslessPiCam or own pairs.")]
 OwnPsf = Annotated[Path | None, typer.Option(help="PSF for a folder with none or with several.")]
 Limit = Annotated[int | None, typer.Option(min=1, help="Just the first pairs of the data set.")]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(help="Just this method of `diffuscope methods`, or FILE.py:NAME; may be repeated."),
+]
 Peers = Annotated[Path, typer.Option(help="Python environment with LenslessPiCam, for comparison.")]
 NoPeers = Annotated[bool, typer.Option("--no-peers", help="Leave other solvers out.")]
 
@@ -544,6 +548,7 @@ def frontier(
     repeats: Annotated[int, typer.Option(min=1, help="Timed turns of every point; the median counts.")] = 7,
     data: Annotated[Path | None, typer.Option(help="Data set with many pairs, instead of one frame.")] = None,
     limit: Limit = None,
+    method: Methods = None,
     peers: Peers = ENVIRONMENT,
     no_peers: NoPeers = False,
 ) -> None:
@@ -552,8 +557,9 @@ def frontier(
     from services.lab import frontier_pairs
 
     request = measured.FrontierRequest(
-        scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, resources.fft_plans()
-    )
+        scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, resources.fft_plans(),
+        tuple(method or ()),
+    )  # fmt: skip
     wanted = None if data is None else frontier_pairs.dataset_request(request, data, limit)
     with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:
         if wanted is None:
@@ -591,9 +597,7 @@ def bench_data_set(
     folder: DataSet,
     psf: OwnPsf = None,
     limit: Limit = None,
-    method: Annotated[
-        list[str] | None, typer.Option(help="Just this method of `diffuscope methods`; may be repeated.")
-    ] = None,
+    method: Methods = None,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs of every method on every pair.")] = 3,
     json_file: Annotated[Path | None, typer.Option("--json", help="Where to write every score, as JSON.")] = None,
     peers: Peers = ENVIRONMENT,

@@ -16,16 +16,15 @@ from device.clock import Clock
 from device.errors import DiffuscopeError, FrameError
 from device.recon.assessment.metrics import FIT, RANGE, shift_px
 from device.recon.estimation.psf_selection import most_likely_psf
-from device.recon.installed_methods import available_methods, find_method
 from device.recon.methods import Method
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Recipe, Reconstructor, default_schedule
 from device.values import Calibration, Image, Sensor
 from services.lab.dataset_pairs import Dataset, Pair
-from services.lab.frontier import Case, scored_region, this_machine, versions
+from services.lab.frontier import Case, scored_region, selected_methods, this_machine, versions
 from services.lab.frontier_result import Machine
-from services.lab.pair_scores import PLANES, LeftOut, PairScore, PairScorer, Row, grey, rows
+from services.lab.pair_scores import PLANES, LeftOut, PairScore, PairScorer, Row, grey, left, rows
 from services.lab.peers import LenslessPeer
 from services.lab.reconstruct_file import require_writable, write_or_raise
 
@@ -102,13 +101,6 @@ def without_bad_pixels(pair: Pair) -> Pixels:
     return filled
 
 
-def left(pair: str, method: str | None, error: DiffuscopeError, progress: ProgressCallback) -> LeftOut:
-    """Report a pair, or a method on it, that failed, and return it with the reason and its remedy."""
-    one = LeftOut(pair, method, f"{error.message}. {error.remedy}")
-    progress(f"  left out: {one}")
-    return one
-
-
 def selected(dataset: Dataset, limit: int | None) -> Dataset:
     """Return the data set with its first `limit` pairs, None for all."""
     return dataset if limit is None else replace(dataset, entries=dataset.entries[:limit])
@@ -123,7 +115,7 @@ def benchmark(
     called with one line per picture. SettingError for an unknown method or an invalid output, StoreError for an
     unwritable file.
     """
-    methods = {one.name: one for one in map(find_method, request.methods)} or available_methods()
+    methods = selected_methods(request.methods)
     if request.json is not None:
         require_writable(request.json)
     dataset = selected(request.dataset, request.limit)

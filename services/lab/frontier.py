@@ -7,7 +7,7 @@ alike; the median of the repeats counts.
 
 import os
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,9 +18,9 @@ import pyfftw
 from device.clock import Clock, Deadline, SystemClock
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.image_files import read_image
-from device.errors import FrameError, SettingError
+from device.errors import DiffuscopeError, FrameError, SettingError
 from device.recon.assessment.metrics import FIT, RANGE, PictureScorer, Scores, shift_px
-from device.recon.installed_methods import available_methods
+from device.recon.installed_methods import available_methods, find_method
 from device.recon.methods import METHODS, Method
 from device.recon.model.fft_plans import Planner, processor_name
 from device.recon.model.field_of_view import field_radius_px
@@ -47,6 +47,7 @@ from services.lab.frontier_result import (
     pareto_front,
 )
 from services.lab.frontier_thumbnails import Shown, nearest_points, thumbnail_panel
+from services.lab.pair_scores import LeftOut, left
 from services.lab.peers import LenslessPeer
 from services.lab.plot import Panel
 from services.lab.reconstruct_file import require_writable, write_or_raise
@@ -63,7 +64,8 @@ ProgressCallback = Callable[[str], None]
 class FrontierRequest:
     """Options of `diffuscope frontier`: a scene, or a raw frame with its PSF and its truth.
 
-    `json` and `plot` are the output files, `plans` the folder of cached FFT plans.
+    `json` and `plot` are the output files, `plans` the folder of cached FFT plans. `methods`: names, or FILE.py:NAME;
+    empty for all.
     """
 
     scene: Path | None
@@ -77,6 +79,7 @@ class FrontierRequest:
     budget_s: float
     repeats: int
     plans: Path
+    methods: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,7 @@ def frontier(request: FrontierRequest, progress: ProgressCallback, peer: Lensles
     """
     _refuse_invalid(request)
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
-    methods = available_methods()
+    methods = selected_methods(request.methods)
     bench = _Bench(_case(request), Planner(request.plans), SystemClock(), progress, methods)
     found = _measured(bench, request.budget_s, request.repeats, peer)
     text = frontier_text(found)
@@ -128,6 +131,14 @@ def measure_frontier(
     A `peer` solves the same frame; the bursts of a case that has them follow.
     """
     return _measured(_Bench(case, Planner(plans), SystemClock(), progress, methods), budget_s, repeats, peer)
+
+
+def selected_methods(names: Sequence[str]) -> Mapping[str, Method]:
+    """Return the methods of these names (or FILE.py:NAME) by name; all, the installed ones too, without names.
+
+    SettingError for an unknown method.
+    """
+    return {one.name: one for one in map(find_method, names)} or available_methods()
 
 
 def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer | None) -> Frontier:
@@ -152,6 +163,7 @@ def _measured(bench: "_Bench", budget_s: float, repeats: int, peer: LenslessPeer
         dominated=tuple(method for method in bench.methods if method not in kept),
         peers=() if peer is None else bench.peer_points(peer),
         light=bench.light_points(),
+        left_out=tuple(bench.left_out),
     )
 
 
@@ -197,7 +209,7 @@ def table(found: Frontier) -> str:
             f"  {one.frames} frames ({one.used} used), {one.dose_j_per_cm2:.2g} J/cm2: {one.psnr_db:.2f} dB in "
             f"{one.seconds_median:.3f} s; linear bound {one.bound_psnr_db:.2f} dB"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, *(f"left out: {one}" for one in found.left_out)])
 
 
 class _Bench:
@@ -218,19 +230,42 @@ class _Bench:
         self.shift = (0, 0)
         if case.registered:  # the truth of a scene is aligned with its frame
             self.shift = shift_px(_grey(self.instrument(case.counts).picture), case.truth)
+        self.left_out: list[LeftOut] = []
         self.recipes = _recipes(case.shape, steps[-1].bin, methods)
         self.makers: dict[tuple[str, int], Reconstructor] = {}
-        for recipe in self.recipes:
-            key = recipe.method, recipe.bin
-            if key not in self.makers:
-                progress(f"{case.name}: planning {recipe.method}, bin {recipe.bin}")
-                most = Recipe(recipe.method, recipe.bin, max(ROUNDS))
-                self.makers[key] = Reconstructor(
-                    case.calibration, case.shape, planner, clock, (most,), refract=False, methods=methods
-                )
 
     def _reconstruct(self, recipe: Recipe) -> Reconstruction:
-        return self.makers[recipe.method, recipe.bin](self.case.counts, rounds=recipe.rounds)
+        """Return the picture of a point; a method is planned at each bin for the largest number of its rounds."""
+        key = recipe.method, recipe.bin
+        if key not in self.makers:
+            self.progress(f"{self.case.name}: planning {recipe.method}, bin {recipe.bin}")
+            rounds = [one.rounds for one in self.recipes if (one.method, one.bin) == key and one.rounds is not None]
+            most = Recipe(*key, max(rounds, default=None))
+            self.makers[key] = Reconstructor(
+                self.case.calibration, self.case.shape, self.planner, self.clock, (most,), refract=False,
+                timed=False, methods=self.methods,
+            )  # fmt: skip
+        return self.makers[key](self.case.counts, rounds=recipe.rounds)
+
+    def _scored(self) -> list[tuple[Recipe, int, Scores]]:
+        """Return each point with the number of rounds that were run, and its scores.
+
+        A point whose solver fails is left out.
+        """
+        found = []
+        for k, recipe in enumerate(self.recipes, 1):
+            place = f"{k:>3}/{len(self.recipes)}"
+            try:
+                made = self._reconstruct(recipe)
+                scores = self.score(made)
+            except DiffuscopeError as error:
+                self.left_out.append(left(self.case.name, _name(recipe), error, self.progress))
+                continue
+            found.append((recipe, made.report.rounds, scores))
+            self.progress(f"{place} {_name(recipe)}: {scores.psnr_db:.2f} dB, PCC {scores.pcc:.3f}")
+        if not found:
+            raise FrameError("no method gave a picture of this frame", str(self.left_out[0]))
+        return found
 
     def score(self, made: Reconstruction) -> Scores:
         """Return the scores of a picture after the shift that all pictures of this case share."""
@@ -293,16 +328,12 @@ class _Bench:
 
     def measure(self, budget_s: float, repeats: int) -> tuple[tuple[Point, ...], Choice]:
         """Return every point, and the instrument's choice within `budget_s`."""
-        scored = []
-        for k, recipe in enumerate(self.recipes, 1):
-            scores = self.score(self._reconstruct(recipe))
-            scored.append(scores)
-            self.progress(f"{k:>3}/{len(self.recipes)} {_name(recipe)}: {scores.psnr_db:.2f} dB, PCC {scores.pcc:.3f}")
-        times, own, made = self._times(budget_s, repeats)
+        scored = self._scored()
+        times, own, made = self._times([recipe for recipe, _, _ in scored], budget_s, repeats)
         last = sorted(made, key=lambda each: (each.report.rounds, -each.report.bin))[len(made) // 2]  # the median run
         points = tuple(
-            Point(recipe.method, recipe.bin, recipe.rounds or 0, *_summary(seconds), **asdict(scores))
-            for recipe, seconds, scores in zip(self.recipes, times, scored, strict=True)
+            Point(recipe.method, recipe.bin, rounds, *_summary(seconds), **asdict(scores))
+            for (recipe, rounds, scores), seconds in zip(scored, times, strict=True)
         )
         report, self.chosen = last.report, self.moved(_grey(last.picture))
         refract_s = float(np.median([each.report.seconds["refract"] for each in made]))
@@ -316,14 +347,16 @@ class _Bench:
         )  # fmt: skip
         return points, choice
 
-    def _times(self, budget_s: float, repeats: int) -> tuple[list[list[float]], list[float], list[Reconstruction]]:
+    def _times(
+        self, recipes: Sequence[Recipe], budget_s: float, repeats: int
+    ) -> tuple[list[list[float]], list[float], list[Reconstruction]]:
         """Return interleaved times in s: of every point, and of the instrument within its budget; and its results."""
-        times: list[list[float]] = [[] for _ in self.recipes]
+        times: list[list[float]] = [[] for _ in recipes]
         own: list[float] = []
         made: list[Reconstruction] = []
         for turn in range(repeats):
             self.progress(f"timing, turn {turn + 1} of {repeats}")
-            for recipe, seconds in zip(self.recipes, times, strict=True):
+            for recipe, seconds in zip(recipes, times, strict=True):
                 begin_s = self.clock.now_s()
                 self._reconstruct(recipe)
                 seconds.append(self.clock.now_s() - begin_s)

@@ -14,9 +14,8 @@ import numpy as np
 from device.clock import Deadline, SystemClock
 from device.errors import DiffuscopeError, FrameError, SettingError
 from device.recon.assessment.metrics import FIT, RANGE
-from device.recon.installed_methods import available_methods
 from device.recon.model.fft_plans import Planner
-from services.lab.benchmark import calibration_of, case_of, left, selected, without_bad_pixels
+from services.lab.benchmark import calibration_of, case_of, selected, without_bad_pixels
 from services.lab.dataset_pairs import Dataset, Entry, Pair
 from services.lab.datasets import open_dataset
 from services.lab.frontier import (
@@ -24,12 +23,13 @@ from services.lab.frontier import (
     FrontierRequest,
     measure_frontier,
     scored_region,
+    selected_methods,
     this_machine,
     versions,
 )
 from services.lab.frontier_plot import draw_frontier
 from services.lab.frontier_result import Choice, Frontier, Machine, Point, pareto_front
-from services.lab.pair_scores import LeftOut, PairScore, PairScorer, Row, rows, table
+from services.lab.pair_scores import LeftOut, PairScore, PairScorer, Row, left, rows, table
 from services.lab.peers import LenslessPeer
 from services.lab.reconstruct_file import require_writable, write_or_raise
 
@@ -49,6 +49,7 @@ class DatasetFrontierRequest:
     budget_s: float
     repeats: int
     plans: Path
+    methods: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def dataset_request(request: FrontierRequest, folder: Path, limit: int | None) -
     Deadline.after(SystemClock(), request.budget_s)  # raises SettingError for an invalid time
     return DatasetFrontierRequest(
         open_dataset(folder, request.psf), limit, request.json, request.plot, request.budget_s, request.repeats,
-        request.plans,
+        request.plans, request.methods,
     )  # fmt: skip
 
 
@@ -101,7 +102,7 @@ def frontier_of_dataset(
     """
     dataset = selected(request.dataset, request.limit)
     frontiers, scores, left_out = [], [], []
-    planner, methods = Planner(request.plans), available_methods()
+    planner, methods = Planner(request.plans), selected_methods(request.methods)
     for k, entry in enumerate(dataset.entries, 1):
         progress(f"{k} of {len(dataset)}: {entry.name}")
         try:
@@ -112,6 +113,7 @@ def frontier_of_dataset(
             continue
         frontiers.append(found)
         scores += _scores(entry.name, found)
+        left_out += found.left_out
         if peer is not None:
             try:
                 scores += measured.peer_scores(peer, found.region.shift_px, progress)

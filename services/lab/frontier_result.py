@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import inf
 
+from services.lab.pair_scores import LeftOut
+
 
 @dataclass(frozen=True)
 class Machine:
@@ -48,7 +50,7 @@ class ScoredRegion:
 
 @dataclass(frozen=True)
 class Point:
-    """One method, bin (bin x bin pixels per sample) and number of rounds (0: closed form) with scores and times.
+    """One method, bin (bin x bin pixels per sample) and number of rounds run (0: closed form) with scores and times.
 
     `pareto`: no other point is at least as fast and at least as accurate (PSNR), and better in one of both.
     """
@@ -144,7 +146,8 @@ class Frontier:
 
     `versions`: of the program and its libraries, by name. `timing` and `edge` describe times and Pareto front in words.
     `best_mu` is empty for a colour frame. `dominated`: methods without a point on the Pareto front. `light`: bursts of
-    a scene, from one frame on; empty for a recorded frame. `peers`: other people's solvers on the same frame.
+    a scene, from one frame on; empty for a recorded frame. `left_out`: points without a result, with the reason.
+    `peers`: other people's solvers on the same frame.
     """
 
     machine: Machine
@@ -161,6 +164,7 @@ class Frontier:
     choice: Choice
     dominated: tuple[str, ...]
     light: tuple[LightPoint, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     peers: tuple[PeerPoint, ...] = ()
 
 

@@ -1,14 +1,16 @@
 """Scores of pictures over the pairs of a data set: one row per method with mean and spread, as table and as values."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from device.errors import DiffuscopeError
 from device.recon.assessment.metrics import PictureScorer
 from device.values import Image, Mask
 
 HIGHPASS_PX = 32.0
+ProgressCallback = Callable[[str], None]
 PLANES = "mean over the channels of a colour truth, each with its own fit"
 
 
@@ -66,6 +68,13 @@ class LeftOut:
 
     def __str__(self) -> str:
         return f"{self.pair}{f', {self.method}' if self.method else ''}: {self.reason}"
+
+
+def left(pair: str, method: str | None, error: DiffuscopeError, progress: ProgressCallback) -> LeftOut:
+    """Report a pair, or a method on it, that failed, and return it with the reason and its remedy."""
+    one = LeftOut(pair, method, f"{error.message}. {error.remedy}")
+    progress(f"  left out: {one}")
+    return one
 
 
 class PairScorer:

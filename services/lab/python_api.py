@@ -29,7 +29,7 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Image, Mask, SimulatedCounts
 from services import resources
-from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case
+from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case, selected_methods
 from services.lab.frontier_result import Frontier
 from services.lab.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
 from services.lab.reconstruct_inputs import ReconstructOptions, Source
@@ -216,13 +216,15 @@ def simulate(
 def frontier(
     raw: ImageSource | None = None, psf: ImageSource | None = None, truth: ImageSource | None = None, *,
     scene: str | Path | SimulatedScene | None = None, head: str | Path | None = None, field_deg: float | None = None,
-    budget_s: float = 0.26, repeats: int = 7, progress: Callable[[str], None] = lambda _: None,
+    method: str | Sequence[str] = (), budget_s: float = 0.26, repeats: int = 7,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Frontier:  # fmt: skip
     """Return accuracy against time of every method, bin and number of rounds, on this machine.
 
     Either `raw`, `psf` and `truth`, (rows, cols) of one grid (a shift and the intensity are fitted), or `scene`:
-    a scene file, the name of one, or the result of `simulate`. `head` and `field_deg` as in `reconstruct`. `budget_s`:
-    time in seconds within which the instrument chooses. `repeats`: timed runs of each point; their median counts.
+    a scene file, the name of one, or the result of `simulate`. `head` and `field_deg` as in `reconstruct`. `method`:
+    name of `methods()` or FILE.py:NAME, one or several; by default all. `budget_s`: time in seconds within which the
+    instrument chooses. `repeats`: timed runs of each point; their median counts.
     `progress` is called with one line per step. SettingError if both or neither are given; FrameError for a truth of
     another shape.
     """
@@ -239,7 +241,8 @@ def frontier(
         assert truth is not None
         place = None if head is None else Path(head)
         case = recorded_case(_source(raw), _source(psf), _source(truth), place, field_deg, resources.fft_plans())
-    return measure_frontier(case, resources.fft_plans(), budget_s, repeats, progress, available_methods())
+    chosen = selected_methods((method,) if isinstance(method, str) else method)
+    return measure_frontier(case, resources.fft_plans(), budget_s, repeats, progress, chosen)
 
 
 def methods() -> dict[str, Method]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,14 +16,18 @@ from device.errors import InputError, SettingError, SpecError
 from device.recon.installed_methods import NEEDED, available_methods, find_method
 from device.recon.method_settings import TAU
 from device.recon.methods import METHODS, Method
+from device.recon.model.fft_plans import Planner
+from device.recon.model.forward_model import Model
+from device.recon.model.preprocessing import Linear
 from device.recon.reconstructor import Recipe, Reconstructor
 from device.recon.solver_contract import check_method
 from device.recon.solvers.solver import Solver
 from device.sim.optical_setup import Scene
 from device.sim.plan import decide
 from device.sim.scene_files import simulate
+from device.values import Calibration
 from services.cli import main
-from services.lab.frontier import Case, measure_frontier
+from services.lab.frontier import ROUNDS, Case, measure_frontier, selected_methods
 from services.lab.frontier_plot import draw_frontier
 from tests import scenes
 from tests.plugin_packages import GALLERY, OWN_EFFECT, OWN_SOLVER, installed
@@ -107,6 +112,59 @@ def test_an_installed_method_has_points_in_the_frontier(tmp_path: Path) -> None:
     found = measure_frontier(case, tmp_path, 5.0, 1, lambda _: None, methods)
     assert {point.method for point in found.points} == {"gradient", "fista"}
     assert "fista (rounds)" in draw_frontier(found, methods)
+
+
+@pytest.mark.usefixtures("own_solver")
+def test_the_frontier_runs_the_rounds_that_it_names(tmp_path: Path) -> None:
+    """FISTA counts its own rounds: the picture of the point "100 rounds" had 100, and that of 20 had 20."""
+    truth = np.random.default_rng(1).uniform(500, 1500, SHAPE).astype(np.float32)
+    fista, longest = find_method("fista"), [0]
+
+    def counted(model: Model, calibration: Calibration, planner: Planner) -> Solver:
+        return CountedRounds(fista.build(model, calibration, planner), longest)
+
+    methods = {"fista": replace(fista, build=counted), "open": METHODS["open"]}
+    found = measure_frontier(Case("noise", COUNTS, truth, None, CALIBRATION, True), tmp_path, 5.0, 1, print, methods)
+    assert longest == [100]
+    for method in methods.values():
+        points = {point.rounds: point for point in found.points if (point.method, point.bin) == (method.name, 1)}
+        assert set(points) == {*ROUNDS, method.rounds}
+        assert points[method.rounds].psnr_db != points[20].psnr_db
+
+
+class CountedRounds:
+    """Solver that notes the largest number of rounds of a frame in `longest[0]`."""
+
+    def __init__(self, solver: Solver, longest: list[int]) -> None:
+        self._solver, self._longest, self._rounds = solver, longest, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._solver, name)
+
+    def start(self, frame: Linear) -> None:
+        self._rounds = 0
+        self._solver.start(frame)
+
+    def step(self) -> None:
+        self._rounds += 1
+        self._longest[0] = max(self._longest[0], self._rounds)
+        self._solver.step()
+
+
+def test_a_plug_in_that_fails_costs_its_own_points_only(tmp_path: Path) -> None:
+    """It gives NaN after more than ten rounds: the points with fewer rounds, and all other methods, are measured."""
+    late = "def finish(self, out): out[:] = np.nan if self.t > 6 else self.x"  # t grows by about half a round
+    source = f"{OWN_SOLVER}\nclass Late(Fista):\n    {late}\nMETHOD = Method('late', 'x', Late, 0, 2, 60)\n"
+    truth = np.random.default_rng(1).uniform(500, 1500, SHAPE).astype(np.float32)
+    case = Case("noise", COUNTS, truth, None, CALIBRATION, True)
+    with installed(tmp_path, "late", source, plugins.METHODS, late="METHOD"):
+        found = measure_frontier(case, tmp_path, 5.0, 1, print, selected_methods(["gradient", "late"]))
+    assert {p.rounds for p in found.points if p.method == "late"} == {0, 1, 2, 4, 8}
+    assert {p.method for p in found.points} == {"gradient", "late"}
+    assert [one.method for one in found.left_out if "bin 1," in str(one.method)] == [
+        f"late, bin 1, {rounds} rounds" for rounds in (12, 20, 60)
+    ]
+    assert all("NaN" in one.reason for one in found.left_out)
 
 
 @pytest.mark.usefixtures("own_solver")
