@@ -6,6 +6,7 @@ last one. Each step is on the disk before the next begins, so a power cut leaves
 
 import errno
 import fcntl
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,15 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 def free_bytes(folder: Path) -> int:
     """Return the free space of the file system of `folder` for unprivileged users, bytes; RESERVE_BYTES included."""
     return shutil.disk_usage(folder).free
+
+
+def free_files(folder: Path) -> float:
+    """Return how many files and folders the file system of `folder` still takes from unprivileged users.
+
+    Infinity on a file system without a fixed number of them, such as FAT or Btrfs.
+    """
+    state = os.statvfs(folder)
+    return state.f_favail if state.f_files else math.inf
 
 
 def has_room(need_bytes: int, free_bytes: int, reserve_bytes: int = RESERVE_BYTES) -> bool:
@@ -144,6 +154,11 @@ def quarantine(stray: Path, quarantine_folder: Path) -> str:
 def size_bytes(place: Path) -> int:
     """Return the size of a file, or the total size of all files below a folder, bytes; symbolic links not followed."""
     return sum(path.lstat().st_size for path in (place, *place.rglob("*")) if not path.is_dir())
+
+
+def number_of_files(place: Path) -> int:
+    """Return the number of files and folders of a file, or of a folder with all that is below it."""
+    return sum(1 for _ in (place, *place.rglob("*")))
 
 
 def remove(place: Path) -> None:

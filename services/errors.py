@@ -19,6 +19,7 @@ DiffuscopeError                       base class in device/errors.py
 │   └── ConsentDeclined               consent declined or withdrawn
 ├── StoreError                        base class in device/errors.py
 │   ├── StoreDamaged                  stored file missing or changed
+│   ├── StoreLocked                   database locked by another program
 │   ├── BackupKeyWrong                passphrase or key does not fit the backup
 │   ├── BackupDamaged                 backup incomplete or changed
 │   ├── RestoreRefused                the store holds records already
@@ -159,6 +160,16 @@ class StoreDamaged(StoreError):
 
     code = "store.damaged"
     default_remedy = "This kept file is damaged. Copy what can be read and call the technician."
+
+
+class StoreLocked(StoreError):
+    """Another program holds the write lock of the database, longer than a writer waits."""
+
+    code = "store.locked"
+    default_remedy = (
+        "Another program is writing to the database of this device: close it, a database viewer or a copy of the "
+        "folder, then try again. Nothing that was kept is lost."
+    )
 
 
 class BackupKeyWrong(StoreError):

@@ -21,6 +21,7 @@ from services.health.thresholds import (
 )
 from services.records.capture import ClockState
 from services.records.recovery_report import RecoveryReport
+from services.records.store_space import NO_FILES_REMEDY
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class StatusSnapshot:
     `unchecked_limits`: names of the light limits that were not compared with the purchased standard;
     `takes_blue_light`: whether the programme lists blue among its colours; `settings_problem`: message and remedy of
     settings of the card that were not taken at the last start; `throttled_bits`: state of supply and clock as the
-    firmware of a Raspberry Pi reports it.
+    firmware of a Raspberry Pi reports it; `lacks_files`: whether free files, not free bytes, limit `captures_left`.
     """
 
     state: str
@@ -84,6 +85,7 @@ class StatusSnapshot:
     takes_blue_light: bool = False
     settings_problem: tuple[str, str] | None = None
     throttled_bits: int | None = None
+    lacks_files: bool = False
 
 
 def camera(facts: StatusSnapshot) -> Check:
@@ -158,14 +160,17 @@ def _count(number: int, one: str, more: str) -> str:
 def space(facts: StatusSnapshot) -> Check:
     """Check that the disk has space for MIN_VISITS_LEFT visits.
 
-    Quarantined captures count as free space; their number and size are in the value.
+    Free bytes and free files (inodes) count. Quarantined captures count as free space; their number and size are in the
+    value.
     """
     people, torn = facts.people_left, facts.torn_bytes
     value = f"plenty, more than {MAX_SHOWN_VISITS} people" if thresholds.are_many_visits(people) else f"{people} people"
     if torn:
         value += f"; half-kept pictures aside: {len(torn)}, {math.ceil(sum(torn) / 1e6)} MB"
-    ok = not thresholds.are_few_visits(people)
-    return Check("space", ok, value, f"at least {MIN_VISITS_LEFT}", "Copy captures away and make room.")
+    ok, remedy = not thresholds.are_few_visits(people), "Copy captures away and make room."
+    if not ok and facts.lacks_files:
+        value, remedy = f"{value}; the disk takes few more files", NO_FILES_REMEDY
+    return Check("space", ok, value, f"at least {MIN_VISITS_LEFT}", remedy)
 
 
 def battery(facts: StatusSnapshot) -> Check:

@@ -33,7 +33,6 @@ def collect_status(
 ) -> StatusSnapshot:
     """Return the current inputs of the checks; `unsent` as in `StatusSnapshot`."""
     newest, orphans, damaged, error = _store_status(store, people)
-    backup_at, unsaved_since = _backup_status(store)
     return StatusSnapshot(
         state=instrument.state,
         problem=instrument.problem,
@@ -56,12 +55,13 @@ def collect_status(
         orphans=orphans,
         damaged=damaged,
         recovery=store.recovery,
-        backup_at=backup_at,
-        unsaved_since=unsaved_since,
+        backup_at=(backup := _backup_status(store))[0],
+        unsaved_since=backup[1],
         unchecked_limits=light_limits().unchecked,
         takes_blue_light="blue" in people.protocol.colours,
         settings_problem=read_settings_problem(SETTINGS_PROBLEM_FILE),
         throttled_bits=read_throttled_bits(PLATFORM_DEVICES),
+        lacks_files=store.space.lacks_files(),
     )
 
 

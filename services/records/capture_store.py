@@ -22,6 +22,7 @@ record in the folder (recovery.py). Without a valid record the store neither mov
 
 import hashlib
 import logging
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -36,7 +37,7 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.clock import Clock, SystemClock
-from device.errors import SettingError, StoreError
+from device.errors import SettingError, StoreError, StoreReadOnly
 from services.errors import RecordNotFound, RecordRemoved, StoreDamaged
 from services.records import blobs, capture_rows, row_validation, schema
 from services.records.blobs import FileContent
@@ -57,7 +58,7 @@ from services.records.row_validation import REMEDY
 from services.records.schema import CaptureRow
 from services.records.snapshots import Snapshots
 from services.records.storage_errors import is_disk_full, storage_errors
-from services.records.store_space import StoreSpace
+from services.records.store_space import FreeSpace, StoreSpace
 from services.records.write_ahead_log import WriteAheadLog
 
 log = logging.getLogger(__name__)
@@ -83,6 +84,7 @@ class CaptureStore:
         *,
         reserve_bytes: int = atomic_io.RESERVE_BYTES,
         free_bytes: Callable[[Path], int] = atomic_io.free_bytes,
+        free_files: Callable[[Path], float] = atomic_io.free_files,
         clock: Clock | None = None,
         refusal: StoreError | None = None,
     ) -> None:
@@ -99,7 +101,8 @@ class CaptureStore:
             self.quarantine = Quarantine(self._captures, torn, self._lock, self.engine)
             self.removed = RemovedCaptures(self._captures, folder / "removed", self._lock)
             self.versions = CaptureVersions(self._captures, self._lock, self.engine)
-            self.space = StoreSpace(folder, self.engine, (self.removed, self.quarantine), reserve_bytes, free_bytes)
+            free = FreeSpace(folder, free_bytes, free_files)
+            self.space = StoreSpace(free, self.engine, (self.removed, self.quarantine), reserve_bytes)
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 damage = self._set_damaged_database_aside()
@@ -153,7 +156,7 @@ class CaptureStore:
         with storage_errors(), atomic_io.file_lock(self._lock):
             self._refuse_duplicate(part, kept)
             schema.refuse_if_read_only(self.engine)
-            self.space.make_room(new_bytes)
+            self.space.make_room(new_bytes, len(files) + 1)
             with _removed_when_full(part, kept):
                 blobs.write_folder(part, files)
                 atomic_io.replace_durably(part, kept)
@@ -163,7 +166,7 @@ class CaptureStore:
                     write_signature(session, record)
                     if write_rows is not None:
                         write_rows(session, capture)
-        self.space.count_capture(length_bytes)
+        self.space.count_capture(length_bytes, len(capture.files))
         return capture
 
     def captures(self, limit: int = 50, before: str | None = None) -> list[Capture]:
@@ -242,15 +245,27 @@ class CaptureStore:
         return content
 
     def refuse_light_in_vain(self) -> None:
-        """Raise StoreFull or StoreReadOnly if a capture could not be stored: called before its light."""
+        """Raise StoreFull or StoreReadOnly if a capture could not be stored: called before its light.
+
+        The dose of the light is written before it, too: that finds a locked database.
+        """
         schema.refuse_if_read_only(self.engine)
+        _refuse_read_only(self.folder, self._captures)
         self.space.refuse_without_room()
+        if self.space.must_delete_files():
+            with storage_errors(), atomic_io.file_lock(self._lock):
+                self.space.make_room(0, self.space.press_files())
 
     def check_writable(self) -> None:
-        """Write and remove a folder with a small file, as durably as a capture; StoreFull or StoreError on failure."""
+        """Write and remove a folder with a small file, as durably as a capture, and lock the database for writing.
+
+        Errors: StoreFull, StoreReadOnly, StoreLocked, StoreError.
+        """
         schema.refuse_if_read_only(self.engine)
+        _refuse_read_only(self.folder, self._captures)
         trial = self.folder / ".trial"
         with storage_errors(), atomic_io.file_lock(self._lock):
+            schema.lock_briefly(self.engine)
             shutil.rmtree(trial, ignore_errors=True)  # left by a killed process
             atomic_io.write_folder(trial, {"trial": b"written and removed"})
             shutil.rmtree(trial)
@@ -280,6 +295,12 @@ class CaptureStore:
         for folder in folders:
             if folder.exists():
                 raise StoreError(f"{folder.name} is on the shelf already", "Take the picture again.")
+
+
+def _refuse_read_only(*folders: Path) -> None:
+    for folder in folders:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise StoreReadOnly(f"the folder {folder.name} cannot be written")
 
 
 def _row(session: Session, id: str) -> capture_rows.CaptureColumns:

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 LOST_J_PER_CM2 = 100.0  # counted for each eye if the ledger is gone: above the limit of every day
 _AS_IT_IS = {"synchronize_session": False}
-REMEDY = "The light stays off while what it gives cannot be written down. Free some space, or call the technician."
+REMEDY = "The light stays off while what it gives cannot be written down. Call the technician."
 
 
 def add_given_dose(session: Session, eye: Eye, dose_j_per_cm2: float) -> None:
@@ -110,7 +110,8 @@ class DoseLedgerStore:
                 session.flush()
                 self._log.append(state)
         except StoreError as error:
-            raise type(error)(f"the book of light cannot be written: {error.message}", REMEDY) from error
+            remedy = REMEDY if type(error) is StoreError else error.remedy
+            raise type(error)(f"the book of light cannot be written: {error.message}", remedy) from error
 
     def _is_lost(self) -> bool:
         """Return whether the store has captures, but neither table nor copy of the ledger has ever been written."""

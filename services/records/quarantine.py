@@ -31,6 +31,10 @@ class Quarantine:
         folders = [folder for folder in sorted(self._folder.iterdir()) if not _is_complete(folder)]
         return {folder.name: atomic_io.size_bytes(folder) for folder in folders}
 
+    def number_of_files(self) -> int:
+        """Return the number of files and folders of the incomplete captures in quarantine."""
+        return sum(atomic_io.number_of_files(self._folder / name) for name in self.sizes_bytes())
+
     def orphans(self) -> list[str]:
         """Return the sorted names of the complete capture folders without a row, which the store never removes.
 

@@ -5,7 +5,6 @@ are read from the disk. Every change is refused with the reason, and with the do
 and backups work; that they were made is known until the program ends.
 """
 
-import errno
 import logging
 import shutil
 from collections.abc import Iterator
@@ -13,24 +12,18 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from sqlalchemy.exc import DBAPIError
-
-from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError, StoreFull, StoreReadOnly
-from services.errors import StoreDamaged
 from services.records.capture_journal import UNDERWAY
 from services.records.capture_store import CaptureStore
 from services.records.reserve_file import NAME, ReserveFile
-from services.records.storage_errors import sqlite_name, storage_errors
+from services.records.storage_errors import storage_errors
 
 log = logging.getLogger(__name__)
 
 MEMORY = Path("/dev/shm")  # the folder of temporary files may be on the disk that refuses
 READ_FROM_DISK = ("captures", "calibrations", "torn", "damaged", "conflicts")
 NOT_COPIED = frozenset({".lock", NAME, "snapshots", "replaced", "explorer"})
-_ERRNOS = frozenset({errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM})
-_SQLITE_NAMES = ("SQLITE_READONLY", "SQLITE_IOERR", "SQLITE_CANTOPEN", "SQLITE_PERM", "SQLITE_FULL")
 
 
 @contextmanager
@@ -42,12 +35,7 @@ def opened_store(folder: Path, clock: Clock) -> Iterator[CaptureStore]:
     """
     try:
         store = _opened(folder, clock)
-    except StoreDamaged:
-        raise
-    except StoreError as error:
-        refusal = _refusal(error)
-        if refusal is None:
-            raise
+    except (StoreFull, StoreReadOnly) as refusal:
         log.error("the store is opened for reading only: %s", refusal.message)
         with _copy_opened(folder, clock, refusal) as copy:
             yield copy
@@ -87,14 +75,3 @@ def _copy(source: Path, target: Path) -> None:
 def _no_frames(folder: str, names: list[str]) -> list[str]:
     """Return the folders of frames in the journal, which are not resumed and need not be in memory."""
     return [name for name in names if (Path(folder) / name).is_dir()]
-
-
-def _refusal(error: StoreError) -> StoreError | None:
-    """Return the error of every later change if this one means a disk that takes no changes; None for another error."""
-    cause = error.__cause__
-    if isinstance(error, StoreFull):
-        return error
-    if isinstance(cause, OSError):
-        return StoreReadOnly(error.message) if cause.errno in _ERRNOS or atomic_io.is_full(cause) else None
-    name = sqlite_name(cause.orig if isinstance(cause, DBAPIError) else cause)
-    return StoreReadOnly(error.message) if name.startswith(_SQLITE_NAMES) else None

@@ -100,6 +100,10 @@ class RemovedCaptures:
         """Return the size (bytes) of what can still be undone, by name, the oldest removal first."""
         return {folder.name: atomic_io.size_bytes(folder) for folder in self._folders()}
 
+    def number_of_files(self) -> int:
+        """Return the number of files and folders of what can still be undone."""
+        return sum(map(atomic_io.number_of_files, self._folders()))
+
     def delete(self, name: str) -> None:
         """Delete removed files, because a new capture needs their space; the caller holds the lock."""
         gone = self._folder / f".{name}"

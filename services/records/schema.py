@@ -42,6 +42,7 @@ MIGRATIONS = Path(__file__).parent / "migrations"
 
 # WAL with FULL is the fastest pair that lost no acknowledged row in power-cut trials; NORMAL lost the last ones.
 BUSY_MS, CHECKPOINT_BUSY_MS = 5000, 200  # a writer waits; a checkpoint gives up and is retried later
+PROBE_BUSY_MS = 1000  # of a health check: longer than our own transactions
 PRAGMAS = (
     f"PRAGMA busy_timeout = {BUSY_MS}",
     "PRAGMA journal_mode = WAL",
@@ -421,6 +422,18 @@ def checkpoint(engine: Engine) -> bool:
         finally:
             connection.execute(f"PRAGMA busy_timeout = {BUSY_MS}").close()
     return not busy
+
+
+def lock_briefly(engine: Engine) -> None:
+    """Take the write lock of the database and release it at once; an error of SQLite after PROBE_BUSY_MS without it."""
+    with closing(engine.raw_connection()) as pooled:
+        connection: Any = pooled.driver_connection
+        connection.execute(f"PRAGMA busy_timeout = {PROBE_BUSY_MS}").close()
+        try:
+            connection.execute("BEGIN IMMEDIATE").close()
+            connection.execute("ROLLBACK").close()
+        finally:
+            connection.execute(f"PRAGMA busy_timeout = {BUSY_MS}").close()
 
 
 def migrate(engine: Engine, before: Callable[[str], None]) -> None:

@@ -1,6 +1,7 @@
 """Capture store: storage, listing, quarantine, space limits and schema."""
 
 import hashlib
+import math
 import re
 import shutil
 import sqlite3
@@ -26,6 +27,7 @@ from services.records.capture import Capture, CaptureReport
 from services.records.capture_report import read_report
 from services.records.capture_store import CaptureStore
 from services.records.quarantine import REQUIRED_FILES
+from services.records.store_space import NO_FILES_REMEDY
 
 MEMORY = Path("/dev/shm")  # order does not depend on the disk, and the test makes many stores
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -276,6 +278,43 @@ def test_the_free_space_is_counted_in_captures_of_mean_size(tmp_path: Path) -> N
         assert store.space.captures_left() == 0
         free[0] = 5
         assert store.space.captures_left() == 0
+
+
+def test_free_files_are_counted_in_captures(tmp_path: Path) -> None:
+    """A capture of two files takes four with its folder and its record; 16 files and those of one press stay free."""
+    free = [math.inf]
+    with CaptureStore(tmp_path, reserve_bytes=0, free_bytes=lambda _: 10**9, free_files=lambda _: free[0]) as store:
+        store.save(capture("a"), {"raw": bytes(1000), "png": bytes(200)})
+        assert (store.space.captures_left(), store.space.lacks_files()) == (10**9 // 1200, False)
+        free[0] = 16 + 8 + 3 * 4
+        assert (store.space.captures_left(), store.space.lacks_files()) == (4, True)
+        free[0] = 16 + 8 - 1
+        assert store.space.captures_left() == 0
+
+
+def test_a_press_without_free_files_is_refused_before_the_light(tmp_path: Path) -> None:
+    free = [1000.0]
+    with CaptureStore(tmp_path, reserve_bytes=0, free_files=lambda _: free[0]) as store:
+        store.refuse_light_in_vain()
+        free[0] = 10
+        with pytest.raises(StoreFull, match="files") as raised:
+            store.refuse_light_in_vain()
+        assert raised.value.remedy == NO_FILES_REMEDY
+        free[0] = 2
+        with pytest.raises(StoreFull, match="files"):
+            store.save(capture("a"), FILES)
+
+
+def test_a_press_without_free_files_deletes_quarantined_captures(tmp_path: Path) -> None:
+    def free_files(_: Path) -> float:
+        return 60 - sum(1 for _ in tmp_path.rglob("torn/*/*"))
+
+    with CaptureStore(tmp_path, reserve_bytes=0, free_files=free_files) as store:
+        (tmp_path / "torn/20260301T120000-OD-aa").mkdir()
+        for number in range(50):
+            (tmp_path / f"torn/20260301T120000-OD-aa/{number}").touch()
+        store.refuse_light_in_vain()
+        assert store.quarantine.sizes_bytes() == {}
 
 
 def test_concurrent_reads_and_writes(store: CaptureStore) -> None:

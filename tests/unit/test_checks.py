@@ -28,6 +28,7 @@ FAULTS: list[tuple[str, dict[str, Any]]] = [
     ("calibration", {"calibration": HeadMismatch("another head")}),
     ("captures", {"store": StoreFull("0 bytes are free")}),
     ("space", {"people_left": 9}),
+    ("space", {"people_left": 9, "lacks_files": True}),
     ("battery", {"battery": 0.04}),
     ("battery", {"battery": BusFault("the fuel gauge does not answer")}),
     ("heat", {"head_c": 56.0}),
@@ -85,6 +86,15 @@ def test_a_large_number_of_visits_is_not_shown() -> None:
         if check.name == "space"
     ]
     assert shown == ["200 people", "plenty, more than 200 people"]
+
+
+def test_few_free_files_have_their_own_remedy() -> None:
+    """Gigabytes may be free: "make room" would not help who looks at bytes."""
+    checks = [one for lacks in (False, True) for one in run_checks(replace(HEALTHY, people_left=9, lacks_files=lacks))]
+    by_bytes, by_files = (check for check in checks if check.name == "space")
+    assert "files" in by_files.value
+    assert "files" in by_files.remedy
+    assert "files" not in by_bytes.value + by_bytes.remedy
 
 
 def test_quarantined_captures_are_reported_with_the_free_space() -> None:

@@ -72,7 +72,7 @@ def test_removed_files_are_deleted_oldest_first_before_a_picture_is_refused(stor
     names = list(store.removed.sizes_bytes())
     assert [name.partition("-")[2] for name in names] == ["b", "a"]
     with pytest.raises(StoreFull):
-        store.space.make_room(10**15)
+        store.space.make_room(10**15, 0)
     assert store.removed.sizes_bytes() == {}
     assert store.removed.undo() == 0
     with pytest.raises(RecordRemoved):

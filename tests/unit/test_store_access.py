@@ -2,10 +2,12 @@
 
 import multiprocessing
 import os
+import sqlite3
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 
 from device.clock import VirtualClock
 from device.errors import StoreError, StoreReadOnly
+from services.errors import StoreLocked
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -134,3 +137,50 @@ def test_two_programs_on_one_store_lose_nothing(folder: Path) -> None:
         assert {one.id for one in store.captures()} == expected
         assert all(store.read(one, name) == FILES[name] for one in expected for name in FILES)
         assert store.newly_quarantined == ()
+
+
+@pytest.fixture
+def locked(folder: Path) -> Iterator[CaptureStore]:
+    """A store on whose database another connection holds the write lock."""
+    with CaptureStore(folder, reserve_bytes=0) as store, closing(sqlite3.connect(folder / "shelf.sqlite")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield store
+        other.execute("ROLLBACK")
+
+
+def test_a_locked_database_is_found_by_the_health_check(locked: CaptureStore) -> None:
+    with pytest.raises(StoreLocked, match="locked"):
+        locked.check_writable()
+
+
+def test_a_locked_database_refuses_the_light_with_its_own_remedy(tmp_path: Path) -> None:
+    """Not "free some space": what helps is to close the other program."""
+    with CaptureStore(tmp_path, reserve_bytes=0) as store, closing(sqlite3.connect(tmp_path / "shelf.sqlite")) as other:
+        ledger = DoseLedgerStore(store.engine, VirtualClock(), 86_400.0, "boot")
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreLocked) as raised:
+            ledger.reserve(("OD",), 0.0, 1.0)
+        assert "close it" in raised.value.remedy
+        other.execute("ROLLBACK")
+        ledger.reserve(("OD",), 0.0, 1.0)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user")
+@pytest.mark.filterwarnings("ignore:This process.*fork:DeprecationWarning")  # the child starts no thread
+@pytest.mark.parametrize("name", [".", "captures"])
+def test_a_folder_that_becomes_read_only_refuses_the_light(folder: Path, name: str) -> None:
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(0o777)
+
+    def use() -> None:
+        with CaptureStore(folder, reserve_bytes=0) as store:
+            store.refuse_light_in_vain()
+            (folder / name).chmod(0o555)
+            with pytest.raises(StoreReadOnly):
+                store.refuse_light_in_vain()
+            with pytest.raises(StoreReadOnly):
+                store.check_writable()
+
+    for path in (folder, *folder.rglob("*")):
+        os.chown(path, OTHER_USER_ID, OTHER_USER_ID)
+    assert run_as(OTHER_USER_ID, use) == 0
