@@ -26,6 +26,7 @@ from services.lab.channel_options import ReconstructCommand, parse_channels, par
 from services.lab.datasets import open_dataset
 from services.lab.montage_files import montage_files, placed_lines
 from services.lab.peers import ENVIRONMENT, installed_peer
+from services.lab.psf_stack import psf_stack
 from services.lab.reconstruct_burst import reconstruct_burst
 from services.lab.reconstruct_colour import reconstruct_colours
 from services.lab.reconstruct_each import reconstruct_each
@@ -72,7 +73,9 @@ def run(
     head: Annotated[Path | None, typer.Option(help="Head file; the simulated head if nothing is given.")] = None,
     replay: Annotated[Path | None, typer.Option(help="Folder with a recording, played instead of a head.")] = None,
     raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
-    psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording, or a stack of them.")] = None,
+    psf: Annotated[
+        list[Path] | None, typer.Option(help="PSF of a recording, or a stack of them, or their folder.")
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
@@ -112,7 +115,8 @@ def _chosen(head: Path | None, replay: Path | None, raws: tuple[Path, ...], psfs
     if replay is not None or raws or psfs:
         if head is not None:
             raise typer.BadParameter("choose --head or a recording (--replay, --raw with --psf), not both")
-        return recording_spec(replay or raws[0].parent if raws else replay or Path(), raws, psfs)
+        stack = tuple(one for one in psf_stack(psfs) if isinstance(one, Path))
+        return recording_spec(replay or raws[0].parent if raws else replay or Path(), raws, stack)
     return load_head(head or SIM_HEAD)
 
 
@@ -123,7 +127,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
         list[Path] | None, typer.Argument(help="Raw frame: tiff, png, npy, npz or dng; several are one burst.")
     ] = None,
     psf: Annotated[
-        list[Path] | None, typer.Option(help="Measured PSF; several are a stack, the best is chosen.")
+        list[Path] | None, typer.Option(help="Measured PSF; several, or a folder, are a stack, the best is chosen.")
     ] = None,
     channel: Annotated[
         list[str] | None,
@@ -157,6 +161,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
     field_fixed: Annotated[
         bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
     ] = False,
+    no_refraction: Annotated[
+        bool, typer.Option("--no-refraction", help="Leave out the eye's refraction, which --head has estimated.")
+    ] = False,
     even: Annotated[
         bool, typer.Option("--even", help="Even out the illumination (paper: flat-field correction).")
     ] = False,
@@ -175,9 +182,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
     channels, raws = parse_channels(channel or []), raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
-        raws[0] if raws else Path(), tuple(psf or ()), None if each else output, method, budget_s, common_dark, flat,
-        head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
-        parse_settings(setting or ()), parse_bayer(bayer), field_fixed,
+        raws[0] if raws else Path(), psf_stack(psf or ()), None if each else output, method, budget_s, common_dark,
+        flat, head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
+        parse_settings(setting or ()), parse_bayer(bayer), field_fixed, not no_refraction,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
     if each:

@@ -1,6 +1,6 @@
 """Options of `diffuscope reconstruct` that take a channel: `--channel NAME RAW PSF`, and `--dark NAME=FILE`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,36 @@ class ReconstructCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Join the three values of each `--channel` to one, then parse as every command does."""
-        return super().parse_args(ctx, _joined(args))
+        joined = _joined(args)
+        refuse_stray(joined, {name for one in self.params if _takes_value(one) for name in one.opts})
+        return super().parse_args(ctx, joined)
+
+
+def _takes_value(option: Any) -> bool:
+    return option.param_type_name == "option" and not option.is_flag
+
+
+def refuse_stray(words: Sequence[str], with_value: Collection[str]) -> None:
+    """Raise SettingError for a file after the value of --psf, --dark or --flat, if a raw stands before them.
+
+    A shell writes `raw.tiff --psf psf*.tiff` out as several files, and all but the first would be frames of a burst.
+    `with_value`: the options that take a value.
+    """
+    rest, option, value, raw_given = iter(words), "", "", False
+    for word in rest:
+        name, equals, given = word.partition("=")
+        if name in with_value:
+            option, value = name, given if equals else next(rest, "")
+        elif word.startswith("-"):
+            option = ""
+        elif option in ("--psf", "--dark", "--flat") and raw_given:
+            remedy = "A stack of PSFs is --psf A --psf B, or --psf FOLDER."
+            raise SettingError(
+                f"{word} stands after {option} {value} and would be one more frame of a burst",
+                f"Give all raws first. {remedy if option == '--psf' else f'One file belongs to {option}.'}",
+            )
+        else:
+            option, raw_given = "", True
 
 
 def _joined(args: Sequence[str]) -> list[str]:

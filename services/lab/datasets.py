@@ -98,7 +98,7 @@ def open_dataset(folder: Path | str, psf: Path | str | None = None, split: Split
 
 def _dataset(folder: Path, found: Found, psf: Path | None, split: Split) -> Dataset:
     """Return the data set of recognised files: test list applied, PSF selected, names in natural order."""
-    names = sorted(found.raws, key=_natural)
+    names = sorted(found.raws, key=natural_order)
     notes = []
     if found.listed and split == "test":
         kept = [name for name in names if name in found.listed]
@@ -146,7 +146,7 @@ def _size(path: Path) -> tuple[int, int] | None:
     return rows, cols
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def natural_order(name: str) -> list[tuple[int, str]]:
     """Return a sorting key that orders im2 before im10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
@@ -223,7 +223,7 @@ def _find_depths(folder: Path) -> Found | None:
         raws = {stem: path for stem, path in _images(place).items() if stem.endswith("raw")}
         stack = tuple(_images(place / "psf").values()) or tuple(sorted(place.glob("*psf*.mat")))
         if raws and stack:
-            return Found(DEPTHS, raws, {}, tuple(sorted(stack, key=lambda path: _natural(path.stem))))
+            return Found(DEPTHS, raws, {}, tuple(sorted(stack, key=lambda path: natural_order(path.stem))))
     return None
 
 

@@ -31,6 +31,7 @@ from device.values import Image, Mask, SimulatedCounts
 from services import resources
 from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case, selected_methods
 from services.lab.frontier_result import Frontier
+from services.lab.psf_stack import psf_stack
 from services.lab.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
 from services.lab.reconstruct_inputs import ReconstructOptions, Source
 
@@ -44,7 +45,8 @@ class ReconstructionOptions(TypedDict, total=False):
     light path and the sensor. `field_deg`: diameter of the illuminated disc in degrees, with `head`. `method`: name of
     `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels per sample. `rounds`: largest number of rounds of an iterative
     method. `settings`: parameters of the method, such as {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the
-    raw is a mosaic of this pattern, "rggb", "bggr", "grbg" or "gbrg".
+    raw is a mosaic of this pattern, "rggb", "bggr", "grbg" or "gbrg". `refraction`: False leaves out the eye's
+    refraction, which is estimated with `head`.
     """
 
     dark: ImageSource
@@ -57,6 +59,7 @@ class ReconstructionOptions(TypedDict, total=False):
     settings: Mapping[str, float]
     budget_s: float
     bayer: str
+    refraction: bool
 
 
 def reconstruct(
@@ -257,11 +260,12 @@ def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOpti
     head, dark, flat = given.get("head"), given.get("dark"), given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
-        raw=Path(), psfs=tuple(_source(one) for one in psfs), output=None, method=given.get("method"),
+        raw=Path(), psfs=psf_stack([_source(one) for one in psfs]), output=None, method=given.get("method"),
         budget_s=given.get("budget_s"), dark=None if dark is None else _source(dark),
         flat=None if flat is None else _source(flat), head=None if head is None else Path(head),
         field_deg=given.get("field_deg"), even=False, plans=resources.fft_plans(), bin=given.get("bin"),
         rounds=given.get("rounds"), settings=dict(given.get("settings", {})), bayer=parse_bayer(given.get("bayer")),
+        refraction=given.get("refraction", True),
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import plane
 from device.values import FrameUse, Report
+from services.lab.burst_frames import refuse_psfs, refuse_repeated, refuse_without_first
 from services.lab.reconstruct_file import (
     FileReconstruction,
     file_report,
@@ -42,10 +43,11 @@ from services.lab.reconstruct_inputs import (
 
 
 def reconstruct_burst(raws: Sequence[Source], options: ReconstructOptions) -> FileReconstruction:
-    """Reconstruct one picture from the raws of a burst, on the grid of the first used one, and write it.
+    """Reconstruct one picture from the raws of a burst, on the grid of the first one, and write it.
 
     `options` holds all other options (`raw` is ignored). The report's `frames` says what became of each raw. FrameError
-    for raws of different shapes or levels, or if none can be used; SettingError for invalid options.
+    for raws of different shapes or levels, with the same pixels, or that look like PSFs, and if the first cannot be
+    used; SettingError for invalid options.
     """
     options = replace(options, raw=raws[0])
     solved = solve_burst(load_burst(raws, options), options, Planner(options.plans))
@@ -68,14 +70,16 @@ def load_burst(raws: Sequence[Source], options: ReconstructOptions) -> list[Load
 
 
 def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
-    """Return the picture of the loaded raws of a burst; FrameError if none can be used, or for colour raws."""
+    """Return the picture of the loaded raws of a burst; FrameError as of `reconstruct_burst`, or for colour raws."""
     unusable = unusable_raws(loaded)
     if len(unusable) == len(loaded):
         raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take the burst again.")
     usable = [one for k, one in enumerate(loaded) if k not in unusable]
+    refuse_repeated(usable)
     common, clock = common_raw(usable), SystemClock()
     psfs = None if options.calibration is not None else load_psfs(options, common, per_channel=False)
     calibration = load_calibrations(options, common, psfs)[0]
+    refuse_psfs(usable, calibration.psfs)
     index = 0
     if len(calibration.psfs) > 1:
         index, _ = most_likely_psf(calibration, common.raw.pixels, planner)
@@ -83,12 +87,13 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
     begin_s = clock.now_s()
     joined = joiner([without_bad(one.raw) for one in loaded], unusable)
     join_s = clock.now_s() - begin_s
+    refuse_without_first(loaded, joined.frames)
     solver = plan_reconstructor(options, joined.calibration, common.solved_shape, planner, index)
     deadline = None if options.budget_s is None else Deadline.after(clock, max(options.budget_s - join_s, 1e-6))
     made = solver(joined.counts, simulated=any(one.simulated for one in loaded), deadline=deadline)
     notes = tuple(dict.fromkeys(note for one in loaded for note in one.notes))
     report = made.report
-    if deadline is None and can_estimate_refraction(calibration):
+    if deadline is None and options.refraction and can_estimate_refraction(calibration):
         estimator = RefractionEstimator(calibration, common.solved_shape, planner, index, options.field_fixed)
         used = [plane(without_bad(loaded[one.index].raw), 0) for one in joined.frames if one.used]
         report = with_scatter(report, estimator, used)

@@ -12,6 +12,7 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
 from device.values import Colour, FrameUse, Image
+from services.lab.psf_stack import psf_stack
 from services.lab.reconstruct_burst import load_burst, solve_burst
 from services.lab.reconstruct_file import (
     FileReconstruction,
@@ -101,7 +102,7 @@ def _same(one: Source, other: Source) -> bool:
 def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
     """Reconstruct the frames of one channel: one frame, or a burst."""
     raws = [one.raw for one in given]
-    options = replace(options, raw=raws[0], psfs=(given[0].psf,), output=None, report=None)
+    options = replace(options, raw=raws[0], psfs=psf_stack([given[0].psf]), output=None, report=None)
     try:
         if len(raws) > 1:
             return solve_burst(load_burst(raws, options), options, planner)
@@ -138,7 +139,9 @@ def _joined(
 
 def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -> Image:
     """Return the lit field on the picture's pixels, 0 to 1: of the head, else the lit area of the picture."""
-    calibration = load_calibration(replace(options, raw=source.raw, psfs=(source.psf,)), load_raw(source.raw).raw)
+    calibration = load_calibration(
+        replace(options, raw=source.raw, psfs=psf_stack([source.psf])), load_raw(source.raw).raw
+    )
     shape = picture.shape[0], picture.shape[1]
     if np.isfinite(field_radius_px(calibration)):
         return field_mask(calibration, shape)

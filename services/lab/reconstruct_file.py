@@ -292,6 +292,7 @@ def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[s
     single: dict[str, float | str | None] = {
         "method": options.method, "bin": options.bin, "rounds": options.rounds, "budget_s": options.budget_s,
         "field_deg": options.field_deg, "bayer": options.bayer,
+        "refraction": None if options.refraction else "left out",
     }  # fmt: skip
     given: dict[str, float | str | dict[str, float]] = {
         key: value for key, value in single.items() if value is not None
@@ -314,7 +315,8 @@ def plan_reconstructor(
     if quick and len(recipes) == 1:
         recipes = (default_schedule(calibration, shape, index)[0], *recipes)
     return Reconstructor(
-        calibration, shape, planner, SystemClock(), recipes, index, refract=main, consistency=consistency,
+        calibration, shape, planner, SystemClock(), recipes, index, refract=main and options.refraction,
+        consistency=consistency,
         timed=options.budget_s is not None, methods=METHODS if method is None else {**METHODS, method.name: method},
         audience=Audience.FILES, field_fixed=options.field_fixed,
     )  # fmt: skip

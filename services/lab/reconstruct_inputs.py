@@ -43,7 +43,8 @@ class ReconstructOptions:
     Images are paths or arrays. `output` None writes nothing. `even`: flat-field correction of the picture.
     `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and `settings` (of the method, see
     device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`: the raw is a mosaic.
-    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge. `light`: colour of the
+    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge. `refraction` False leaves
+    the refraction out. `light`: colour of the
     raw, for which the PSFs of an archived calibration are chosen (None: all are used).
     """
 
@@ -66,6 +67,7 @@ class ReconstructOptions:
     settings: Settings = field(default_factory=dict)
     bayer: Bayer | None = None
     field_fixed: bool = False
+    refraction: bool = True
     light: Colour | None = None
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from tests.journey.wrong_inputs import Answer, call
 from tests.moving_retina import DRIFT_PX, PSF, RETINA, SHAPE, field, frame, seen
@@ -52,11 +53,11 @@ def test_a_burst_gives_one_picture_and_its_report_names_every_frame(folder: Path
 
 
 def test_a_frame_without_values_is_left_out_and_a_smaller_one_is_refused(folder: Path) -> None:
-    done = call(reconstruct(folder, "nan.npy", "0.npy", "1.npy"))
+    done = call(reconstruct(folder, "0.npy", "nan.npy", "1.npy"))
     assert done.code == 0, done.err
     report = json.loads((folder / "report.json").read_text())
-    assert [one["used"] for one in report["frames"]] == [False, True, True]
-    assert "not numbers" in report["frames"][0]["reason"]
+    assert [one["used"] for one in report["frames"]] == [True, False, True]
+    assert "not numbers" in report["frames"][1]["reason"]
     assert "344 x 480 pixels" in refusal(call(reconstruct(folder, "0.npy", "small.npy")))
     assert "no frame of the burst can be used" in refusal(call(reconstruct(folder, "nan.npy", "nan.npy")))
 
@@ -68,3 +69,65 @@ def test_no_raw_of_a_burst_is_overwritten(folder: Path) -> None:
         assert "would be overwritten" in refusal(call([*words, *out]))
     assert (folder / "1.npy").read_bytes() == before
     assert "Leave --even out." in refusal(call([*words, "-o", str(folder / "x.npy"), "--even"]))
+    sweep = call([*words, "-o", str(folder / "x.npy"), "--sweep", str(folder / "s.svg")])
+    assert "Leave --sweep out, or give one raw." in refusal(sweep)
+
+
+def test_a_burst_without_its_first_frame_is_refused(folder: Path) -> None:
+    """The picture would be on another grid than that of the first raw: a lid, or no values."""
+    (folder / "out.npy").unlink(missing_ok=True)
+    for first in ("lid.npy", "nan.npy"):
+        says = refusal(call(reconstruct(folder, first, "0.npy", "1.npy", "2.npy")))
+        assert f"the first frame of the burst, {folder / first}, was left out" in says
+    assert not (folder / "out.npy").exists()
+
+
+def test_psfs_among_the_frames_are_refused(folder: Path) -> None:
+    """As a shell writes `raw.npy --psf psf*.npy`, and as a burst of PSFs without a raw."""
+    others = [psf_of_another_depth(folder, zoom) for zoom in (0.95, 1.05, 1.1)]
+    words = ["reconstruct", str(folder / "0.npy"), "--psf", str(folder / "psf.npy"), *others, "-o", "out.npy"]
+    assert "--psf A --psf B" in refusal(call(words))
+    for frames in (["0.npy", *others], others):
+        says = refusal(call(reconstruct(folder, *frames)))
+        assert "looks like a PSF" in says
+        assert "--psf A --psf B" in says
+
+
+def psf_of_another_depth(folder: Path, zoom: float) -> str:
+    place = folder / f"depth{zoom}.npy"
+    scaled = ndimage.zoom(PSF.pixels.astype(np.float64), zoom, order=1)
+    rows, cols = scaled.shape
+    centred = np.zeros(SHAPE)
+    top, left = (SHAPE[0] - rows) // 2, (SHAPE[1] - cols) // 2
+    centred[top : top + rows, left : left + cols] = scaled
+    counts = centred / centred.max() * 4000 + np.random.default_rng(int(zoom * 100)).normal(60, 2, SHAPE)
+    np.save(place, counts.astype(np.uint16))
+    return str(place)
+
+
+def test_the_same_exposure_twice_is_no_burst(folder: Path) -> None:
+    np.save(folder / "copy.npy", np.load(folder / "1.npy"))
+    assert "holds the same pixels as" in refusal(call(reconstruct(folder, "0.npy", "1.npy", "copy.npy")))
+    channels = [word for name in ("0.npy", "0.npy") for word in ("--channel", "green", name, "psf.npy")]
+    words = ["reconstruct", *(str(folder / one) if one.endswith(".npy") else one for one in channels)]
+    assert "green: " in refusal(call([*words, "-o", str(folder / "x.npy")]))
+
+
+def test_raws_after_an_option_are_frames_where_none_stands_before(folder: Path) -> None:
+    words = ["reconstruct", "--psf", str(folder / "psf.npy"), str(folder / "0.npy"), str(folder / "1.npy")]
+    done = call([*words, "-o", str(folder / "after.npy")])
+    assert done.code == 0, done.err
+
+
+def test_a_folder_of_psfs_is_a_stack(folder: Path) -> None:
+    stack = folder / "psfs"
+    stack.mkdir()
+    for name, source in (("d2.npy", psf_of_another_depth(folder, 1.1)), ("d10.npy", folder / "psf.npy")):
+        (stack / name).write_bytes(Path(source).read_bytes())
+    (stack / "._d2.npy").write_bytes(b"a companion of macOS")
+    words = ["reconstruct", str(folder / "0.npy"), "-o", str(folder / "x.npy"), "--report", str(folder / "r.json")]
+    done = call([*words, "--psf", str(stack)])
+    assert done.code == 0, done.err
+    assert json.loads((folder / "r.json").read_text())["psf_index"] == 1  # d10 after d2
+    (folder / "empty").mkdir()
+    assert "holds no PSF" in refusal(call([*words, "--psf", str(folder / "empty")]))

@@ -75,7 +75,7 @@ def test_setting_replaces_the_value_of_the_frame(method: str, setting: str) -> N
         (["--rounds", "0"], "0 rounds"),
         (["--rounds", "5", "--method", "gradient"], "closed form"),
         (["--bayer", "rgbg"], "Choose one of: rggb, bggr, grbg, gbrg."),
-        (["FOLDER/psf.npy", "--sweep", "FOLDER/s.svg"], "Leave --sweep out, or give one raw."),
+        (["FOLDER/psf.npy"], "A stack of PSFs is --psf A --psf B"),
         (["--sweep", "FOLDER/s.svg"], "compares several PSFs"),
         (["-o", "FOLDER/raw.npy"], "would be overwritten"),
         (["--each"], "Give -o FOLDER/."),
