@@ -191,10 +191,18 @@ strace: ## Install strace (Debian package) where it is missing.
 buses: ## Install umockdev (Debian packages) where it is missing.
 	@tests/ports/emulators/install
 
-lint: .venv/ready ## Check style, types, and who imports whom.
+# The page has no build step; its JSDoc types are checked by a compiler that nothing else needs.
+PAGE_TYPES := tests/browser/types
+
+.venv/typescript/ready: $(PAGE_TYPES)/package-lock.json $(PAGE_TYPES)/install | .venv/ready
+	@$(PAGE_TYPES)/install
+	@touch $@
+
+lint: .venv/ready .venv/typescript/ready ## Check style, types (Python and the page's JavaScript), and who imports whom.
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --diff --quiet .
 	@$(BIN)/mypy --no-error-summary
+	@.venv/typescript/node_modules/.bin/tsc --project $(PAGE_TYPES)
 	@said=$$($(BIN)/lint-imports --no-logo) || { echo "$$said"; exit 1; }
 
 VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)

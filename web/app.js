@@ -7,12 +7,14 @@ import { page } from "./screens/page_layout.js";
 import { bindKeys } from "./core/keyboard.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
-import { playCue, resetPictureTools, captureEventHandlers, ignoreTaps, openPicture, resolveCutShots, takePicture } from "./core/capture.js";
+import { playCue, resetPictureTools, captureEventHandlers, ignoreTaps, openPicture, rejectForeignCapture, resolveCutShots, takePicture } from "./core/capture.js";
 import { startRouter, navigate } from "./core/router.js";
 import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
 import { render } from "./vendor/lit-html.js";
 import { finishWhenComplete, alertOnError, refreshList, refreshMontages, refreshOutbox, refreshVisit, flushUnsaved } from "./core/visit.js";
 import { loadLanguage, t, today } from "./i18n/translate.js";
+
+/** @typedef {import("./core/state.js").State} State */
 
 const STATUS_BEATS = 10; // request the status at every tenth heartbeat
 const LEASE_BEATS = 4; // renewal period; the server's control lease lasts ten seconds
@@ -89,7 +91,11 @@ async function loadRoute(route) {
   if (route.screen === "film") refreshMontages(route.visit);
   if (route.screen === "compare") {
     const captures = await Promise.all([route.capture, route.other].map((id) => alertOnError(() => getCapture(id))));
-    set({ compared: Object.freeze(captures.filter(Boolean)) });
+    const found = captures.filter((one) => one !== undefined);
+    const foreign = found.find((one) => one.visit !== route.visit);
+    if (get().route !== route) return;
+    if (foreign) rejectForeignCapture(route, foreign);
+    else set({ compared: Object.freeze(found) });
   }
   if (route.screen !== "picture" || !visit) return;
   if (!get().status) await refreshStatus(); // after a reload, `activity` shows whether a capture is in progress
@@ -238,21 +244,24 @@ function showAim(aim) {
 // requests control again.
 addEventListener("pagehide", releaseControl);
 
-actions.previewAim = ({ detail }) => showAim(detail);
-// Consent or control changed on another screen: reload the visit or the lease to show the reason.
-actions.previewRefused = ({ detail: { code } }) => {
-  if (code.startsWith("consent.")) refreshVisit(get().route.visit);
-  else if (code === "link.other") renewControl();
-};
-actions.previewLate = ({ detail: seconds }) => {
-  if (seconds && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
-  if (seconds >= LATE_S && get().link === "live") {
-    raiseAlert({ code: "link.slow", n: seconds, from: "page" });
-  } else lowerAlerts("link.slow");
-};
+Object.assign(actions, {
+  previewAim: ({ detail }) => showAim(detail),
+  // Consent or control changed on another screen: reload the visit or the lease to show the reason.
+  previewRefused({ detail: { code } }) {
+    if (code.startsWith("consent.")) refreshVisit(get().route.visit);
+    else if (code === "link.other") renewControl();
+  },
+  previewLate({ detail: seconds }) {
+    if (seconds && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
+    if (seconds >= LATE_S && get().link === "live") {
+      raiseAlert({ code: "link.slow", n: seconds, from: "page" });
+    } else lowerAlerts("link.slow");
+  },
+});
 
 // ---- render
 
+/** @param {State} state */
 function renderPage(state) {
   document.documentElement.dataset.theme = state.theme;
   render(page(state, actions), $("#app"));

@@ -462,3 +462,22 @@ def test_details_state_that_the_psf_has_the_cylinder(open_page: Open, real: Real
     page.reload()
     page.get_by_role("button", name="Details").tap()
     expect(page.get_by_role("dialog")).to_contain_text("Corrected for the cylinder, predicted gain 0.4 dB")
+
+
+def test_comparison_is_reloaded_and_refuses_another_visit(open_page: Open, real: Real) -> None:
+    """A page error fails the test: nothing is found while the visit is loaded, nor in another visit."""
+    other, visit = (real.begin_visit(consent="agreed")["id"] for _ in range(2))
+    first, second = (real.press(other, slot)["id"] for slot in ("R-centre", "L-centre"))
+    page = open_page("about:blank")
+    held: list[Route] = []
+    page.route(f"**/api/visits/{other}", lambda route: held.append(route))
+    page.goto(f"{real.url}/#/visit/{other}/compare/{first}/{second}")
+    expect(page.locator(".compare figcaption")).to_have_count(2)  # drawn before the visit is loaded
+    for route in held:
+        route.continue_()
+    page.unroute(f"**/api/visits/{other}")
+    page.reload()
+    expect(page.locator(".compare figcaption").first).to_contain_text("Right eye · Centre")
+    page.goto(f"{real.url}/#/visit/{visit}/compare/{first}/{second}")
+    page.wait_for_selector("[data-screen=person]")
+    expect(page.locator(".state-bar")).to_contain_text("This picture is of another person.")

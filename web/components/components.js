@@ -9,7 +9,13 @@ import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
 
-/** Return the translated eye and field of a slot: {eye, part}. */
+/** @typedef {import("../core/state.js").State} State */
+
+/**
+ * Return the translated eye and field of a slot: {eye, part}.
+ * @param {State} state
+ * @param {string | null | undefined} slot
+ */
 export const slotLabel = (state, slot) => {
   const plan = slotPlan(state, slot);
   return plan ? { eye: t(`eye.${plan.eye}`), part: fieldLabel(plan.field) } : { eye: "", part: "" };
@@ -37,6 +43,7 @@ const TILE_FACES = {
   lost: ["warn", "tile.lost"],
 };
 
+/** @param {State} state */
 function faceOf(state, id) {
   const { shots, visit } = state;
   const slot = visit?.slots[id];
@@ -46,7 +53,10 @@ function faceOf(state, id) {
   return slot.verdict?.word === "again" ? "poor" : "good";
 }
 
-/** Row of slot tiles. */
+/**
+ * Row of slot tiles.
+ * @param {State} state
+ */
 export function tiles(state, actions) {
   return html`
     <div class="tiles" role="group" aria-label=${t("part.tiles")}>
@@ -55,6 +65,7 @@ export function tiles(state, actions) {
   `;
 }
 
+/** @param {State} state */
 function tile(state, actions, { id, eye, field }) {
   const face = faceOf(state, id);
   const [mark, word] = TILE_FACES[face];
@@ -84,7 +95,10 @@ const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an ex
 
 // ---- alerts: one bar for a blocking alert, at most two chips
 
-/** Return the alert of the prompt bar: the blocking alert of highest priority, else the latest refused request. */
+/**
+ * Return the alert of the prompt bar: the blocking alert of highest priority, else the latest refused request.
+ * @param {State} state
+ */
 export function topAlert(state) {
   return visibleAlerts(state).stop ?? state.alerts.find(({ level }) => level === "refused") ?? null;
 }
@@ -104,7 +118,10 @@ export function alertBar(one, actions) {
   `;
 }
 
-/** List of advisory alerts. */
+/**
+ * List of advisory alerts.
+ * @param {State} state
+ */
 export function chips(state, actions) {
   // The Send screen shows the text of these two alerts itself.
   const shown = visibleAlerts(state).chips.filter(({ code }) => state.route.screen !== "send" || !code.startsWith("send."));
@@ -128,7 +145,10 @@ export const alertButton = (one, name, actions) =>
     ? html`<a class="button" href=${ALERT_LINKS[name]}>${t(`do.${name}`)}</a>`
     : html`<button type="button" data-do=${name} @click=${() => actions.runAlertButton(name, one)}>${t(`do.${name}`)}</button>`;
 
-/** Group of toggle buttons: one choice, or several with `many`. */
+/**
+ * Group of toggle buttons: one choice, or several with `many`.
+ * @param {{label: string, field?: string, value: any, options: any[][], choose: (one: any) => void, many?: boolean}} group
+ */
 export function choice({ label, field, value, options, choose, many = false }) {
   const on = (one) => (many ? (value ?? []).includes(one) : value === one);
   return html`
@@ -150,12 +170,15 @@ export function choice({ label, field, value, options, choose, many = false }) {
 /** Name of a version of a picture: its number, and the day on which the store adopted it. */
 export const versionName = ({ number, at }) => t("version.n", { n: number, day: at ? calendarDay(at) : "" });
 
-/** Reasons of the programme why a picture could not be taken, as buttons. */
+/**
+ * Reasons of the programme why a picture could not be taken, as buttons.
+ * @param {State} state
+ */
 export function reasons({ protocol, route }, actions) {
   return html`
     <div class="reasons" role="group" aria-labelledby="why">
       <h2 id="why">${t("result.why")}</h2>
-      ${protocol.reasons.map(
+      ${(protocol?.reasons ?? []).map(
         (reason) => html`<button type="button" data-reason=${reason} @click=${() => actions.couldNot(route.slot, reason)}>
           ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
         </button>`,

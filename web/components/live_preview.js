@@ -2,7 +2,7 @@
 // frame rate and not the freshness (MJPEG lagged 3 s on the same connection).
 
 import { getPreview, ApiError } from "../core/api.js";
-import { fitCanvas, homeBox } from "../core/viewport.js";
+import { context2d, fitCanvas, homeBox } from "../core/viewport.js";
 import { number, t } from "../i18n/translate.js";
 
 const RETRY_MS = 500;
@@ -18,12 +18,15 @@ export class LivePreview extends HTMLElement {
   #running = false;
   #head = null;
   #eye = "OD"; // the eye that gets the light
+  /** @type {string | null} */
   #visit = null; // the visit for which light is allowed
   #link = "opening";
+  /** @type {ImageBitmap | null} */
   #bitmap = null;
   #number = 0;
   #takenMs = 0; // on this page's clock: when the drawn frame was exposed
-  #hint = null; // aiming hint: {code, fill}
+  /** @type {{code: string} | null} */
+  #hint = null; // aiming hint
   #reportedLate_s = 0;
   #abort = new AbortController();
   #canvas = document.createElement("canvas");
@@ -144,7 +147,7 @@ export class LivePreview extends HTMLElement {
   #draw() {
     if (!this.#canvas.isConnected || !fitCanvas(this.#canvas)) return;
     const { width, height } = this.#canvas;
-    const context = this.#canvas.getContext("2d");
+    const context = context2d(this.#canvas);
     context.fillStyle = "#000";
     context.fillRect(0, 0, width, height);
     let disc = Math.min(width, height) * 0.94;

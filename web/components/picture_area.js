@@ -7,12 +7,20 @@ import { slotLabel, topAlert, alertBar, versionName } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
 export const isExamScreen = ({ route }) => route.screen === "aim" || route.screen === "picture";
 
-/** The visit that live pictures are requested for: the present one, if its consent and the control lease permit light. */
+/**
+ * The visit that live pictures are requested for: the present one, if its consent and the control lease permit light.
+ * @param {State} state
+ */
 const litVisit = (state) => (state.hasControl && allowsLight(state) ? state.route.visit : null);
 
-/** Live preview, picture viewer and prompt line; hidden outside the exam screens. */
+/**
+ * Live preview, picture viewer and prompt line; hidden outside the exam screens.
+ * @param {State} state
+ */
 export function pictureArea(state, actions) {
   const shot = currentShot(state);
   const none = state.picture === "none" || !shot;
@@ -61,6 +69,7 @@ function sourceOf(shot, { redfree, version }) {
 
 // ---- prompt line: a blocking alert, the mark of the picture, or the aiming hint
 
+/** @param {State} state */
 function prompt(state, actions) {
   const stop = topAlert(state);
   const [tone, name, text] = stop ? ["stop"] : promptOf(state);
@@ -84,6 +93,7 @@ const HINT_ICONS = {
   bright: "sun",
 };
 
+/** @param {State} state */
 function promptOf(state) {
   const { route, note, activity, prompt: hint } = state;
   if (note) return ["wait", "wait", note];
@@ -95,6 +105,7 @@ function promptOf(state) {
   return [hint.code === "ready" ? "ready" : "plain", HINT_ICONS[hint.code] ?? "ring", t(`aim.${hint.code}`)];
 }
 
+/** @param {State} state */
 function markPrompt(state) {
   const shot = currentShot(state);
   if (shot?.stage.name === "expose" && !shot.verdict && !shot.capture) return ["hold", "hand", t("make.expose")];
@@ -104,6 +115,7 @@ function markPrompt(state) {
   return ["wait", "wait", t("make.refine")];
 }
 
+/** @param {State} state */
 function pictureName(state, shot) {
   if (!shot || state.picture === "none") return t("pic.none");
   const time = shot.capture ? clockTime(shot.capture.taken_at) : "";

@@ -5,7 +5,7 @@ import { icon } from "./icons.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
 
-const dialog = () => document.querySelector("#details");
+const dialog = () => /** @type {HTMLDialogElement | null} */ (document.querySelector("#details"));
 export const open = () => dialog()?.showModal();
 const close = () => dialog()?.close();
 

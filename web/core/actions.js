@@ -2,7 +2,7 @@
 
 import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
-import { get, saveSetting, set, currentShot } from "./state.js";
+import { get, otherEyeSlot, saveSetting, set, currentShot } from "./state.js";
 import { displayNumber, applyKey } from "./numbers.js";
 import { playCue, resetPictureTools, takePicture, acceptTap } from "./capture.js";
 import { qrCode } from "./qr_code.js";
@@ -23,7 +23,10 @@ const navigationActions = {
   begin: (number) => acceptTap() && visits.begin(number),
   resume: visits.resume,
   retryUploads: visits.retryUploads,
-  startAiming: () => acceptTap() && navigate({ screen: "aim", visit: get().visit.id, slot: get().visit.next_slot ?? visits.nextSlot() }),
+  startAiming() {
+    const { visit } = get();
+    if (visit && acceptTap()) navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot ?? get().protocol?.slots[0].id });
+  },
   setField: visits.setField,
   typeNumber(key) {
     const typed = applyKey(get().typed, key, 12);
@@ -51,6 +54,7 @@ const navigationActions = {
   /** Show the picture of a slot; if the slot is empty, aim at it. */
   chooseTile(slot) {
     const { visit, shots } = get();
+    if (!visit) return;
     const pendingShots = shots.some((shot) => shot.visit === visit.id && shot.slot === slot && !shot.over);
     lowerAlerts(({ from }) => from === "press");
     if (pendingShots || visit.finished_at || visit.slots[slot].captures.length) navigate({ screen: "picture", visit: visit.id, slot });
@@ -63,7 +67,7 @@ const examActions = {
   again: () => acceptTap() && goToAim(currentRoute().slot),
   keepPrevious: () => acceptTap() && navigate({ screen: "picture", visit: currentRoute().visit, slot: currentRoute().slot }),
   next: () => acceptTap() && visits.goToNextSlot(currentRoute().slot),
-  keepThis: () => acceptTap() && visits.keepPoor(currentShot(get()).id, currentRoute().slot),
+  keepThis: () => acceptTap() && visits.keepPoor(currentShot(get())?.id, currentRoute().slot),
   useThis: () => acceptTap() && visits.useInSlot(currentRoute().slot, currentRoute().capture),
   ask: () => acceptTap() && set({ asking: true }),
   closeReasons: () => set({ asking: false }),
@@ -93,7 +97,7 @@ const examActions = {
   setBlink: (blink) => set({ blink, front: 0 }),
   swap: () => set({ front: get().front ? 0 : 1 }),
   linkZoom({ target, detail }) {
-    for (const pic of document.querySelectorAll(".two eye-pic")) if (pic !== target) pic.view = detail;
+    for (const pic of get().modules.viewer?.viewersOf(target.closest(".two")) ?? []) if (pic !== target) pic.view = detail;
   },
   listFolders: async () => set({ folders: (await visits.alertOnError(getFolders)) ?? null, copied: null, zipped: false }),
   zipped: () => set({ folders: null, copied: null, zipped: true }),
@@ -148,10 +152,9 @@ const alertButtons = {
     if (answer) pageHooks.setControl(answer);
   },
   otherEye() {
-    const { protocol } = get();
-    const now = protocol.slots.find(({ id }) => id === currentRoute().slot);
     lowerAlerts(({ code }) => code.startsWith("light."));
-    goToAim(protocol.slots.find(({ eye, field }) => eye !== now.eye && field === now.field).id);
+    const slot = otherEyeSlot(get(), currentRoute().slot);
+    if (slot) goToAim(slot.id);
   },
   finish: () => examActions.finish(),
   ask: () => navigate({ screen: "person", visit: currentRoute().visit }),
@@ -172,11 +175,11 @@ const alertButtons = {
   timer: () => set({ timer: Date.now() + PUPIL_REST_MS, now: Date.now() }),
   change({ id, slot }) {
     lowerAlerts("eye.side");
-    visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentShot(get()).id);
+    visits.moveToOtherEye(slot ?? currentRoute().slot, id ?? currentShot(get())?.id);
   },
   keepEye({ code, id, slot }) {
     dismissAlert({ code }); // hide the question until the server has the answer
-    visits.confirmEye(slot ?? currentRoute().slot, id ?? currentShot(get()).id);
+    visits.confirmEye(slot ?? currentRoute().slot, id ?? currentShot(get())?.id);
   },
   uncross: visits.undoCouldNot,
 };
@@ -210,6 +213,7 @@ const settingsActions = {
 };
 
 /** Functions that app.js provides for the alert buttons. */
+/** @type {{refreshStatus: () => void, setControl: (answer: {mine: boolean}) => void}} */
 export const pageHooks = { refreshStatus: () => {}, setControl: () => {} };
 
 export const actions = {

@@ -5,11 +5,14 @@
 import { consentOf, get, lostShots, set } from "./state.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
 const ASSERTIVE = /^(link\.lost|light\.|heat\.)/;
 
 // Highest priority first. Levels: `stop` blocks captures; `tell` is an advisory chip; `shot` belongs to one picture and
 // is shown on its card; `ask` is a question on that card. `wait_s`: seconds until the alert ends by itself; "n": the n
 // minutes that the server sent. A `wait_s` from the server takes precedence.
+/** @type {[string, string, string[], {wait_s?: number | "n"}?][]} */
 const TABLE = [
   ["link.lost", "stop", []],
   ["link.other", "stop", ["useHere"]],
@@ -42,11 +45,13 @@ const TABLE = [
   ["make.failed", "shot", ["again", "next"]],
   ["shot.poor", "shot", ["couldNot", "again"]],
   ["shot.pupil", "shot", ["timer", "again"]],
-  ...["shot.saturated", "shot.dark", "shot.moved", "shot.blink", "shot.noeye", "shot.edge", "shot.halo"].map((code) => [
-    code,
-    "shot",
-    ["again"],
-  ]),
+  ["shot.saturated", "shot", ["again"]],
+  ["shot.dark", "shot", ["again"]],
+  ["shot.moved", "shot", ["again"]],
+  ["shot.blink", "shot", ["again"]],
+  ["shot.noeye", "shot", ["again"]],
+  ["shot.edge", "shot", ["again"]],
+  ["shot.halo", "shot", ["again"]],
 ];
 
 export const ALERTS = Object.freeze(
@@ -73,7 +78,10 @@ const SAME = {
 // Defaults for a code that is not in the table: a server status blocks captures, a refused request is advisory.
 const UNKNOWN = { buttons: [], assertive: false };
 
-/** Return the text of an alert: translated, or the server's text where a number is missing. */
+/**
+ * Return the text of an alert: translated, or the server's text where a number is missing.
+ * @param {{code: string, message?: string, remedy?: string, [more: string]: any}} alert
+ */
 export function alertText({ code, message, remedy, ...vars }) {
   const key = `state.${code}`;
   const values = translatedValues(vars);
@@ -81,6 +89,7 @@ export function alertText({ code, message, remedy, ...vars }) {
   return message ? `${message} ${remedy ?? ""}`.trim() : t("fault.unknown");
 }
 
+/** @type {(vars: {eye?: string, other?: string, slot?: string, [more: string]: any}) => Record<string, any>} */
 const translatedValues = ({ eye, other, slot, ...vars }) => ({
   ...vars,
   ...(eye ? { eye: t(`eye.${eye}`) } : {}),
@@ -140,13 +149,17 @@ const worstFirst = (one, other) => one.rank - other.rank;
 function consentAlerts({ route, visit }) {
   if (route.screen !== "aim" || visit?.id !== route.visit) return [];
   const known = ALERTS[`consent.${consentOf(visit)}`];
-  return known ? [{ ...known, from: "visit" }] : [];
+  return known ? [{ ...known, from: "visit", until: 0 }] : [];
 }
 
-/** Return at most one blocking alert and two chips, highest priority first, and a chip for each lost picture. */
+/**
+ * Return at most one blocking alert and two chips, highest priority first, and a chip for each lost picture.
+ * @param {State} state
+ * @returns {{stop: import("./state.js").Alert | null, chips: import("./state.js").Alert[]}}
+ */
 export function visibleAlerts(state) {
   const { alerts } = state;
-  const lost = lostShots(state).map((shot) => ({ ...shot, ...ALERTS["shot.lost"], assertive: true }));
+  const lost = lostShots(state).map((shot) => ({ ...shot, ...ALERTS["shot.lost"], assertive: true, from: "page", until: 0 }));
   return {
     stop: [...consentAlerts(state), ...alerts].sort(worstFirst).find(({ level }) => level === "stop") ?? null,
     chips: [...lost, ...alerts.filter(({ level }) => level === "tell").slice(0, 2)],

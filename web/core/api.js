@@ -5,6 +5,7 @@ import { t } from "../i18n/translate.js";
 
 /** Error answer of the server: code, message and remedy; "link.cut" when no answer came. */
 export class ApiError extends Error {
+  /** @param {{code: string, message?: string, remedy?: string, [more: string]: any}} answer */
   constructor({ code, message, remedy, ...vars }) {
     super(message);
     this.code = code;
@@ -44,7 +45,12 @@ export const fileStatus = async (url) => (await fetch(url, { cache: "no-store" }
 export const captureFileUrl = (capture, name) => `/api/captures/${encodeURIComponent(capture)}/${name}`;
 export const visitZipUrl = (visit) => `/api/visits/${encodeURIComponent(visit)}/export.zip`;
 
-/** Send a change with an idempotency key, so that a duplicated or repeated request has one effect. */
+/**
+ * Send a change with an idempotency key, so that a duplicated or repeated request has one effect.
+ * @param {string} method
+ * @param {string} path
+ * @param {Record<string, any>} [body]
+ */
 export function send(method, path, { key = newIdempotencyKey(), ...body } = {}) {
   return requestJson(path, {
     method,
@@ -109,7 +115,12 @@ function parseAim(header) {
   }
 }
 
-/** Return the URLs of the pictures of a capture: of the version with this number, or as taken for 0. */
+/**
+ * Return the URLs of the pictures of a capture: of the version with this number, or as taken for 0.
+ * @param {import("./state.js").Capture} capture
+ * @param {number} version
+ * @returns {Record<string, string>}
+ */
 export const pictureLinks = ({ links, versions = [] }, version) => versions.find(({ number }) => number === version) ?? links;
 
 /**
@@ -140,6 +151,7 @@ const EVENTS = ["beat", "state", "stage", "verdict", "kept", "failed", "aim", "n
  */
 export class EventStream {
   #handlers;
+  /** @type {EventSource | null} */
   #source = null;
   #lastEventMs = 0;
   #openedMs = 0;
@@ -163,9 +175,10 @@ export class EventStream {
   #open() {
     this.#close();
     this.#openedMs = performance.now();
-    this.#source = new EventSource("/api/events");
+    const source = new EventSource("/api/events");
+    this.#source = source;
     for (const type of EVENTS) {
-      this.#source.addEventListener(type, (event) => {
+      source.addEventListener(type, (event) => {
         this.#lastEventMs = performance.now();
         this.#setLink("live");
         this.#handlers[type]?.(event.data ? JSON.parse(event.data) : {});

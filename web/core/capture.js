@@ -94,7 +94,8 @@ function failShot(key, { code, message, remedy, vars }) {
 
 /** After a reconnection, fetch the result of each capture whose answer was lost. */
 export async function resolveCutShots() {
-  for (const { id, key } of get().shots.filter(({ answerLost, over }) => answerLost && !over)) {
+  for (const { id, key, answerLost, over } of get().shots) {
+    if (!id || !answerLost || over) continue;
     try {
       completeShot(await getCapture(id), key);
     } catch (problem) {
@@ -119,8 +120,8 @@ function completeShot(capture, key = shotById(capture.id)?.key) {
 // Optimistic update: show the picture in its tile until the visit is loaded.
 function updateSlot({ visit: id, slot: name }, capture, verdict) {
   const { visit } = get();
-  const slot = visit?.id === id ? visit.slots[name] : null;
-  if (!slot || slot.captures.includes(capture)) return;
+  const slot = visit?.slots[name];
+  if (!visit || visit.id !== id || !slot || slot.captures.includes(capture)) return;
   const captures = [...slot.captures, capture];
   const taken = { ...slot, state: "taken", capture, captures, verdict, tries: slot.tries + 1 };
   set({ visit: Object.freeze({ ...visit, slots: { ...visit.slots, [name]: taken } }) });
@@ -153,8 +154,8 @@ export const captureEventHandlers = {
   },
 
   kept(capture) {
-    const waiting = ({ id, over, visit, slot }) => !id && !over && visit === capture.visit && slot === capture.slot;
-    const shot = shotById(capture.id) ?? get().shots.find(waiting);
+    const shot =
+      shotById(capture.id) ?? get().shots.find(({ id, over, visit, slot }) => !id && !over && visit === capture.visit && slot === capture.slot);
     if (shot) completeShot(capture, shot.key);
     else if (capture.visit && capture.visit === get().visit?.id) refreshVisit(capture.visit);
   },
@@ -185,8 +186,8 @@ export async function openPicture(route) {
   }
 }
 
-// The address names a picture that does not belong to this visit: show an error and go to the patient.
-function rejectForeignCapture({ visit }, { test }) {
+/** Go to the patient and show an error: the address names a picture that does not belong to this visit. */
+export function rejectForeignCapture({ visit }, { test }) {
   navigate({ screen: "person", visit }, { replace: true });
   raiseAlert({ code: "capture.elsewhere", message: t(test ? "fault.test" : "fault.elsewhere"), remedy: "", from: "press" });
 }

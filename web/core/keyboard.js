@@ -11,16 +11,17 @@ const isTextField = (target) => target.closest("input, select, textarea");
 export function bindKeys(actions) {
   addEventListener("keydown", (event) => {
     if (event.defaultPrevented || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
-    if (document.querySelector("dialog[open]") || isTextField(event.target)) return;
+    const target = /** @type {Element} */ (event.target);
+    if (document.querySelector("dialog[open]") || isTextField(target)) return;
     const { route } = get();
     if (route.screen === "find" && onFind(event, actions)) return event.preventDefault(); // the Enter of a barcode reader must not press a button
     if (SHUTTER_KEYS.has(event.key)) {
-      if (route.screen !== "aim" || event.target.closest("button, a, summary, eye-pic")) return;
+      if (route.screen !== "aim" || target.closest("button, a, summary, eye-pic")) return;
       event.preventDefault();
       actions.take();
       return;
     }
-    if (get().letters && !event.target.closest("eye-pic")) onLetter(event, actions);
+    if (get().letters && !target.closest("eye-pic")) onLetter(event, actions);
   });
 }
 

@@ -47,6 +47,7 @@ export function routeHash({ screen, visit, day, ...more }) {
   return `#/visit/${[visit, screen, ...parts].map(encodeURIComponent).join("/")}`;
 }
 
+/** @type {(route: Route) => void} */
 let onRoute = () => {};
 
 /** Navigate to a route: push a history entry, or replace the current one. */

@@ -30,7 +30,43 @@ export const PICTURE_DEFAULTS = Object.freeze({
   asking: false,
 });
 
-export const store = createStore({
+const settings = Object.freeze({
+  voice: loadSetting("voice", ""), // speech language, if it differs from the page's
+  sound: loadSetting("sound", "on") === "on",
+  theme: loadSetting("theme", "dim"),
+  letters: loadSetting("letters", "on") === "on",
+  auto: loadSetting("auto", "off") === "on",
+  language: loadSetting("language", "en"),
+});
+
+/**
+ * What the page reads of the server's answers (`services/http/schemas/`), and its own captures and alerts.
+ * @typedef {{word: string, code?: string | null}} Verdict
+ * @typedef {{state: string, capture: string | null, captures: string[], verdict: Verdict | null, reason: string | null, tries: number}} Slot
+ * @typedef {{id: string, number: string, begun_at: string, fields: Record<string, any>, slots: Record<string, Slot>,
+ *   next_slot: string | null, outcome: {code: string, sentence: string} | null, finished_at: string | null,
+ *   undo_until: string | null, waiting?: string[]}} Visit
+ * @typedef {{id: string, visit: string | null, slot: string | null, eye: string, taken_at: string, verdict: Verdict | null,
+ *   simulated: boolean, report: any, links: Record<string, string>, versions?: any[], calibration_id: string, test: boolean}} Capture
+ * @typedef {{key: string, visit: string, slot: string, eye: string, id: string | null,
+ *   stage: {name: string, fraction: number, left: number}, verdict: Verdict | null, over?: boolean, quick?: string,
+ *   capture?: Capture, failed?: {code: string, message: string, remedy: string}, answerLost?: boolean, reloaded?: boolean}} Shot
+ * @typedef {{code: string, level: string, rank: number, buttons: string[], from: string, until: number, [more: string]: any}} Alert
+ * @typedef {{id: string, eye: string, field: string, required: boolean}} SlotPlan
+ * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, programme: Record<string, any>}} Protocol
+ * @typedef {{link: string, status: any, activity: string, hasControl: boolean, alerts: readonly Alert[],
+ *   route: import("./router.js").Route, protocol: Protocol | null, visit: Visit | null, visits: Visit[] | null,
+ *   counts: {done: number, to_finish: number, referred: number} | null, typed: string, listFilter: string,
+ *   shots: readonly Shot[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
+ *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: boolean, zoom: number, note: string,
+ *   picked: readonly string[], compared: readonly Capture[], montages: Readonly<Record<string, any>>,
+ *   folders: {id: string, name: string}[] | null, zipped: boolean, copied: string | null, outbox: any,
+ *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
+ *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
+ *   blink: boolean, front: number, code: {size: number, path: string} | undefined}} State
+ */
+
+export const store = createStore(/** @type {State} */ ({
   link: "opening", // opening | live | lost
   status: null,
   activity: "aim", // state of the instrument, as in its status
@@ -60,17 +96,19 @@ export const store = createStore({
   modules: Object.freeze({}), // lazily loaded modules, by name
   speech: null, // sentences for the patient: {tag, words, hasVoice}, see speech.js
   saying: null, // {key, why}: the sentence, and why it was not spoken
-  voice: loadSetting("voice", ""), // speech language, if it differs from the page's
-  sound: loadSetting("sound", "on") === "on",
-  theme: loadSetting("theme", "dim"),
-  letters: loadSetting("letters", "on") === "on",
-  auto: loadSetting("auto", "off") === "on",
-  language: loadSetting("language", "en"),
-});
+  ...settings,
+  timer: 0, // end of the rest of a small pupil, in milliseconds
+  blink: false, // the compared pictures lie one over the other
+  front: 0, // which of them is in front
+  code: undefined, // QR code of the outcome, while it is shown
+}));
 
 export const { get, set } = store;
 
-/** Return the shot on the picture screen: the named capture, or the newest of the slot. */
+/**
+ * Return the shot on the picture screen: the named capture, or the newest of the slot.
+ * @param {State} state
+ */
 export function currentShot({ route, shots }) {
   if (route.screen !== "picture") return null;
   const here = shots.filter((shot) => shot.visit === route.visit && shot.slot === route.slot);
@@ -78,14 +116,21 @@ export function currentShot({ route, shots }) {
   return here.findLast((shot) => !shot.failed) ?? here.at(-1) ?? null;
 }
 
-/** Return the shots of a visit that are still in progress. */
+/**
+ * Return the shots of a visit that are still in progress.
+ * @param {State} state
+ * @param {string} visit
+ */
 export const pendingShots = ({ shots }, visit) => shots.filter((shot) => shot.visit === visit && !shot.over);
 
 /** Move a shot to a slot of the other eye. */
 export const moveShot = (id, { id: slot, eye }) =>
   set({ shots: Object.freeze(get().shots.map((shot) => (shot.id === id ? Object.freeze({ ...shot, slot, eye }) : shot))) });
 
-/** Return the failed shots of the open visit, each until its slot gets another shot or is marked "could not". */
+/**
+ * Return the failed shots of the open visit, each until its slot gets another shot or is marked "could not".
+ * @param {State} state
+ */
 export function lostShots({ shots, visit }) {
   if (!visit || visit.finished_at) return [];
   const of = ({ slot }) => shots.filter((shot) => shot.visit === visit.id && shot.slot === slot);
@@ -94,12 +139,33 @@ export function lostShots({ shots, visit }) {
   );
 }
 
-/** Return the consent of a visit: "agreed", "declined" or "missing"; "saving" while a change is being sent. */
+/**
+ * Return the consent of a visit: "agreed", "declined" or "missing"; "saving" while a change is being sent.
+ * @param {Visit} visit
+ */
 export const consentOf = ({ fields, waiting }) => (waiting?.includes("consent") ? "saving" : (fields.consent ?? "missing"));
 
-/** Return whether captures are allowed for the visit on this screen; the server refuses all others. */
-export const allowsLight = ({ route, visit }) => Boolean(visit) && visit.id === route.visit && consentOf(visit) === "agreed";
+/**
+ * Return whether captures are allowed for the visit on this screen; the server refuses all others.
+ * @param {State} state
+ */
+export const allowsLight = ({ route, visit }) => visit !== null && visit.id === route.visit && consentOf(visit) === "agreed";
 
-/** Return the definition of a slot in the programme: {id, eye, field}. */
+/**
+ * Return the definition of a slot in the programme.
+ * @param {State} state
+ * @param {string | null | undefined} id
+ */
 export const slotPlan = ({ protocol }, id) => protocol?.slots.find((slot) => slot.id === id) ?? null;
+/**
+ * Return the definition of the slot with the same field of the other eye.
+ * @param {State} state
+ * @param {string | null | undefined} id
+ */
+export function otherEyeSlot(state, id) {
+  const here = slotPlan(state, id);
+  return state.protocol?.slots.find(({ eye, field }) => eye !== here?.eye && field === here?.field) ?? null;
+}
+
+/** @type {(state: State, slot: string | null | undefined) => string} */
 export const eyeOf = (state, slot) => slotPlan(state, slot)?.eye ?? "OD";

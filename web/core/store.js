@@ -1,12 +1,14 @@
 // State store: one frozen object and its listeners.
 
 /**
- * @template {object} T
+ * @template {Record<string, any>} T
  * @param {T} initial
  */
 export function createStore(initial) {
+  /** @type {Readonly<T>} */
   let state = Object.freeze({ ...initial });
   let scheduled = false;
+  /** @type {Set<(state: Readonly<T>) => void>} */
   const listeners = new Set();
 
   const notify = () => {
@@ -17,7 +19,10 @@ export function createStore(initial) {
   return {
     get: () => state,
 
-    /** Merge `patch` into the state and notify the listeners once, in a microtask: many changes cause one render. */
+    /**
+     * Merge `patch` into the state and notify the listeners once, in a microtask: many changes cause one render.
+     * @param {Partial<T>} patch
+     */
     set(patch) {
       if (Object.keys(patch).every((key) => Object.is(patch[key], state[key]))) return;
       state = Object.freeze({ ...state, ...patch });
@@ -27,6 +32,7 @@ export function createStore(initial) {
       }
     },
 
+    /** @param {(state: Readonly<T>) => void} listener */
     subscribe(listener) {
       listeners.add(listener);
       return () => listeners.delete(listener);

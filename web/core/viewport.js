@@ -20,6 +20,17 @@ export function homeBox(head, width, height) {
   return { width, height, disc: Math.min(width, height) };
 }
 
+/**
+ * Return the 2-D context of a canvas.
+ * @param {HTMLCanvasElement} canvas
+ * @param {CanvasRenderingContext2DSettings} [options]
+ */
+export function context2d(canvas, options) {
+  const context = canvas.getContext("2d", options);
+  if (!context) throw new Error("this canvas has no 2-D context");
+  return context;
+}
+
 /** Match the canvas to its size on the screen in device pixels; false if it is not visible. */
 export function fitCanvas(canvas) {
   const ratio = Math.min(devicePixelRatio || 1, 2); // a higher ratio costs time without visible gain

@@ -1,7 +1,7 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
 import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
-import { eyeOf, get, lostShots, moveShot, set, pendingShots } from "./state.js";
+import { eyeOf, get, lostShots, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
 import { navigate } from "./router.js";
 import { lowerAlerts, raiseAlert } from "./alerts.js";
 
@@ -72,6 +72,7 @@ let unsaved = []; // {visit, field, value, key}
 /** Set a form field at once and send the change. */
 export async function setField(field, value) {
   const { visit } = get();
+  if (!visit) return;
   const change = { visit: visit.id, field, value, key: newIdempotencyKey() };
   unsaved = [...unsaved.filter((other) => other.visit !== visit.id || other.field !== field), change];
   set({ visit: withUnsaved(visit) });
@@ -120,13 +121,13 @@ const change = (what, body) =>
 /** Mark a slot as "could not"; a chip offers undo for ten seconds. */
 export async function couldNot(slot, reason) {
   set({ asking: false });
-  const { visit, protocol } = get();
+  const { visit } = get();
+  if (!visit) return;
   const before = visit.slots[slot].capture;
   if (!(await change("could-not", { slot, reason }))) return;
   navigate({ screen: "aim", visit: visit.id, slot: nextSlot(slot) ?? slot });
-  const { eye } = protocol.slots.find(({ id }) => id === slot);
   lowerAlerts("shot.crossed");
-  raiseAlert({ code: "shot.crossed", visit: visit.id, slot, eye, before, from: "page" });
+  raiseAlert({ code: "shot.crossed", visit: visit.id, slot, eye: eyeOf(get(), slot), before, from: "page" });
 }
 
 /** Undo "could not". */
@@ -151,9 +152,7 @@ export const useInSlot = (slot, capture) => change("slots", { slot, capture });
 
 /** Move a picture to the slot of the same field of the other eye. */
 export async function moveToOtherEye(slot, capture) {
-  const { protocol } = get();
-  const from = protocol.slots.find(({ id }) => id === slot);
-  const to = protocol.slots.find(({ eye, field }) => field === from.field && eye !== from.eye);
+  const to = otherEyeSlot(get(), slot);
   if (!to) return;
   const visit = await alertOnError(() => send("POST", `/api/captures/${encodeURIComponent(capture)}/eye`, { eye: to.eye }));
   if (!visit) return;
@@ -202,6 +201,7 @@ export async function retryUploads(visit) {
 /** Finish the visit; while a capture is in progress, show its progress first and finish afterwards. */
 export async function finish() {
   const { visit } = get().route;
+  if (!visit) return;
   lowerAlerts("shot.crossed"); // undo would need a reopened visit
   if (pendingShots(get(), visit).length) {
     navigate({ screen: "outcome", visit });

@@ -90,6 +90,7 @@ export function number(value, digits = 1) {
 
 /** Format a number with its sign and that many decimals; zero has no sign. */
 export function signed(value, digits = 2) {
+  /** @type {Intl.NumberFormatOptions} */
   const form = { signDisplay: "exceptZero", minimumFractionDigits: digits, maximumFractionDigits: digits };
   return new Intl.NumberFormat(language, form).format(value);
 }

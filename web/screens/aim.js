@@ -7,11 +7,14 @@ import { visibleAlerts, timeLeft } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { has, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
+/** @param {State} state */
 export function aim(state, actions) {
   const { eye, part } = slotLabel(state, state.route.slot);
   if (state.asking) return html`<h2 class="slot-title">${eye} · ${part}</h2> ${reasons(state, actions)} ${tiles(state, actions)}`;
   const answered = Object.values(state.visit?.slots ?? {}).every((slot) => slot.state !== "empty");
-  const here = state.visit?.slots[state.route.slot];
+  const here = state.visit?.slots[state.route.slot ?? ""];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
     ${tiles(state, actions)} ${state.modules.speech?.speechButtons(state) ?? nothing} ${chips(state, actions)}
@@ -30,6 +33,7 @@ export function aim(state, actions) {
   `;
 }
 
+/** @param {State} state */
 function shutter(state, actions) {
   const { eye, part } = slotLabel(state, state.route.slot);
   const [name, text] = shutterFace(state);
@@ -40,6 +44,7 @@ function shutter(state, actions) {
   `;
 }
 
+/** @param {State} state */
 function shutterFace(state) {
   const { stop } = visibleAlerts(state);
   if (stop) {

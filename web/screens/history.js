@@ -10,12 +10,15 @@ import { displayNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, isoDay, t, today } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
 const FILTERS = {
   all: () => true,
   open: ({ finished_at: end }) => !end,
   referred: ({ outcome }) => Boolean(outcome?.code.startsWith("refer")),
 };
 
+/** @param {State} state */
 export function history(state, actions) {
   const { visits, listFilter, route, status } = state;
   const filters = status?.sending ? [...Object.keys(FILTERS), "waiting"] : Object.keys(FILTERS);
@@ -51,6 +54,7 @@ const shiftDay = (day, days) => {
 
 // ---- pictures of one patient
 
+/** @param {State} state */
 export function film(state, actions) {
   const { visit, picked } = state;
   if (!visit) return nothing;
@@ -58,9 +62,9 @@ export function film(state, actions) {
   return html`
     <section class="film">
       <h2>${t("film.title", { number: displayNumber(visit.number) })}</h2>
-      ${visit.outcome ? html`<p>${outcomeTexts(state).filter(Boolean).join(" · ")}</p>` : nothing}
+      ${visit.outcome ? html`<p>${outcomeTexts(visit.outcome, state.language).filter(Boolean).join(" · ")}</p>` : nothing}
       ${taken.length ? html`<ul>${taken.map((one) => captureItem(state, actions, one))}</ul>` : html`<p>${t("film.none")}</p>`}
-      ${Object.entries(state.montages).map(([eye, made]) => montage(state, actions, eye, made))}
+      ${Object.entries(state.montages).map(([eye, made]) => montage(visit, actions, eye, made))}
       <div class="ends">
         ${picked.length === 2
           ? html`<button class="primary" type="button" id="compare" @click=${actions.compare}>${t("film.compare")}</button>`
@@ -73,24 +77,30 @@ export function film(state, actions) {
               ${t("home.continue", { number: displayNumber(visit.number) })}
             </button>`}
       </div>
-      ${taken.length ? exportControls(state, actions) : nothing}
+      ${taken.length ? exportControls(visit, state, actions) : nothing}
     </section>
   `;
 }
 
-/** Return eye, field and, of several, the number of a capture. */
+/**
+ * Return eye, field and, of several, the number of a capture.
+ * @param {State} state
+ */
 function captureLabel(state, id) {
-  const [slot, { captures }] = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id)) ?? [];
-  if (!slot) return "";
+  const found = Object.entries(state.visit?.slots ?? {}).find(([, one]) => one.captures.includes(id));
+  if (!found) return "";
+  const [slot, { captures }] = found;
   return t(captures.length > 1 ? "film.name.n" : "film.name", { ...slotLabel(state, slot), n: captures.indexOf(id) + 1 });
 }
 
 /** Return whether this capture, of several, is the one in use. */
 const isUsed = ({ visit }, id) =>
   Object.values(visit?.slots ?? {}).some(({ capture, captures }) => capture === id && captures.length > 1);
+/** @param {State} state */
 const usedMark = (state, id) =>
   isUsed(state, id) ? html`<span class="used">${icon("check")} ${t("film.used")}</span>` : nothing;
 
+/** @param {State} state */
 function captureItem(state, actions, { slot, id }) {
   const on = state.picked.includes(id);
   return html`<li>
@@ -104,8 +114,11 @@ function captureItem(state, actions, { slot, id }) {
   </li>`;
 }
 
-/** Montage of one eye: the joined pictures, or the reason why there are none; nothing without pictures of this eye. */
-function montage({ visit }, actions, eye, { state, digest, pictures, placed }) {
+/**
+ * Montage of one eye: the joined pictures, or the reason why there are none; nothing without pictures of this eye.
+ * @param {import("../core/state.js").Visit} visit
+ */
+function montage(visit, actions, eye, { state, digest, pictures, placed }) {
   if (!pictures) return nothing;
   const used = placed.filter((one) => one.used).length;
   const text = t(`montage.${state}`, { n: used });
@@ -123,7 +136,11 @@ function montage({ visit }, actions, eye, { state, digest, pictures, placed }) {
   </figure>`;
 }
 
-function exportControls({ visit, folders, copied, zipped }, actions) {
+/**
+ * @param {import("../core/state.js").Visit} visit
+ * @param {State} state
+ */
+function exportControls(visit, { folders, copied, zipped }, actions) {
   const message = copied ? t("film.copied", { folder: copied }) : folders?.length === 0 ? t("film.nofolder") : "";
   return html`
     <div class="ends">
@@ -141,6 +158,7 @@ function exportControls({ visit, folders, copied, zipped }, actions) {
 
 // ---- comparison: side by side, or one over the other
 
+/** @param {State} state */
 export function compare(state, actions) {
   const { blink, redfree, loupe, route, front = 0 } = state;
   return html`
@@ -168,6 +186,7 @@ export function compare(state, actions) {
   `;
 }
 
+/** @param {State} state */
 function comparedPicture(state, actions, i) {
   const { route, status, blink, front = 0, redfree, loupe } = state;
   const id = [route.capture, route.other][i];

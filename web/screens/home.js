@@ -7,6 +7,9 @@ import { displayNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { clockTime, LANGUAGES, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
+/** @param {State} state */
 export function home(state, actions) {
   const { visits, counts, status } = state;
   const unfinished = (visits ?? []).find((visit) => !visit.finished_at);
@@ -41,6 +44,7 @@ const sendingButton = ({ sent, waiting }, actions) =>
     ${icon(waiting ? "wait" : "check")} <span>${t("home.sent", { n: sent })} · ${t("home.waiting", { n: waiting })}</span>
   </button>`;
 
+/** @param {State} state */
 function languages({ language }, actions) {
   const draft = LANGUAGES[language]?.draft;
   const options = Object.entries(LANGUAGES).map(([tag, { name }]) => [tag, name]);
@@ -53,6 +57,7 @@ function languages({ language }, actions) {
   `;
 }
 
+/** @param {State} state */
 export function find({ typed, visits }, actions) {
   const found = (visits ?? []).filter(({ number }) => number.includes(typed) || displayNumber(number).includes(typed)).slice(0, 20);
   const [one] = typed ? found : [];

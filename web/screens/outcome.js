@@ -9,16 +9,20 @@ import { displayNumber } from "../core/numbers.js";
 import { html, nothing, svg } from "../vendor/lit-html.js";
 import { calendarDay, clockTime, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
+/** @param {State} state */
 export function outcome(state, actions) {
   const { visit } = state;
   if (!visit) return nothing;
-  if (state.finishing === visit.id) return pendingPictures(state, actions);
+  if (state.finishing === visit.id) return pendingPictures(visit, state, actions);
   if (!visit.outcome) return unfinishedVisit(actions, visit);
+  const [headline, sentence] = outcomeTexts(visit.outcome, state.language);
   return html`
     <section class="outcome" data-outcome=${visit.outcome.code}>
       <h2>${t("outcome.title", { number: displayNumber(visit.number) })}</h2>
-      <p class="verdict">${icon(outcomeIcon(visit.outcome))} ${outcomeTexts(state)[0]}</p>
-      <p>${outcomeTexts(state)[1]} ${state.status?.sending || visit.outcome.code !== "send" ? nothing : t("outcome.copy")}</p>
+      <p class="verdict">${icon(outcomeIcon(visit.outcome))} ${headline}</p>
+      <p>${sentence} ${state.status?.sending || visit.outcome.code !== "send" ? nothing : t("outcome.copy")}</p>
       ${state.status?.sending ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, actions)}
       <div class="ends">
         <button type="button" id="print" @click=${actions.print}>${t("outcome.print")}</button>
@@ -31,7 +35,7 @@ export function outcome(state, actions) {
           ${t("outcome.done")}
         </button>
       </div>
-      ${state.code ? qrFigure(state.code) : nothing} ${slip(state)}
+      ${state.code ? qrFigure(state.code) : nothing} ${slip(visit, [headline, sentence], state)}
     </section>
   `;
 }
@@ -43,8 +47,12 @@ export const reopenButton = ({ undo_until: allowed }, actions) =>
     : nothing;
 
 // The outcome is known only after the last capture; until then its progress is shown.
-function pendingPictures(state, actions) {
-  const shots = pendingShots(state, state.visit.id);
+/**
+ * @param {import("../core/state.js").Visit} visit
+ * @param {State} state
+ */
+function pendingPictures(visit, state, actions) {
+  const shots = pendingShots(state, visit.id);
   return html`<section class="outcome" id="finishing">
     <h2>${icon("wait")} ${t("outcome.making", { n: Math.max(1, shots.length) })}</h2>
     ${shots.map(
@@ -67,7 +75,7 @@ function unfinishedVisit(actions, visit) {
 }
 
 /** Return the outcome's texts: the server's English sentence, preceded by the translated outcome in other languages. */
-export const outcomeTexts = ({ visit: { outcome: { code, sentence } }, language }) => {
+export const outcomeTexts = ({ code, sentence }, language) => {
   if (language === "en") return [sentence, ""];
   return [t(`outcome.${code}`), code === "send" ? "" : sentence]; // the sentence adds nothing here
 };
@@ -82,15 +90,19 @@ function qrFigure({ size, path }) {
 }
 
 // Shown only in print.
-function slip(state) {
-  const { visit, protocol, code: drawn } = state;
+/**
+ * @param {import("../core/state.js").Visit} visit
+ * @param {string[]} texts
+ * @param {State} state
+ */
+function slip(visit, [headline, sentence], { protocol, code: drawn }) {
   const phone = protocol?.programme?.centre_phone;
   const moment = visit.finished_at ?? visit.begun_at;
   return html`<section class="slip" aria-hidden="true">
     <p class="slip-number">${patientLabel(visit)}</p>
     <p>${calendarDay(moment)}, ${clockTime(moment)}</p>
-    <p class="slip-outcome">${outcomeTexts(state)[0]}</p>
-    <p>${outcomeTexts(state)[1]}</p>
+    <p class="slip-outcome">${headline}</p>
+    <p>${sentence}</p>
     ${phone ? html`<p>${t("outcome.phone", { phone })}</p>` : nothing} ${drawn ? qrFigure(drawn) : nothing}
   </section>`;
 }

@@ -14,11 +14,16 @@ import { isExamScreen, pictureArea } from "../components/picture_area.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { has, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
 const SPACE_PLENTY = 200; // patients; weeks of screening
 
 const SCREENS = { home, find, person, aim, picture, outcome };
 
-/** Template of the whole exam page. */
+/**
+ * Template of the whole exam page.
+ * @param {State} state
+ */
 export function page(state, actions) {
   const { modules, route } = state;
   const screen = (SCREENS[route.screen] ?? modules.history?.[route.screen] ?? modules.send?.[route.screen])?.(state, actions) ?? nothing;
@@ -38,13 +43,17 @@ export function page(state, actions) {
   `;
 }
 
-/** Return the phase of the picture screen: making, assessed (with a verdict) or kept. */
+/**
+ * Return the phase of the picture screen: making, assessed (with a verdict) or kept.
+ * @param {State} state
+ */
 function phase(state) {
   const shot = currentShot(state);
   if (!shot) return "";
   return shot.over ? "kept" : shot.verdict ? "assessed" : "making";
 }
 
+/** @param {State} state */
 function topAlertBar(state, actions) {
   const stop = topAlert(state);
   return stop ? alertBar(stop, actions) : nothing;
@@ -52,6 +61,7 @@ function topAlertBar(state, actions) {
 
 // ---- header
 
+/** @param {State} state */
 function header(state, actions) {
   const { status, link, route, visit } = state;
   const word = link === "live" ? shownActivity(state) : link;
@@ -100,6 +110,7 @@ function kindChip(kind) {
 
 // ---- menu
 
+/** @param {State} state */
 function menu({ theme, letters, auto, sound, status }, actions) {
   return html`
     <dialog id="menu" aria-labelledby="menu-title">

@@ -6,6 +6,8 @@ import { applyKey } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
 const VISION_LEVELS = ["6/6", "6/9", "6/12", "6/18", "6/24", "6/36", "6/60", "CF", "HM", "LP", "NLP"];
 const visionOption = (value) => [value, value.startsWith("6/") ? value : t(`vision.${value}`)];
 const options = (prefix, values) => values.map((value) => [value, t(`${prefix}.${value}`)]);
@@ -29,6 +31,7 @@ const QUESTIONS = [
 const isDrops = (name) => name.startsWith("drops_");
 const fieldValue = (name, one) => (isDrops(name) ? (one ? new Date().toISOString() : null) : one);
 
+/** @param {State} state */
 export function person(state, actions) {
   const { visit, modules } = state;
   if (!visit) return nothing;
@@ -45,16 +48,20 @@ export function person(state, actions) {
         options: options("consent", ["agreed", "declined"]),
         choose: (value) => actions.setField("consent", value),
       })}
-      ${startButton(state, actions)}
+      ${startButton(visit, state, actions)}
       <p class="muted" id="unsaved">${waiting.length ? t("save.waiting") : ""}</p>
       <h2>${t("person.details")}</h2>
-      <div class="questions">${questions.map(([name, answers]) => question(state, actions, name, answers))}</div>
-      ${textFields(state, actions)}
+      <div class="questions">${questions.map(([name, answers]) => question(visit, actions, name, answers))}</div>
+      ${textFields(visit, actions)}
     </section>
   `;
 }
 
-function startButton({ visit, protocol }, actions) {
+/**
+ * @param {import("../core/state.js").Visit} visit
+ * @param {State} state
+ */
+function startButton(visit, { protocol }, actions) {
   const { consent } = visit.fields;
   const any = Object.values(visit.slots).some(({ captures }) => captures.length);
   if (consent === "declined") {
@@ -77,7 +84,8 @@ function startButton({ visit, protocol }, actions) {
   </div>`;
 }
 
-function question({ visit }, actions, name, answers) {
+/** @param {import("../core/state.js").Visit} visit */
+function question(visit, actions, name, answers) {
   const label = t(`field.${name}`);
   const value = visit.fields[name];
   if (name === "age") return age(value, actions);
@@ -115,7 +123,8 @@ function age(value, actions) {
   `;
 }
 
-function textFields({ visit }, actions) {
+/** @param {import("../core/state.js").Visit} visit */
+function textFields(visit, actions) {
   const box = (name, type) => html`
     <label class="typing">
       <span>${t(`field.${name}`)}</span>

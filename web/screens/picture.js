@@ -10,12 +10,15 @@ import { html, nothing } from "../vendor/lit-html.js";
 import { nextSlot } from "../core/visit.js";
 import { number, t } from "../i18n/translate.js";
 
+/** @typedef {import("../core/state.js").State} State */
+
+/** @param {State} state */
 export function picture(state, actions) {
   const shot = currentShot(state);
   if (!shot) return html`<div class="card making"><p>${t("mark.opening")}</p></div>`;
   if (state.asking) return html`${reasons(state, actions)} ${tiles(state, actions)}`;
   return html`
-    ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions, shot)} ${tiles(state, actions)}
+    ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions, shot.capture)} ${tiles(state, actions)}
     ${chips(state, actions)}
     <div class="actions">${actionButtons(state, actions, shot)}</div>
     ${shot.capture ? (state.modules.details?.detailsDialog(state, actions, shot) ?? nothing) : nothing}
@@ -34,11 +37,13 @@ function triesOf({ visit }, shot) {
   return (slot?.tries ?? 0) + (slot?.captures.includes(shot.id) ? 0 : 1);
 }
 
+/** @param {State} state */
 const exhausted = (state, shot) =>
   shot.verdict?.code === "shot.poor" || triesOf(state, shot) > (state.protocol?.retakes ?? 2);
 
 // ---- card: same height with and without a verdict, so that the layout does not shift
 
+/** @param {State} state */
 function card(state, actions, shot) {
   if (!shot.verdict && !shot.over) return makingCard(shot);
   const side = state.alerts.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
@@ -63,6 +68,7 @@ function detailsButton(actions, { report }) {
   </button>`;
 }
 
+/** @param {State} state */
 function verdictText(state, shot) {
   if (shot.failed) return ["warn", t("verdict.again"), alertText(shot.failed)];
   if (shot.verdict?.word === "good") {
@@ -74,6 +80,7 @@ function verdictText(state, shot) {
   return ["pen", t("verdict.again"), cause];
 }
 
+/** @param {State} state */
 function timer(state, actions, shot) {
   if (shot.verdict?.code !== "shot.pupil" || exhausted(state, shot)) return null;
   const left = timeLeft(state.timer);
@@ -99,7 +106,8 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 
 // ---- tools
 
-function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions, { capture }) {
+/** @param {State} state */
+function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions, capture) {
   const step = (tool, label, by) => html`
     <div class="step" role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
@@ -136,6 +144,7 @@ function versions(value, actions, capture) {
 
 // ---- buttons: the verdict selects the primary one
 
+/** @param {State} state */
 function actionButtons(state, actions, shot) {
   if (state.visit?.finished_at) return button(actions.backToOutcome, "result", "left", "result.seen");
   if (!shot.verdict && !shot.over) {
@@ -163,6 +172,7 @@ const button = (click, id, name, word, primary = false) => html`
   <button class=${primary ? "primary" : ""} type="button" id=${id} @click=${click}>${icon(name)} <span>${t(word)}</span></button>
 `;
 
+/** @param {State} state */
 function next(state, actions, primary) {
   const slot = nextSlot(state.route.slot);
   const waits = !slot && state.shots.some((shot) => shot.visit === state.route.visit && !shot.over);

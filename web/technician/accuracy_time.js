@@ -3,7 +3,7 @@
 
 import { html, render, svg } from "../vendor/lit-html.js";
 import { ApiError } from "../core/api.js";
-import "../components/viewer/viewer.js";
+import { viewersOf } from "../components/viewer/viewer.js";
 import { clockTime, number, t } from "../i18n/translate.js";
 
 const WIDTH = 720, HEIGHT = 400, LEFT = 64, RIGHT = 16, TOP = 16, BELOW = 56;
@@ -13,6 +13,7 @@ const ZOOMS = [1, 2, 4];
 const ALL = Object.freeze({ zoom: 1, u: 0, v: 0 });
 
 class AccuracyTime extends HTMLElement {
+  /** @type {Record<string, any>} */
   #state = { explorer: null, head: null, captures: [], capture: null, point: null, recomputed: null, viewport: ALL, all: false, alert: null };
   #timer = 0;
 
@@ -31,7 +32,7 @@ class AccuracyTime extends HTMLElement {
 
   // Synchronise the views of the two pictures.
   #setView(viewport, from = null) {
-    for (const pic of this.querySelectorAll("eye-pic")) if (pic !== from) pic.view = viewport;
+    for (const pic of viewersOf(this)) if (pic !== from) pic.view = viewport;
     this.#set({ viewport });
   }
 
@@ -100,9 +101,11 @@ customElements.define("accuracy-time", AccuracyTime);
 
 const recentCaptures = async () => (await (await request("GET", "/api/captures?limit=12")).json()).captures;
 const fetchStatus = async () => (await request("GET", "/api/status")).json();
+/** @type {(method: string, resource?: string, body?: object) => Promise<any>} */
 const fetchTechnician = async (method, resource = "explorer", body = undefined) => (await request(method, `/api/technician/${resource}`, body)).json();
 
 async function request(method, path, body) {
+  /** @type {RequestInit} */
   const options = { method, cache: "no-store" };
   if (body) Object.assign(options, { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   const response = await fetch(path, options);

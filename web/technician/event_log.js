@@ -30,7 +30,8 @@ class EventLog extends HTMLElement {
 
   async #load() {
     const { about } = this.#state;
-    const query = about ? { limit: 300, about } : { limit: 300 };
+    /** @type {Record<string, string>} */
+    const query = about ? { limit: "300", about } : { limit: "300" };
     const answer = await this.#request(`/api/technician/diary?${new URLSearchParams(query)}`);
     if (answer) this.#set({ entries: answer.entries, error: "" });
   }

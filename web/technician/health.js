@@ -13,10 +13,12 @@ const POLL_MS = 5000;
 
 class InstrumentHealth extends HTMLElement {
   #timer = 0;
-  #abort = null;
+  #abort = new AbortController();
+  /** @type {any} */
   #health = null; // latest answer of the server, or null
   #large = ""; // the check that was not spoken and is shown in large letters
   #status = { name: "", version: "" };
+  /** @type {{size: number, path: string} | null} */
   #code = null; // QR code of the report, while visible
   #message = "";
 

@@ -1,6 +1,7 @@
 // <bench-live>: raw sensor counts while a technician centres a source. Frames are pulled one by one, so a slow
 // connection lowers the frame rate and not the freshness.
 
+import { context2d } from "../core/viewport.js";
 import { t } from "../i18n/translate.js";
 
 const RETRY_MS = 500;
@@ -11,6 +12,7 @@ const delay = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 class SensorPreview extends HTMLElement {
   #active = false;
   #running = false;
+  /** @type {ImageBitmap | null} */
   #bitmap = null;
   #number = 0;
   #canvas = document.createElement("canvas");
@@ -54,7 +56,7 @@ class SensorPreview extends HTMLElement {
       this.#bitmap = await createImageBitmap(await response.blob());
       old?.close();
       this.#empty.textContent = "";
-      this.dataset.frame = this.#number;
+      this.dataset.frame = String(this.#number);
       this.#draw();
       const level = (name) => Number(response.headers.get(`X-${name}`));
       const detail = {
@@ -76,7 +78,7 @@ class SensorPreview extends HTMLElement {
     const zoom = Math.min(canvas.width / bitmap.width, canvas.height / bitmap.height);
     const [wide, high] = [bitmap.width * zoom, bitmap.height * zoom];
     const [left, top] = [(canvas.width - wide) / 2, (canvas.height - high) / 2];
-    const context = canvas.getContext("2d");
+    const context = context2d(canvas);
     context.drawImage(bitmap, left, top, wide, high);
     const [x, y, arm] = [canvas.width / 2, canvas.height / 2, Math.min(wide, high) * 0.2];
     context.lineWidth = 2 * scale;

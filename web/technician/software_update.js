@@ -12,8 +12,10 @@ const MAY_RESTART = ["installing", "restarting", "trying"]; // states in which a
 const NEWS_SHOWN = 5;
 
 class SoftwareUpdate extends HTMLElement {
+  /** @type {Record<string, any>} */
   #state = { status: null, waiting: 0, lost: false, alert: null, sent: null };
   #timer = 0;
+  /** @type {XMLHttpRequest | null} */
   #uploadRequest = null;
   #ignoreTapsUntil = 0;
 

@@ -15,7 +15,7 @@ const ACTIVITY_MS = 30_000; // at most one activity report in this time
 
 useLanguage("en", TECHNICIAN);
 
-const store = createStore({
+const store = createStore(/** @type {Record<string, any>} */ ({
   view: "opening", // opening | door | overview | wizard | done | lenses | lens-result
   section: "calibration", // section of the overview
   cal: null, // latest calibration state of the server
@@ -29,7 +29,7 @@ const store = createStore({
   busy: false,
   lost: false,
   theme: loadSetting("theme", "dim"),
-});
+}));
 const { get, set } = store;
 let ignoreTapsUntil = 0;
 let activityMs = 0;
@@ -39,6 +39,7 @@ let dismissedLenses = readStorage("dismissed.lenses");
 // ---- requests
 
 async function request(path, body) {
+  /** @type {RequestInit} */
   const init = { cache: "no-store", signal: AbortSignal.timeout(60_000) };
   if (body !== undefined) {
     Object.assign(init, {
@@ -261,7 +262,7 @@ function readStorage(key, where = sessionStorage) {
 
 function renderPage(state) {
   document.documentElement.dataset.theme = state.theme;
-  render(technicianPage(state, actions), document.querySelector("#app"));
+  render(technicianPage(state, actions), /** @type {HTMLElement} */ (document.querySelector("#app")));
 }
 
 store.subscribe(renderPage);

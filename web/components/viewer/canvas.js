@@ -37,7 +37,7 @@ export function drawLoupe(context, shown, { u, v, width, height, loupe }) {
   context.fill();
   drawPicture(context, shown, { u: loupe.u, v: loupe.v, width: width * LOUPE_ZOOM, height: height * LOUPE_ZOOM }, centre);
   context.restore();
-  for (const [colour, line] of [["#000", 5], ["#fff", 2]]) {
+  for (const [colour, line] of /** @type {[string, number][]} */ ([["#000", 5], ["#fff", 2]])) {
     context.strokeStyle = colour; // white on black is visible on every picture
     context.lineWidth = line * unit;
     context.stroke();

@@ -1,6 +1,8 @@
 // Brightness lookup table of 256 entries for the image tools. Both renderers use the same table, so their pictures are
 // equal.
 
+import { context2d } from "../../core/viewport.js";
+
 const CONTRAST_STEP = 1.25; // contrast: slope factor per step
 const BRIGHTNESS_STEP = 1.2; // brightness: exponent factor per step; black and white stay fixed
 const ANALYSIS_SIDE = 256;
@@ -30,7 +32,7 @@ export function downscaled(picture, side) {
   const scale = Math.min(1, side / Math.max(picture.width, picture.height));
   const canvas = document.createElement("canvas");
   Object.assign(canvas, { width: Math.round(picture.width * scale), height: Math.round(picture.height * scale) });
-  const context = canvas.getContext("2d", { willReadFrequently: true, alpha: false });
+  const context = context2d(canvas, { willReadFrequently: true, alpha: false });
   context.drawImage(picture, 0, 0, canvas.width, canvas.height);
   return canvas;
 }
@@ -38,7 +40,7 @@ export function downscaled(picture, side) {
 /** Return the mean green value of the illuminated pixels (`pivot`) and whether the picture is grey. */
 export function analyse(picture) {
   const copy = downscaled(picture, ANALYSIS_SIDE);
-  const { data } = copy.getContext("2d").getImageData(0, 0, copy.width, copy.height);
+  const { data } = context2d(copy).getImageData(0, 0, copy.width, copy.height);
   let sum = 0;
   let count = 1;
   let grey = true;

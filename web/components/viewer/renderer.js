@@ -12,7 +12,9 @@ const SIDE_MAX = 2048; // supported by every WebGL2 device, and fast enough in J
  * canvas.
  */
 export class PictureRenderer extends EventTarget {
+  /** @type {Map<any, any>} */
   #cache = new Map(); // picture -> analysis, handle, and the last output with its tools
+  /** @type {any} */
   #renderer;
 
   /** `open` returns a WebGL2 context or null. */

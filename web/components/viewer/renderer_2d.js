@@ -1,5 +1,7 @@
 // Renderer on the 2-D canvas: applies the lookup table to each pixel in JavaScript, three channels at once.
 
+import { context2d } from "../../core/viewport.js";
+
 /** Renderer that needs no graphics chip. */
 export class Renderer2d {
   name = "2d";
@@ -8,7 +10,7 @@ export class Renderer2d {
   load(picture) {
     const { width, height } = picture;
     const output = Object.assign(document.createElement("canvas"), { width, height });
-    const context = output.getContext("2d", { alpha: false, willReadFrequently: true });
+    const context = context2d(output, { alpha: false, willReadFrequently: true });
     context.drawImage(picture, 0, 0);
     const from = context.getImageData(0, 0, width, height);
     const to = context.createImageData(width, height);

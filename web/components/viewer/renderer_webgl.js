@@ -2,6 +2,7 @@
 // error. One context serves all viewers; it maps pixel to pixel without interpolation, and copies the result to a 2-D
 // canvas.
 
+import { context2d } from "../../core/viewport.js";
 import { NEUTRAL, lookupTable } from "./lookup_table.js";
 
 const TOLERANCE = 2; // of 255; largest accepted difference
@@ -68,7 +69,7 @@ export class RendererWebgl {
     const texture = this.#createTexture(0);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, picture);
     const output = Object.assign(document.createElement("canvas"), { width, height });
-    const handle = { texture, output, context: output.getContext("2d", { alpha: false }) };
+    const handle = { texture, output, context: context2d(output, { alpha: false }) };
     this.draw(handle, { redfree: false, table: lookupTable(0, NEUTRAL) });
     compare(readRows(output, height >> 1, 1), readRows(picture, height >> 1, 1), "a whole picture");
     return handle;
@@ -143,7 +144,7 @@ export class RendererWebgl {
 
 function testPicture() {
   const canvas = Object.assign(document.createElement("canvas"), { width: TEST_SIDE, height: TEST_SIDE });
-  const context = canvas.getContext("2d");
+  const context = context2d(canvas);
   const pixels = context.createImageData(TEST_SIDE, TEST_SIDE);
   for (let i = 0; i < 256; i += 1) pixels.data.set([i, 255 - i, (i * 7) % 256, 255], 4 * i);
   context.putImageData(pixels, 0, 0);
@@ -153,7 +154,7 @@ function testPicture() {
 /** Return the RGBA values of some rows of a picture or canvas. */
 function readRows(source, first, count) {
   const canvas = Object.assign(document.createElement("canvas"), { width: source.width, height: count });
-  const context = canvas.getContext("2d", { willReadFrequently: true });
+  const context = context2d(canvas, { willReadFrequently: true });
   context.drawImage(source, 0, -first);
   return context.getImageData(0, 0, source.width, count).data;
 }

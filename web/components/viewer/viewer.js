@@ -2,7 +2,7 @@
 // renderer.js; drawing: canvas.js. Light DOM, so that style sheet and tests reach its parts. Loaded on demand.
 
 import { getBitmap } from "../../core/api.js";
-import { clamp, fitCanvas, homeBox } from "../../core/viewport.js";
+import { clamp, context2d, fitCanvas, homeBox } from "../../core/viewport.js";
 import { Gestures } from "./gestures.js";
 import { drawLoupe, drawPicture } from "./canvas.js";
 import { pictureRenderer } from "./renderer.js";
@@ -17,18 +17,23 @@ const EARLY_PROPERTIES = ["view", "subject", "src", "head", "redfree", "brightne
 
 /** Custom element <eye-pic>; dispatches "drawn", "fault", "zoomed", "looked" and "loupe". */
 export class PictureViewer extends HTMLElement {
+  /** @type {{url?: string, blob?: Blob, mark: string, redfree?: boolean} | null} */
   #src = null;
+  /** @type {string | null} */
   #subject = null;
   #head = null;
   #tools = NEUTRAL;
+  /** @type {ImageBitmap | null} */
   #bitmap = null;
   #mark = "";
   #takenRedfree = false; // the picture itself is in green light only
+  /** @type {ImageBitmap | null} */
   #previous = null; // the previous picture during the fade
   #fadeStartMs = 0;
   #loading = new AbortController(); // pending requests of this subject
   #frame = 0;
   // Positions are fractions of the picture width from the centre, independent of its resolution.
+  /** @type {{zoom: number, u: number, v: number, loupe: {u: number, v: number, held: boolean} | null}} */
   #view = WHOLE_VIEW; // loupe: {u, v, held} or null; `held` during a long press
   #canvas = document.createElement("canvas");
   #onChange = () => this.#redraw();
@@ -147,6 +152,10 @@ export class PictureViewer extends HTMLElement {
     }
   }
 
+  /**
+   * @param {ImageBitmap | null} bitmap
+   * @param {{mark: string, redfree?: boolean}} src
+   */
   #show(bitmap, { mark, redfree }) {
     const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.#releaseBitmap(this.#previous);
@@ -160,6 +169,7 @@ export class PictureViewer extends HTMLElement {
     this.#redraw();
   }
 
+  /** @param {ImageBitmap | null} bitmap */
   #releaseBitmap(bitmap) {
     if (!bitmap) return;
     pictureRenderer().release(bitmap);
@@ -189,7 +199,7 @@ export class PictureViewer extends HTMLElement {
   #draw() {
     this.#frame = 0;
     if (document.hidden || !fitCanvas(this.#canvas)) return; // drawn when the page is visible
-    const context = this.#canvas.getContext("2d", { alpha: false });
+    const context = context2d(this.#canvas, { alpha: false });
     context.fillStyle = "#000";
     context.fillRect(0, 0, this.#canvas.width, this.#canvas.height);
     if (!this.#bitmap) return;
@@ -208,16 +218,16 @@ export class PictureViewer extends HTMLElement {
 
   #drawBitmap(context, bitmap) {
     const { zoom, u, v, loupe } = this.#view;
-    const { width, height } = this.#bitmap; // a smaller quick look is scaled to the size of the final picture
-    const scale = this.#baseScale() * zoom;
+    const { width, height } = this.#bitmap ?? bitmap; // a smaller quick look is scaled to the size of the final picture
+    const scale = this.#baseScale(this.#bitmap ?? bitmap) * zoom;
     const shown = pictureRenderer().render(bitmap, this.#tools);
     drawPicture(context, shown, { u, v, width: width * scale, height: height * scale });
     if (loupe) drawLoupe(context, shown, { u, v, width: width * scale, height: height * scale, loupe });
   }
 
-  /** Canvas pixels per picture pixel at zoom 1. */
-  #baseScale() {
-    const home = homeBox(this.#head, this.#bitmap.width, this.#bitmap.height);
+  /** Canvas pixels per pixel of a picture at zoom 1. */
+  #baseScale({ width, height }) {
+    const home = homeBox(this.#head, width, height);
     return Math.min(this.#canvas.width / home.width, this.#canvas.height / home.height);
   }
 
@@ -245,7 +255,7 @@ export class PictureViewer extends HTMLElement {
     const { width, height } = this.#bitmap;
     const home = homeBox(this.#head, width, height);
     const zoom = clamp(requested.zoom, 1, ZOOM_MAX);
-    const scale = this.#baseScale() * zoom;
+    const scale = this.#baseScale(this.#bitmap) * zoom;
     const [visibleU, visibleV] = [this.#canvas.width, this.#canvas.height].map((size) => size / scale / width / 2);
     const limitU = Math.max(0, home.width / width / 2 - visibleU);
     const limitV = Math.max(0, home.height / width / 2 - visibleV);
@@ -265,14 +275,14 @@ export class PictureViewer extends HTMLElement {
     if (!this.#bitmap) return;
     const { zoom, u, v } = this.#view;
     const next = clamp(zoom * factor, 1, ZOOM_MAX);
-    const perPixel = this.#perCssPixel();
+    const perPixel = this.#perCssPixel(this.#bitmap);
     this.#setView({ zoom: next, u: u + (x / zoom - x / next) * perPixel, v: v + (y / zoom - y / next) * perPixel });
   }
 
   panBy(x, y) {
     if (!this.#bitmap) return;
     const { zoom, u, v } = this.#view;
-    const perPixel = this.#perCssPixel() / zoom;
+    const perPixel = this.#perCssPixel(this.#bitmap) / zoom;
     this.#setView({ u: u - x * perPixel, v: v - y * perPixel });
   }
 
@@ -285,10 +295,10 @@ export class PictureViewer extends HTMLElement {
   moveLoupe(x, y) {
     const { zoom, u, v, loupe } = this.#view;
     if (!this.#bitmap || !loupe) return;
-    const perPixel = this.#perCssPixel() / zoom;
+    const perPixel = this.#perCssPixel(this.#bitmap) / zoom;
     const requested = { ...loupe, u: loupe.u + x * perPixel, v: loupe.v + y * perPixel };
     this.#setView({ loupe: requested });
-    const actual = this.#view.loupe;
+    const actual = this.#view.loupe ?? requested;
     this.#setView({ u: u + requested.u - actual.u, v: v + requested.v - actual.v, loupe: requested });
   }
 
@@ -296,7 +306,7 @@ export class PictureViewer extends HTMLElement {
   placeLoupe([x, y], held) {
     if (!this.#bitmap) return;
     const { zoom, u, v } = this.#view;
-    const perPixel = this.#perCssPixel() / zoom;
+    const perPixel = this.#perCssPixel(this.#bitmap) / zoom;
     this.#setView({ loupe: { u: u + x * perPixel, v: v + y * perPixel, held } });
   }
 
@@ -310,9 +320,16 @@ export class PictureViewer extends HTMLElement {
   }
 
   /** Return picture widths per CSS pixel at zoom 1. */
-  #perCssPixel() {
-    return this.#canvas.width / this.#canvas.clientWidth / this.#baseScale() / this.#bitmap.width;
+  #perCssPixel(bitmap) {
+    return this.#canvas.width / this.#canvas.clientWidth / this.#baseScale(bitmap) / bitmap.width;
   }
 }
 
 customElements.define("eye-pic", PictureViewer);
+
+/**
+ * Return the viewers in an element.
+ * @param {ParentNode} element
+ * @returns {NodeListOf<PictureViewer>}
+ */
+export const viewersOf = (element) => element.querySelectorAll("eye-pic");

@@ -1,0 +1,2 @@
+export const generate: any;
+export const correction: any;
