@@ -56,6 +56,12 @@ DiffuscopeError                       base class in device/errors.py
 
 from device.errors import DiffuscopeError, StoreError
 
+# Remedy of StoreFull where free files (inodes) lack, not free bytes.
+NO_FILES_REMEDY = (
+    "The disk takes no more files, although it has free bytes. Nothing that was kept is lost. Copy pictures to a USB "
+    "stick and remove old ones, or call the technician: another program may have filled the disk with small files."
+)
+
 
 class AuthenticationError(DiffuscopeError):
     """Authentication of the technician failed."""

@@ -313,7 +313,12 @@ def test_no_exception_is_caught_without_its_name() -> None:
     plugin = "code of another package may raise anything; the error that follows names the package"
     library = "a compiled part of a library may raise anything at its import; the error that follows names the library"
     drivers = [f"device/drivers/{name}.py: except Exception" for name in ("chips", "gpio", "pi_camera", "spi_bus")]
-    allowed = {"device/plugins.py: except Exception": plugin} | dict.fromkeys(drivers, library)
+    boot = "a card with any settings has to start; the error that follows is shown on the page and on the console"
+    allowed = {
+        "device/plugins.py: except Exception": plugin,
+        "services/identity/apply_settings.py: except Exception": boot,
+    }
+    allowed |= dict.fromkeys(drivers, library)
     check_rule(swallowers, python_files("device", "services", "tests"), allowed, "catch named exceptions")
 
 
@@ -416,6 +421,39 @@ def test_files_are_written_durably_and_locked_in_one_module() -> None:
         "services/identity/apply_at_boot.py: rename": "on a tmpfs, where nothing is durable",
     }
     check_rule(file_calls, names, allowed, "use write_atomically, replace_durably, fsync_file or file_lock")
+
+
+def folder_lists(source: str) -> Iterator[Violation]:
+    """Find lists of the files of a folder: they may hold companions `._NAME` that macOS has written."""
+    for node in nodes(source):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            name = node.func.attr
+            if name in ("iterdir", "glob", "rglob") or ast.unparse(node.func) in (
+                "os.listdir",
+                "os.scandir",
+                "os.walk",
+            ):
+                yield node.lineno, name, "use files_in of device/user_files.py"
+
+
+def test_folders_are_listed_without_hidden_companions() -> None:
+    """A stick, a card or a data set that a Mac has touched holds a file `._NAME` beside each file."""
+    names = [name for name in python_files("device", "services") if name != "device/user_files.py"]
+    whole = "all that a folder holds, hidden or not, is counted, copied, moved or removed"
+    parts = "parts of interrupted writes, whose names begin with a dot"
+    own = "names that only this program or the kernel gives, in a folder that no other program writes"
+    allowed = {
+        "device/atomic_io.py: rglob": whole, "services/backup/restore_backup.py: iterdir": whole,
+        "services/backup/restore_backup.py: rglob": whole, "services/records/quarantine.py: iterdir": whole,
+        "services/records/read_only_store.py: iterdir": whole, "services/records/restoration.py: iterdir": whole,
+        "services/records/removed_captures.py: glob": whole, "services/records/removed_captures.py: iterdir": whole,
+        "services/records/capture_journal.py: iterdir": whole, "services/identity/card_settings.py: glob": whole,
+        "device/calibration/archive.py: glob": parts, "services/lab/archive/result.py: glob": parts,
+        "services/update/sources.py: glob": parts, "device/config/device_nodes.py: glob": own,
+        "services/health/collector.py: glob": own, "services/identity/apply_at_boot.py: glob": own,
+        "services/records/capture_journal.py: glob": own,
+    }  # fmt: skip
+    check_rule(folder_lists, names, allowed, "list folders with files_in")
 
 
 # Leftovers
@@ -557,6 +595,9 @@ BROKEN: list[tuple[Finder, str]] = [
     (file_calls, "part.replace(path)"),
     (file_calls, "part.rename(path)"),
     (file_calls, "import fcntl\nfcntl.flock(file, fcntl.LOCK_EX)"),
+    (folder_lists, "for path in folder.iterdir(): ..."),
+    (folder_lists, "sorted(folder.glob('*.tiff'))"),
+    (folder_lists, "import os\nos.walk('.')"),
     (leftovers, "# TO" "DO: later"),
     (leftovers, "see /wo" "rk/main"),
     (workplace_words, "from shared" "/knowledge"),

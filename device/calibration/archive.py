@@ -35,6 +35,7 @@ from device.errors import (
     StoreError,
     StoreFull,
 )
+from device.user_files import files_in
 from device.values import Calibration, Colour, Geometry, Psf, RefractionOffset, Sensor, WhiteReference
 
 MANIFEST, CURRENT = "manifest.toml", "current"
@@ -180,7 +181,7 @@ class Archive:
         """Return the ids of all stored calibrations, damaged ones included, oldest folder first (modification time)."""
         if not self.root.is_dir():
             return ()
-        found = [place for place in self.root.iterdir() if ID.fullmatch(place.name) and place.is_dir()]
+        found = [place for place in files_in(self.root) if ID.fullmatch(place.name) and place.is_dir()]
         return tuple(place.name for place in sorted(found, key=lambda place: place.stat().st_mtime_ns))
 
 
@@ -232,7 +233,7 @@ def _format(calibration: Calibration) -> int:
 
 def _read_files(place: Path) -> dict[str, bytes]:
     try:
-        return {path.name: path.read_bytes() for path in sorted(place.iterdir()) if path.is_file()}
+        return {path.name: path.read_bytes() for path in files_in(place) if path.is_file()}
     except OSError as error:
         raise CalibrationDamaged(f"calibration {place.name} cannot be read: {error.strerror}") from error
 

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from device.config.toml_file import Table, load_toml
 from device.errors import SpecError
+from device.user_files import files_in
 
 PRESETS = Path(__file__).with_name("sensor_presets")
 
@@ -49,7 +50,7 @@ class SensorProfile(Table):
 @cache
 def known_sensors() -> Mapping[str, SensorProfile]:
     """Return the presets by name; SpecError names the file and the key of an invalid one."""
-    return {path.stem: load_toml(path, SensorProfile) for path in sorted(PRESETS.glob("*.toml"))}
+    return {path.stem: load_toml(path, SensorProfile) for path in files_in(PRESETS, "*.toml")}
 
 
 def sensor_profile(name: str, folder: Path) -> SensorProfile:

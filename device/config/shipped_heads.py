@@ -7,6 +7,7 @@ import difflib
 from pathlib import Path
 
 from device.errors import SpecError
+from device.user_files import files_in
 
 _BESIDE = Path(__file__).parents[2]
 _INSTALLED = _BESIDE / "diffuscope"
@@ -22,7 +23,7 @@ def head_path(name: str, folder: Path) -> Path:
     """
     if name.endswith(".toml"):
         return folder / name
-    known = sorted(path.stem for path in HEADS.glob("*.toml"))
+    known = [path.stem for path in files_in(HEADS, "*.toml")]
     if name not in known:
         near = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(known)}, or the path of a .toml file"

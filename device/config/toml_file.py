@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from device.errors import SpecError
+from device.user_files import read_text
 
 
 class Table(BaseModel):
@@ -20,6 +21,7 @@ class Table(BaseModel):
 
 
 T = TypeVar("T", bound=Table)
+SYNTAX_REMEDY = 'Correct the line: text stands between straight quotes, as in name = "text"; a table is [name].'
 LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
@@ -28,14 +30,11 @@ def load_toml(path: Path, kind: type[T]) -> T:
 
     Validators get the file's folder in their context (`folder`), to resolve relative paths.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"{path} cannot be read: {error}", "Give the path of a readable TOML file.") from error
+    text = read_text(path)
     try:
         return kind.model_validate(tomllib.loads(text), context={"folder": path.parent})
     except tomllib.TOMLDecodeError as error:
-        raise SpecError(f"{path} is not TOML: {error}") from error
+        raise SpecError(f"{path} is not TOML: {error}", SYNTAX_REMEDY) from error
     except ValidationError as error:
         raise SpecError(_error_message(path, text, _first_cause(error), kind)) from error
 

@@ -24,6 +24,7 @@ from device.config.image_files import (
 )
 from device.errors import CameraMissing, FrameError, SpecError
 from device.sim.light import LampContext
+from device.user_files import files_in
 from device.values import Calibration, Counts, ExposureSettings, Frame, Illumination, Image, Mask, Psf, Sensor
 
 FLOAT_ZERO_DN, FLOAT_PEAK_DN = 1000.0, 60000.0  # counts for zero and maximum of a float recording, with margins
@@ -37,7 +38,7 @@ def find_recording(folder: Path) -> ReplaySpec:
     are the only other image. PSFs of another shape than the first raw (thumbnails) and files that hold no counts
     (figures with transparency) are left out; SpecError if none remains.
     """
-    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    images = [path for path in files_in(folder, "**/*") if path.suffix.lower() in SUFFIXES]
     names = {path: str(path.relative_to(folder)).lower() for path in images}
     psfs = [path for path in images if "psf" in names[path]]
     others = [path for path in images if path not in psfs]

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from device import atomic_io
+from device.user_files import files_in
 from services.backup.backup_key import HEADER_FILES, BackupHeader, encoded_model, read_model
 from services.delivery.usb_drives import drive_errors
 from services.errors import BackupDamaged, UsbDriveUnavailable
@@ -112,7 +113,7 @@ class BackupFolder:
     def _read_index(self) -> dict[str, tuple[str, int]]:
         """Return object and length by name; without torn lines, and without objects that are missing or incomplete."""
         lines = self._index.read_text("ascii", "replace").splitlines() if self._index.exists() else []
-        lengths = {path.stem: path.stat().st_size for path in self._objects.glob("*.age")}
+        lengths = {path.stem: path.stat().st_size for path in files_in(self._objects, "*.age")}
         found = [match.groups() for line in lines if (match := _LINE.fullmatch(line))]
         return {
             name: (sha256, int(length)) for name, sha256, length in found if lengths.get(sha256) == int(length)
@@ -121,7 +122,7 @@ class BackupFolder:
 
 def backup_numbers(folder: Path) -> list[int]:
     """Return the numbers of the backups in a folder of backups, oldest first."""
-    return sorted(int(path.stem) for path in (folder / "backups").glob("*.age") if path.stem.isdecimal())
+    return sorted(int(path.stem) for path in files_in(folder / "backups", "*.age") if path.stem.isdecimal())
 
 
 def backup_path(folder: Path, number: int) -> Path:
@@ -165,7 +166,7 @@ def find_folder(place: Path) -> Path:
     """Return the folder of backups at `place`, or in it; BackupDamaged if there is none, or more than one."""
     if (place / "objects").is_dir() and (place / "backups").is_dir():
         return place
-    found = sorted(path for path in place.glob(f"{PREFIX}*") if path.is_dir())
+    found = [path for path in files_in(place, f"{PREFIX}*") if path.is_dir()]
     if len(found) != 1:
         listed = ", ".join(path.name for path in found) or "none"
         remedy = "Give the folder of one device's backups with --from."

@@ -20,6 +20,8 @@ import pyrage
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from device import atomic_io
+from device.errors import SpecError
+from device.user_files import read_text
 from services.errors import BackupDamaged, BackupKeyWrong
 from services.records import blobs, digested_json
 
@@ -178,9 +180,9 @@ def key_of_passphrase(header: BackupHeader, passphrase: str) -> SecretKey:
 def key_in(path: Path) -> SecretKey:
     """Return the secret key in a file of `age-keygen`; BackupKeyWrong if it has none."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BackupKeyWrong(f"{path} cannot be read: {error}") from error
+        lines = read_text(path).splitlines()
+    except SpecError as error:
+        raise BackupKeyWrong(error.message, error.remedy) from error
     for line in lines:
         if line.startswith("AGE-SECRET-KEY-"):
             return SecretKey(line)

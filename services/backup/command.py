@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from device.clock import SystemClock
+from device.errors import SpecError
+from device.user_files import read_text
 from services.records.store_command import Data, table
 
 if TYPE_CHECKING:
@@ -102,9 +104,9 @@ def _secret_key(header: "BackupHeader", identity: Path | None, passphrase_file: 
 
 def _first_line(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8").partition("\n")[0]
-    except (OSError, UnicodeDecodeError) as error:
-        raise typer.BadParameter(f"{path} cannot be read: {error}") from error
+        return read_text(path).partition("\n")[0]
+    except SpecError as error:
+        raise typer.BadParameter(error.message) from error
 
 
 def _percent(verb: str) -> Callable[[int, int], None]:

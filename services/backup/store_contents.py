@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 
+from device.user_files import files_in
 from services.errors import BackupDamaged, StoreDamaged
 from services.records import blobs, device_identity, reserve_file, schema, snapshots
 from services.records.record_files import CAPTURE_RECORD
@@ -27,9 +28,8 @@ NOT_BACKED_UP = frozenset(
 
 def units(store: Path) -> list[str]:
     """Return the paths of the second-level folders of a store, relative to it, sorted."""
-    tops = (top for top in store.iterdir() if _is_kept(top) and top.is_dir())
-    found = (one for top in tops for one in top.iterdir() if _is_kept(one) and one.is_dir())
-    return sorted(str(one.relative_to(store)) for one in found)
+    tops = (top for top in _kept_in(store) if top.is_dir())
+    return [str(one.relative_to(store)) for top in tops for one in _kept_in(top) if one.is_dir()]
 
 
 def fingerprint(store: Path, unit: str) -> bytes:
@@ -54,11 +54,9 @@ def packed_unit(store: Path, unit: str) -> bytes:
 
 def rest_of_store(store: Path) -> dict[str, Path]:
     """Return the files that are in no unit, by their path in the store; without the database."""
-    found = [path for path in store.iterdir() if _is_kept(path) and path.is_file()]
-    for top in store.iterdir():
-        if _is_kept(top) and top.is_dir():
-            found += [path for path in top.iterdir() if _is_kept(path) and path.is_file()]
-    return {str(path.relative_to(store)): path for path in sorted(found)}
+    tops = _kept_in(store)
+    found = [*tops, *(path for top in tops if top.is_dir() for path in _kept_in(top))]
+    return {str(path.relative_to(store)): path for path in sorted(found) if path.is_file()}
 
 
 def database_copy(database: Path) -> bytes:
@@ -99,12 +97,12 @@ def unpacked(content: bytes) -> Iterator[tuple[Path, int, bytes]]:
         raise BackupDamaged(f"an archive of the backup cannot be read: {error}") from error
 
 
-def _is_kept(path: Path) -> bool:
-    """Return whether a file or folder is backed up: parts of an atomic write and locks begin with a dot."""
-    return not path.name.startswith(".") and path.name not in NOT_BACKED_UP
+def _kept_in(folder: Path) -> list[Path]:
+    """Return the files and folders of a folder that are backed up: parts of a write and locks begin with a dot."""
+    return [path for path in files_in(folder) if path.name not in NOT_BACKED_UP]
 
 
 def _files_below(folder: Path) -> list[Path]:
     """Return all files of a folder, sorted, without parts of writes and locks; FileNotFoundError without the folder."""
     folder.stat()
-    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return [path for path in files_in(folder, "**/*") if path.is_file()]

@@ -13,7 +13,6 @@ import hashlib
 import ipaddress
 import socket
 import ssl
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -24,9 +23,11 @@ from threading import Event, Timer
 from typing import Protocol
 from urllib.parse import SplitResult, quote, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
+from device.config.toml_file import Table, load_toml
 from device.errors import SpecError
+from device.user_files import read_text
 from services.errors import ReceiverUnreachable, ReceiverUntrusted, UploadMismatch, UploadRejected, UploadUnauthorised
 from services.records.upload_queue import UploadReceipt
 
@@ -36,10 +37,9 @@ SUCCESS, PRECONDITION_FAILED = (200, 201, 204), 412
 RETRYABLE = (408, 425, 429)
 
 
-class UploadSettings(BaseModel):
+class UploadSettings(Table):
     """Contents of the settings file of `diffuscope run --send`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     address: str  # URL of the receiver's folder: https://, or http:// to this computer only
     token: Path  # file with the bearer token of this device
     authority: Path | None = None  # CA file; None: the system's CAs
@@ -74,10 +74,7 @@ def _is_local(host: str) -> bool:
 
 def load_settings(path: Path) -> UploadSettings:
     """Return the upload settings in a TOML file; SpecError if the file is missing or invalid."""
-    try:
-        return UploadSettings(**tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
-        raise SpecError(f"{path}: {error}", "Correct the file that is given with --send, or leave it out.") from error
+    return load_toml(path, UploadSettings)
 
 
 @dataclass(frozen=True)
@@ -200,10 +197,10 @@ class HttpsUploader:
         The token file is read at each request, because a technician may replace it.
         """
         try:
-            token = self._settings.token.read_text(encoding="ascii").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UploadUnauthorised(f"{self._settings.token} cannot be read: {error}") from error
-        if not token or not token.isprintable():
+            token = read_text(self._settings.token).strip()
+        except SpecError as error:
+            raise UploadUnauthorised(error.message) from error
+        if not token or not token.isprintable() or not token.isascii():
             raise UploadUnauthorised(f"{self._settings.token} holds no key")
         return {"Authorization": f"Bearer {token}", "Connection": "close"}
 

@@ -11,6 +11,7 @@ from datetime import datetime
 
 from device.config.operating_limits import is_battery_low, is_too_hot
 from device.errors import DiffuscopeError, StoreError
+from services.errors import NO_FILES_REMEDY
 from services.health import thresholds
 from services.health.thresholds import (
     MAX_COMPUTER_C,
@@ -21,7 +22,6 @@ from services.health.thresholds import (
 )
 from services.records.capture import ClockState
 from services.records.recovery_report import RecoveryReport
-from services.records.store_space import NO_FILES_REMEDY
 
 
 @dataclass(frozen=True)

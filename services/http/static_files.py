@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
+from device.user_files import files_in
 from services import resources
 from services.http.bundler import bundle_module, bundle_style_sheet
 
@@ -33,7 +34,7 @@ class StaticFiles:
     """
 
     def __init__(self, folder: Path = resources.WEB) -> None:
-        paths = sorted(path for path in folder.rglob("*") if path.suffix in MEDIA_TYPES)
+        paths = [path for path in files_in(folder, "**/*") if path.suffix in MEDIA_TYPES]
         texts = {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
         digest = hashlib.sha256(repr(texts).encode()).hexdigest()[:12]
         self._plain: dict[str, bytes] = {}

@@ -3,11 +3,24 @@
 import json
 import shutil
 import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from device.errors import DiffuscopeError
-from services.identity.card_settings import CardSettings, Ethernet, Wifi, head_path, kept_settings, take_settings
+from device.errors import DiffuscopeError, SpecError
+from services.identity.card_settings import (
+    FILE,
+    UPDATES,
+    CardSettings,
+    Ethernet,
+    Wifi,
+    head_path,
+    kept_settings,
+    named_files,
+    take_settings,
+)
 
 CONNECTIONS = "run/NetworkManager/system-connections"
 OUTPUT = "run/diffuscope-settings"  # readable for all: head file, programme, arguments, country, problem
@@ -26,39 +39,57 @@ class CardBoot:
         return self.root / "data/settings"
 
     def run(self) -> DiffuscopeError | None:
-        """Take the file of the boot partition, apply what is kept, and publish a problem; return it, else None."""
-        release, zones = self.root / "opt/diffuscope", self.root / "usr/share/zoneinfo"
-        problem = take_settings(self.root / "boot/chooser", self.kept, release, zones)
-        try:
-            self._apply(kept_settings(self.kept), release)
-        except DiffuscopeError as error:
-            problem = problem or error
+        """Take the file of the boot partition, apply what is kept, and publish a problem; return it, else None.
+
+        Each step is tried, whatever another one raised, and the device starts: the first problem is published.
+        """
+        problems = [_attempt(step) for step in (self._take, self._apply, self._apply_update_settings)]
+        problem = next((one for one in problems if one is not None), None)
         self._publish(problem)
         return problem
 
-    def _apply(self, settings: CardSettings, release: Path) -> None:
+    def _take(self) -> DiffuscopeError | None:
+        zones = self.root / "usr/share/zoneinfo"
+        return take_settings(self.root / "boot/chooser", self.kept, self._release, zones)
+
+    @property
+    def _release(self) -> Path:
+        return self.root / "opt/diffuscope"
+
+    def _apply(self) -> DiffuscopeError | None:
+        settings = kept_settings(self.kept)
+        steps = (self._apply_head_and_programme, self._apply_place, self._apply_networks, self._apply_ssh)
+        problems = [_attempt(partial(step, settings)) for step in steps]
+        return next((one for one in problems if one is not None), None)
+
+    def _apply_head_and_programme(self, settings: CardSettings) -> None:
         output, arguments = self.root / OUTPUT, {}
-        for file in sorted(self.kept.glob("*.toml")):
-            if file.name not in ("diffuscope.toml", "update.toml"):
-                self._write_public(file.name, file.read_text(encoding="utf-8"))
+        for name in named_files(settings, self.kept):
+            self._write_public(name, (self.kept / name).read_bytes())
         if settings.head is not None:
-            arguments["HEAD"] = str(_from_root(head_path(settings.head, output, release), self.root))
+            arguments["HEAD"] = str(_from_root(head_path(settings.head, output, self._release), self.root))
         if settings.programme is not None:
             arguments["PROGRAMME"] = f"--protocol {_from_root(output / settings.programme, self.root)}"
-        self._write_public("instrument.env", "".join(f"{name}={value}\n" for name, value in arguments.items()))
+        content = "".join(f"{name}={value}\n" for name, value in arguments.items())
+        self._write_public("instrument.env", content.encode())
+
+    def _apply_place(self, settings: CardSettings) -> None:
         if settings.country is not None:
-            self._write_public("country.env", f"COUNTRY={settings.country}\n")
+            self._write_public("country.env", f"COUNTRY={settings.country}\n".encode())
         if settings.time_zone is not None:
             zone = self.root / "etc/localtime"
             zone.unlink(missing_ok=True)
             zone.symlink_to(f"/usr/share/zoneinfo/{settings.time_zone}")
+
+    def _apply_networks(self, settings: CardSettings) -> None:
         if settings.wifi is not None:
             self._write_private(f"{CONNECTIONS}/wifi.nmconnection", wifi_profile(settings.wifi))
         if settings.ethernet is not None:
             self._write_private(f"{CONNECTIONS}/ethernet.nmconnection", ethernet_profile(settings.ethernet))
-        if (updates := self.kept / "update.toml").exists():
-            shutil.copyfile(updates, self.root / "etc/diffuscope/update.toml")
-        self._apply_ssh(settings)
+
+    def _apply_update_settings(self) -> None:
+        if (updates := self.kept / UPDATES).exists():
+            shutil.copyfile(updates, self.root / "etc/diffuscope" / UPDATES)
 
     def _apply_ssh(self, settings: CardSettings) -> None:
         """Write the public keys, and create the host key once; ssh.service runs only if the file of keys exists."""
@@ -75,23 +106,44 @@ class CardBoot:
         for file in (self.root / OUTPUT / "problem.json", console):
             file.unlink(missing_ok=True)
         if problem is not None:
-            self._write_public("problem.json", json.dumps({"message": problem.message, "remedy": problem.remedy}))
             text = f"\n  The settings of the card were not taken: {problem.message}\n  {problem.remedy}\n\n"
             self._write_private("run/issue.d/settings.issue", text)
+            content = json.dumps({"message": problem.message, "remedy": problem.remedy})
+            self._write_public("problem.json", content.encode())
 
-    def _write_public(self, name: str, content: str) -> None:
+    def _write_public(self, name: str, content: bytes) -> None:
         """Write a file into OUTPUT, readable for every user; the umask of the unit is 077."""
         folder = self.root / OUTPUT
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o755)
-        (folder / name).write_text(content, encoding="utf-8")
+        (folder / name).write_bytes(content)
         (folder / name).chmod(0o644)
 
     def _write_private(self, name: str, content: str) -> None:
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch(mode=0o600)
-        path.write_text(content)
+        path.write_text(content, encoding="utf-8")
+
+
+def _attempt(step: Callable[[], DiffuscopeError | None]) -> DiffuscopeError | None:
+    """Return the problem of a step; an unexpected exception is one, too, because the device has to start."""
+    try:
+        with _expected():
+            return step()
+    except DiffuscopeError as error:
+        return error
+
+
+@contextmanager
+def _expected() -> Iterator[None]:
+    try:
+        yield
+    except DiffuscopeError:
+        raise
+    except Exception as error:
+        message = f"the settings cannot be used: {type(error).__name__}: {error}"
+        raise SpecError(message, f"Write {FILE} onto the card again. If this stays, call the technician.") from error
 
 
 def wifi_profile(wifi: Wifi) -> str:

@@ -5,6 +5,7 @@ reported and changes nothing.
 """
 
 import re
+import tomllib
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from typing import Self
@@ -15,9 +16,11 @@ from device import atomic_io
 from device.config.head_file import load_head
 from device.config.toml_file import Table, load_toml
 from device.errors import DiffuscopeError, SpecError
+from device.user_files import files_in, read_text
 from services.records.protocol import load_protocol
 
 FILE = "diffuscope.toml"
+UPDATES = "update.toml"  # of the update server, put onto the data partition by SSH
 COUNTRIES = "iso3166.tab"  # of tzdata: a line for each country, its code first
 PASSWORD = re.compile(rb'^([ \t]*password[ \t]*=[ \t]*)(["\'])(.*?)\2', re.MULTILINE)
 KEPT = re.compile(r"\*+")  # what is left of a password on the first partition
@@ -77,8 +80,9 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
     """Keep the settings of the boot partition in the folder `kept`; return the error of an invalid file, else None.
 
     `boot`: folder of `diffuscope.toml`; `release`: folder of the installed program; `zones`: folder of the time zones.
-    Without a file nothing changes. After an error the kept settings are as before. The password on the boot partition
-    is overwritten after the settings are durable, so that a power cut loses neither.
+    Without a file nothing changes. After an error the kept settings are as before. Of the files beside, `kept` has
+    those that the settings name (`named_files`); others that it had before are removed. The password on the boot
+    partition is overwritten after the settings are durable, so that a power cut loses neither.
     """
     source = boot / FILE
     if not source.exists():
@@ -94,6 +98,7 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
         for name, text in beside.items():
             atomic_io.write_atomically(kept / name, text, 0o600)
         atomic_io.write_atomically(kept / FILE, content, 0o600)
+        _forget(kept, {FILE, UPDATES, *beside})
         _overwrite_password(source)
     except DiffuscopeError as error:
         return error
@@ -128,7 +133,7 @@ def _with_known_password(content: bytes, wifi: Wifi, kept: Path) -> bytes:
 
 
 def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path) -> dict[str, bytes]:
-    """Return the head file and programme beside the settings by name, checked; SpecError for one that is not valid."""
+    """Return the files that the settings name by name, checked; SpecError for one that is not valid."""
     if settings.time_zone is not None and not (zones / settings.time_zone).is_file():
         raise SpecError(f"{FILE}: time_zone: {settings.time_zone!r} is none", "Write one such as Asia/Kolkata.")
     if settings.country is not None and f"\n{settings.country}\t" not in (zones / COUNTRIES).read_text("utf-8"):
@@ -138,12 +143,44 @@ def _files_beside(settings: CardSettings, boot: Path, release: Path, zones: Path
     if settings.head is not None:
         path = head_path(settings.head, boot, release)
         if not path.is_file():
-            heads = ", ".join(sorted(file.stem for file in head_path("any", boot, release).parent.glob("*.toml")))
+            heads = ", ".join(file.stem for file in files_in(head_path("any", boot, release).parent, "*.toml"))
             remedy = f"Write one of {heads}, or the name of a .toml file beside {FILE}."
             raise SpecError(f"{FILE}: head: there is no head file {path.name!r}", remedy)
         load_head(path)
-    names = {path.name for path in boot.glob("*.toml")} - {FILE}  # also the sensors that a head file names
-    return {name: (boot / name).read_bytes() for name in sorted(names)}
+    return {name: (boot / name).read_bytes() for name in named_files(settings, boot)}
+
+
+def named_files(settings: CardSettings, folder: Path) -> list[str]:
+    """Return the sorted names of the TOML files in `folder` that the settings name, and those that these files name.
+
+    A head file names a sensor, or the head whose light it has. SpecError for a file that cannot be read.
+    """
+    named, pending = set[str](), [settings.programme, settings.head]
+    while pending:
+        name = pending.pop()
+        if name is None or name in named or Path(name).name != name or not name.endswith(".toml"):
+            continue
+        if (folder / name).is_file():
+            named.add(name)
+            pending += _texts(tomllib.loads(read_text(folder / name)))
+    return sorted(named)
+
+
+def _texts(value: object) -> list[str]:
+    """Return every text among the values of a TOML table."""
+    if isinstance(value, dict):
+        return [text for one in value.values() for text in _texts(one)]
+    if isinstance(value, list):
+        return [text for one in value for text in _texts(one)]
+    return [value] if isinstance(value, str) else []
+
+
+def _forget(kept: Path, names: set[str]) -> None:
+    """Remove every other TOML file that is kept, also a hidden one, durably."""
+    for path in kept.glob("*.toml"):
+        if path.name not in names:
+            path.unlink()
+    atomic_io.fsync_folder(kept)
 
 
 def head_path(head: str, folder: Path, release: Path) -> Path:

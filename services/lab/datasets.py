@@ -14,6 +14,7 @@ from typing import Literal
 
 from device.config.image_files import SUFFIXES, read_image
 from device.errors import FrameError, SettingError
+from device.user_files import files_in
 from services.lab.dataset_pairs import Dataset, Entry, Layout, Region, psf_factor
 
 Split = Literal["test", "all"]
@@ -87,7 +88,7 @@ def open_dataset(folder: Path | str, psf: Path | str | None = None, split: Split
         if found is not None:
             return _dataset(folder, found, None if psf is None else Path(psf), split)
     looked_for = "; ".join(recogniser.files for recogniser in RECOGNISERS)
-    parquet = any((folder / "data").glob("*.parquet"))
+    parquet = any(files_in(folder / "data", "*.parquet"))
     raise SettingError(
         f"{folder} has none of the known layouts: {looked_for}",
         "Export the parquet files as pictures first: the page on data sets has the ten lines."
@@ -155,7 +156,7 @@ def _images(folder: Path) -> Files:
     """Return the image files of a folder by stem; empty if the folder does not exist."""
     if not folder.is_dir():
         return {}
-    return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES}
+    return {path.stem: path for path in files_in(folder) if path.suffix.lower() in SUFFIXES}
 
 
 def _image(folder: Path, stem: str) -> Path:
@@ -221,7 +222,7 @@ def _find_measured(folder: Path) -> Found | None:
 def _find_depths(folder: Path) -> Found | None:
     for place in _within(folder, "example_data"):
         raws = {stem: path for stem, path in _images(place).items() if stem.endswith("raw")}
-        stack = tuple(_images(place / "psf").values()) or tuple(sorted(place.glob("*psf*.mat")))
+        stack = tuple(_images(place / "psf").values()) or tuple(files_in(place, "*psf*.mat"))
         if raws and stack:
             return Found(DEPTHS, raws, {}, tuple(sorted(stack, key=lambda path: natural_order(path.stem))))
     return None
@@ -237,7 +238,7 @@ def _find_tutorial(folder: Path) -> Found | None:
 
 
 def _find_simulated(folder: Path) -> Found | None:
-    places = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
+    places = [folder, *(path for path in files_in(folder) if path.is_dir())]
     scenes = {place.name: images for place in places if {"raw", "psf"} <= set(images := _images(place))}
     if not scenes:
         return None

@@ -27,6 +27,7 @@ from device.sim.plan import Decision, decide, format_plan
 from device.sim.render import crop_or_pad
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
+from device.user_files import files_in
 from device.values import Image, Mask, SimulatedCounts
 from services import resources
 from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case, selected_methods
@@ -279,7 +280,7 @@ def _scene_file(scene: str | Path) -> Path:
         return Path(scene)
     place = resources.SCENES / f"{scene}.toml"
     if not place.is_file():
-        names = sorted(path.stem for path in resources.SCENES.glob("*.toml"))
+        names = [path.stem for path in files_in(resources.SCENES, "*.toml")]
         near = difflib.get_close_matches(scene, names, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         remedy = f"Give the path of a scene file, or one of: {', '.join(names)}."

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from device import atomic_io
 from device.errors import StoreError
+from device.user_files import files_in
 from device.values import EYES, Eye
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import digested_json, row_validation
@@ -76,7 +77,7 @@ class CaptureJournal:
         self.resumable: tuple[ResumableCapture, ...] = ()
         with storage_errors():
             atomic_io.make_folder(self._folder)
-            paths = sorted(self._folder.glob("*.json"))
+            paths = files_in(self._folder, "*.json")
             found, self._keys = {path.stem: _read(path) for path in paths}, {path.stem: _key(path) for path in paths}
         for id in [id for id in found if _is_kept(store, id)]:
             del found[id]

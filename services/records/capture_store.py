@@ -38,6 +38,7 @@ from sqlalchemy.orm import Session
 from device import atomic_io
 from device.clock import Clock, SystemClock
 from device.errors import SettingError, StoreError, StoreReadOnly
+from device.user_files import files_in
 from services.errors import RecordNotFound, RecordRemoved, StoreDamaged
 from services.records import blobs, capture_rows, row_validation, schema
 from services.records.blobs import FileContent
@@ -287,7 +288,7 @@ class CaptureStore:
             log.error("the database is moved to %s: %s", set_aside(database), damage)
             return damage
         missing = not database.exists() or database.stat().st_size == 0
-        if missing and any(not path.name.startswith(".") for path in self._captures.iterdir()):
+        if missing and files_in(self._captures):
             raise StoreDamaged(f"{database} is gone, and there are captures that it should list")
         return None
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from device import atomic_io
 from device.errors import DiffuscopeError, FrameError
+from device.user_files import files_in
 from device.values import Frame
 from services.imaging import picture_files
 from services.imaging.raw_metadata import RawMetadata
@@ -124,7 +125,7 @@ def stored_frames(folder: Path) -> tuple[StoredFrame, ...]:
     A frame that is incomplete, has changed or has no note is left out, with a line in the log. Empty without a folder.
     """
     found = []
-    for note in sorted(folder.glob("*.tiff.json")):
+    for note in files_in(folder, "*.tiff.json"):
         try:
             found.append(_checked(folder / note.stem, digested_json.decoded(read_blob(note))))
         except (OSError, ValueError, KeyError, TypeError) as error:

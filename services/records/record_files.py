@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from device import atomic_io
+from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import blobs, row_validation
 from services.records.record_document import Kind, RecordDocument, parse_document
@@ -57,7 +58,7 @@ class RecordFiles:
         """Yield the ids of the records of patients or visits that have a file, sorted."""
         folder = self._folder / _FOLDERS[kind]
         if folder.is_dir():
-            yield from sorted(path.stem for path in folder.glob("[!.]*.json"))
+            yield from [path.stem for path in files_in(folder, "*.json")]
 
     def write(self, documents: Iterable[RecordDocument]) -> None:
         """Write or replace the files of these records, each atomically and durably, in the given order.

@@ -27,6 +27,7 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import StoreError
+from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import record_rows, row_validation, schema
 from services.records.json_values import JsonObject
@@ -247,7 +248,7 @@ class Recovery:
         if kind != "capture":
             return list(self._files.ids(kind))
         folder = self._folder / "captures"
-        return sorted(one.name for one in folder.iterdir() if one.is_dir() and not one.name.startswith("."))
+        return [one.name for one in files_in(folder) if one.is_dir()]
 
     def _log(self) -> None:
         report = self.report

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from device import atomic_io
+from device.user_files import files_in
 from services.errors import StoreDamaged
 from services.records import blobs, digested_json, row_validation
 from services.records.storage_errors import storage_errors
@@ -114,7 +115,7 @@ class RemovedCaptures:
     def _folders(self) -> list[Path]:
         if not self._folder.is_dir():
             return []
-        return sorted(path for path in self._folder.iterdir() if not path.name.startswith("."))
+        return files_in(self._folder)
 
     def _aside(self, id: str) -> Path | None:
         return next((path for path in self._folders() if path.name.partition("-")[2] == id), None)

@@ -17,6 +17,7 @@ from device import atomic_io
 from device.clock import Clock
 from device.errors import StoreError, StoreFull
 from device.light_safety.dose_ledger import DoseLedgerState
+from device.user_files import files_in
 from device.values import EYES
 from services.errors import RecordNotFound, StoreDamaged
 from services.records.dose_ledger_log import DoseLedgerLog, raise_to
@@ -35,7 +36,7 @@ class Snapshots:
 
     def names(self) -> list[str]:
         """Return the names of the snapshots, oldest schema first."""
-        return sorted(path.name for path in self.folder.glob("*.db"))
+        return [path.name for path in files_in(self.folder, "*.db")]
 
     def create(self, schema: str) -> None:
         """Copy the database, whose schema version is `schema`; the copy is durable when the call returns.
@@ -84,7 +85,7 @@ class Snapshots:
         """Return the sorted names of the folders in `captures` without a row in the snapshot `name`: stored later."""
         with _connected(self.folder / name) as tables:
             known = {id for (id,) in tables.execute("SELECT id FROM captures")}
-        return sorted(path.name for path in captures.glob("[!.]*") if path.name not in known)
+        return [path.name for path in files_in(captures, "*") if path.name not in known]
 
     def _refuse_without_room(self, size_bytes: int) -> None:
         """Raise StoreFull if less space than 2 `size_bytes` + MARGIN_BYTES is free, for the copy and the migration.

@@ -12,6 +12,7 @@ from pathlib import Path
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from device.user_files import files_in
 from services.errors import RecordNotFound, StoreDamaged
 from services.records import blobs, record_signing, row_validation, schema
 from services.records.dose_ledger_log import DoseLedgerLog
@@ -133,7 +134,7 @@ def _in_file(files: RecordFiles, kind: Kind, id: str) -> RecordDocument | None:
 def _ids_of_files(folder: Path, kind: Kind) -> list[str]:
     if kind != "capture":
         return list(RecordFiles(folder).ids(kind))
-    return sorted(one.name for one in (folder / "captures").iterdir() if one.is_dir() and not one.name.startswith("."))
+    return [one.name for one in files_in(folder / "captures") if one.is_dir()]
 
 
 def _checked_files(folder: Path, documents: dict[tuple[Kind, str], RecordDocument]) -> Checked:

@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from device import atomic_io
 from device.errors import StoreFull
+from services.errors import NO_FILES_REMEDY
 from services.records.schema import VISIT_ROWID, CaptureSlotRow, FileRow, VisitRow
 from services.records.storage_errors import storage_errors
 
@@ -21,10 +22,6 @@ RECENT_VISITS = 100  # visits whose mean size predicts the size of the next ones
 DEFAULT_CAPTURE_BYTES = 10_000_000  # size of the first capture: 4 megapixels of raw, compressed, and a picture
 DEFAULT_CAPTURE_FILES = 12  # files and folders of the first capture: those of a burst
 RESERVE_FILES = 16  # stay free, for the answers of a visit, the logs of the database and of the light, and the trial
-NO_FILES_REMEDY = (
-    "The disk takes no more files, although it has free bytes. Nothing that was kept is lost. Copy pictures to a USB "
-    "stick and remove old ones, or call the technician: another program may have filled the disk with small files."
-)
 
 
 class Deletable(Protocol):

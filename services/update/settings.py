@@ -1,20 +1,18 @@
 """Update settings: sources, preconditions, paths and timeouts in one TOML file; unknown keys are an error."""
 
-import tomllib
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
-from device.errors import SpecError
+from device.config.toml_file import Table, load_toml
 from services.update.ipc import TABLET
 
 SETTINGS_PATH = Path("/etc/diffuscope/update.toml")
 
 
-class UpdateSettings(BaseModel):
+class UpdateSettings(Table):
     """Content of /etc/diffuscope/update.toml; folders, URLs and commands have the defaults of the device."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     channel: str = Field(default="", pattern="^(https://.+[^/])?$")  # URL of a folder; empty: USB drives only
     authority: Path | None = None  # CA file for the web server; None: system CAs
     sticks: Path = Path("/media")  # mount points of USB drives, one folder each
@@ -40,7 +38,4 @@ class UpdateSettings(BaseModel):
 
 def load_settings(path: Path) -> UpdateSettings:
     """Return the settings in a file; SpecError if it is missing or invalid."""
-    try:
-        return UpdateSettings(**tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
-        raise SpecError(f"{path}: {error}", "Give the settings of this device with --settings.") from error
+    return load_toml(path, UpdateSettings)

@@ -16,6 +16,7 @@ import httpx
 
 from device import atomic_io
 from device.clock import Clock
+from device.user_files import files_in
 from services.errors import UpdateDamaged, UpdateNoRoom, UpdateNotFound, UpdateSourceRemoved, UpdateUnreachable
 from services.update.channel import Offer
 from services.update.ipc import OPEN_FLAGS, UPLOAD, FoundUpdate
@@ -35,7 +36,7 @@ def find_bundle(place: Path) -> Path:
     """
     if place.is_file():
         return place.resolve()
-    found = sorted({*place.glob("*.raucb"), *place.glob("*/*.raucb")})
+    found = files_in(place, "*.raucb", "*/*.raucb")
     if len(found) == 1:
         return found[0].resolve()
     if not found:
@@ -49,7 +50,7 @@ def list_bundles(sticks: Path, tablet: Path) -> list[tuple[FoundUpdate, Path]]:
 
     The id is a hash of path, size and modification time. Regular files only, no symbolic links.
     """
-    on_sticks = [("stick", path) for path in sorted({*sticks.glob("*.raucb"), *sticks.glob("*/*.raucb")})]
+    on_sticks = [("stick", path) for path in files_in(sticks, "*.raucb", "*/*.raucb")]
     found = []
     for where, path in [("tablet", tablet / UPLOAD), *on_sticks]:
         try:

@@ -21,13 +21,12 @@ from hypothesis import strategies as st
 
 from device.errors import SettingError, StoreError, StoreFull
 from device.values import Report
-from services.errors import RecordNotFound, StoreDamaged
+from services.errors import NO_FILES_REMEDY, RecordNotFound, StoreDamaged
 from services.records import schema
 from services.records.capture import Capture, CaptureReport
 from services.records.capture_report import read_report
 from services.records.capture_store import CaptureStore
 from services.records.quarantine import REQUIRED_FILES
-from services.records.store_space import NO_FILES_REMEDY
 
 MEMORY = Path("/dev/shm")  # order does not depend on the disk, and the test makes many stores
 NOON = datetime(2026, 3, 1, 12, tzinfo=UTC)

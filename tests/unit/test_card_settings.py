@@ -14,6 +14,7 @@ import pytest
 from services.identity import card_settings
 from services.identity.apply_settings import CardBoot, ethernet_profile, wifi_profile
 from services.identity.card_settings import CardSettings, Ethernet, Wifi, kept_settings, take_settings
+from tests.companions import apple_double
 from tests.project_files import ROOT, text
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIGJcPFbe5hVKaLZ4yKkYbCzW1Sxd0hNnT0y0vN3hX4bQ me@laptop"
@@ -169,6 +170,69 @@ def test_a_head_file_beside_comes_with_its_sensor(card: CardBoot) -> None:
     output = card.root / "run/diffuscope-settings"
     assert (output / "instrument.env").read_text() == "HEAD=/run/diffuscope-settings/head.toml\n"
     assert (output / "mine.toml").exists()
+
+
+def test_files_that_the_settings_do_not_name_are_not_read(card: CardBoot) -> None:
+    """Companions of macOS, and a note in another encoding, are there and do not matter."""
+    boot = card.root / "boot/chooser"
+    (boot / "._diffuscope.toml").write_bytes(apple_double())
+    (boot / "notes.toml").write_bytes("# clínica".encode("latin-1"))
+    write(card, GOOD)
+    assert card.run() is None
+    assert [path.name for path in card.kept.glob("*.toml")] == ["diffuscope.toml"]
+
+
+def test_what_the_settings_no_longer_name_is_forgotten(card: CardBoot) -> None:
+    boot = card.root / "boot/chooser"
+    shutil.copyfile(ROOT / "services/records/protocol.toml", boot / "programme.toml")
+    write(card, f'programme = "programme.toml"\n{GOOD}')
+    assert card.run() is None
+    (card.kept / "update.toml").write_text('channel = "https://updates.example.org/diffuscope"\n')
+    (card.kept / "._old.toml").write_bytes(apple_double())
+    write(card, GOOD)
+    volatile(card)
+    assert card.run() is None
+    assert sorted(path.name for path in card.kept.glob("*.toml")) == ["diffuscope.toml", "update.toml"]
+    assert not (card.root / "run/diffuscope-settings/programme.toml").exists()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "latin-1"])
+def test_settings_in_another_encoding_are_named_and_a_mark_is_read(card: CardBoot, encoding: str) -> None:
+    write(card, GOOD).write_bytes(f"# clínica\n{GOOD}".encode(encoding))
+    problem = card.run()
+    expected = {"utf-8-sig": None, "latin-1": "line 1: the byte 0xED .*Latin-1"}.get(encoding, "UTF-16")
+    if expected is None:
+        assert problem is None
+        assert files_with(card.root / "boot", PASSWORD) == []
+        return
+    assert problem is not None
+    assert re.search(expected, problem.message)
+    assert "UTF-8" in problem.remedy
+
+
+@pytest.mark.parametrize("broken", ["kept", "zone", "ssh"])
+def test_a_step_that_fails_is_reported_and_the_others_are_applied(card: CardBoot, broken: str) -> None:
+    """What was in force stays: a damaged programme, a root without zones or a key that cannot be made costs itself."""
+    boot = card.root / "boot/chooser"
+    shutil.copyfile(ROOT / "services/records/protocol.toml", boot / "programme.toml")
+    file = write(card, f'programme = "programme.toml"\n{GOOD}')
+    assert card.run() is None
+    file.unlink()
+    volatile(card)
+    if broken == "kept":
+        (card.kept / "programme.toml").write_bytes(b"\xff\xfe\x00")
+    elif broken == "zone":
+        (card.root / "etc/localtime").unlink()
+        (card.root / "etc/localtime").mkdir()
+    else:
+        (card.kept / "ssh_host_ed25519_key").unlink()
+        (card.kept / "ssh_host_ed25519_key").symlink_to("/nowhere/key")
+    problem = card.run()
+    assert problem is not None
+    assert json.loads((card.root / "run/diffuscope-settings/problem.json").read_text())["message"] == problem.message
+    assert problem.message in (card.root / "run/issue.d/settings.issue").read_text()
+    profile = card.root / "run/NetworkManager/system-connections/wifi.nmconnection"
+    assert f"psk={PASSWORD}" in profile.read_text()
 
 
 def test_a_full_data_partition_is_a_problem_and_no_failed_boot(card: CardBoot) -> None:

@@ -11,6 +11,7 @@ from device.errors import FrameError, PsfError, SettingError
 from services.lab.dataset_pairs import Pair
 from services.lab.dataset_summary import check, summary
 from services.lab.datasets import open_dataset
+from tests.companions import add_companions
 from tests.datasets import COLS, ROWS, WRITERS, Scene, simulate_tiny, stored, write_dlmd, write_pairs
 
 
@@ -35,6 +36,7 @@ FOUND = {  # layout, names, number of truths, number of PSFs
 @pytest.mark.parametrize("layout", WRITERS)
 def test_a_layout_is_recognised_and_its_first_pair_is_upright(layout: str, scene: Scene, tmp_path: Path) -> None:
     WRITERS[layout](tmp_path / "set", scene)
+    add_companions(tmp_path / "set")
     dataset = open_dataset(tmp_path / "set")
     truths = sum(entry.truth is not None for entry in dataset.entries)
     pair = next(iter(dataset))

@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import device
+from device.user_files import files_in
 from services import lab
 
 NUMERICAL_PACKAGES = ("numpy", "scipy", "pyfftw", "numba")
@@ -27,7 +28,7 @@ def software() -> dict[str, str]:
     """
     digest = hashlib.sha256()
     for folder, patterns in _SOURCES:
-        for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+        for path in files_in(folder, *patterns):
             digest.update(f"{path.relative_to(folder).as_posix()}\0".encode() + path.read_bytes() + b"\0")
     packages = {name: version(name) for name in NUMERICAL_PACKAGES}
     own = {"diffuscope": version("diffuscope"), "code": digest.hexdigest()[:12]}

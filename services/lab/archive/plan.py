@@ -13,7 +13,8 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from device import atomic_io
-from device.errors import SettingError
+from device.errors import SettingError, SpecError
+from device.user_files import read_text
 from services.lab.reconstruct_file import write_or_raise
 from services.records.capture import OtherColour
 
@@ -144,12 +145,12 @@ def read_plan(path: Path) -> Plan:
     """Return the plan in a file; SettingError for a file that is missing, damaged, or of another release."""
     remedy = "Make the plan again: diffuscope archive plan SOURCE -o PLAN.toml."
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_text(path))
         if content.get("format") != FORMAT:
             raise SettingError(f"{path} is a plan of format {content.get('format')}, not {FORMAT}", remedy)
         plan = Plan.model_validate(content)
-    except OSError as error:
-        raise SettingError(f"{path} cannot be read: {error.strerror}", remedy) from error
+    except SpecError as error:
+        raise SettingError(error.message, error.remedy if path.is_file() else remedy) from error
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

@@ -23,6 +23,7 @@ from uuid import uuid4
 
 from device import atomic_io
 from device.errors import SettingError
+from device.user_files import files_in
 from services.lab.archive.content import file_digest
 from services.lab.archive.plan import Plan, encoded, read_plan
 from services.lab.reconstruct_file import write_or_raise
@@ -155,7 +156,7 @@ class ResultFolder:
 
     def quarantined(self) -> Iterator[Quarantined]:
         """Yield every capture in quarantine, sorted by name."""
-        for path in sorted(self._quarantine.glob("[!.]*.json")):
+        for path in files_in(self._quarantine, "*.json"):
             entries = _document(path)
             yield Quarantined(**entries)
 

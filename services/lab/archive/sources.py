@@ -13,6 +13,7 @@ from typing import Literal
 from device.calibration.archive import MANIFEST, Archive
 from device.config.image_files import SUFFIXES
 from device.errors import CalibrationError, SettingError
+from device.user_files import files_in
 from services.lab.archive.plan import COLOUR_ROLES, Role
 from services.lab.dataset_pairs import Entry
 from services.lab.datasets import open_dataset
@@ -113,13 +114,13 @@ def archived_calibrations(folder: Path) -> dict[str, Path]:
     """Return the folder of each archived calibration below a folder (at most three levels), by its id."""
     found: dict[str, Path] = {}
     for pattern in (f"*/{MANIFEST}", f"*/*/{MANIFEST}", f"*/*/*/{MANIFEST}"):
-        found |= {path.parent.name: path.parent for path in sorted(folder.glob(pattern))}
+        found |= {path.parent.name: path.parent for path in files_in(folder, pattern)}
     return found
 
 
 def _of_store(store: Path, calibrations: Mapping[str, Path]) -> Iterator[FoundCapture]:
     unusable = {id: refusal for id, folder in calibrations.items() if (refusal := _refusal(folder))}
-    places = sorted(path for path in (store / "captures").iterdir() if path.is_dir() and path.name[:1] != ".")
+    places = [path for path in files_in(store / "captures") if path.is_dir()]
     for place in places:
         yield _stored(store, place, calibrations, unusable)
 
@@ -206,12 +207,12 @@ def _digests(files: object) -> dict[str, str]:
 
 def _exports(source: Path) -> list[Path]:
     """Return the folders of exported visits in a folder, or the folder itself."""
-    return [path.parent for path in sorted([*source.glob("visit.json"), *source.glob("*/visit.json")])]
+    return [path.parent for path in files_in(source, "visit.json", "*/visit.json")]
 
 
 def _of_export(visit: Path) -> Iterator[FoundCapture]:
     """Yield the captures of an exported visit: an export has pictures and reports, and no raw frames."""
-    for picture in sorted(visit.glob("*.png")):
+    for picture in files_in(visit, "*.png"):
         raw = visit / f"{picture.stem}.tiff"
         reason = "an export holds no raw frame; give the store or its backup instead"
         yield FoundCapture(f"{visit.name}/{picture.stem}", raw, before=picture, refused=reason)
@@ -277,7 +278,7 @@ def _colour_psfs(folder: Path) -> tuple[tuple[OtherColour, Path], ...]:
 
 def _images(folder: Path) -> dict[str, Path]:
     """Return the image files of a folder by stem."""
-    return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES}
+    return {path.stem: path for path in files_in(folder) if path.suffix.lower() in SUFFIXES}
 
 
 def _beside(folder: Path, stem: str) -> Path | None:

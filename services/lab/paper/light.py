@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from device.config.head_file import CameraSpec, load_head
 from device.sim.optical_setup import Scene
+from device.user_files import files_in
 from device.values import Image
 from services import resources
 from services.lab.paper.bench import SCENES, Bench, SimulatedFrame
@@ -66,7 +67,7 @@ def human_light(name: str) -> HumanLight:
 
 def shipped_heads() -> list[str]:
     """Return the names of the head files without extension, without those that have no lamp."""
-    return sorted(path.stem for path in resources.HEADS.glob("*.toml") if load_head(path).light.backend != "none")
+    return [path.stem for path in files_in(resources.HEADS, "*.toml") if load_head(path).light.backend != "none"]
 
 
 def head_pictures(bench: Bench, names: Sequence[str]) -> dict[str, HeadPictures]:
