@@ -5,6 +5,7 @@ from pathlib import Path
 
 from device.config.image_files import SUFFIXES
 from device.errors import PsfError
+from device.user_files import files_in
 from services.lab.datasets import natural_order
 from services.lab.reconstruct_inputs import Source
 
@@ -21,7 +22,7 @@ def psf_stack(sources: Sequence[Source]) -> tuple[Source, ...]:
 
 
 def _images(folder: Path) -> list[Path]:
-    names = [path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != "."]
+    names = [path.name for path in files_in(folder) if path.suffix.lower() in SUFFIXES]
     if not names:
         raise PsfError(f"the folder {folder} holds no PSF", f"Give a folder of PSFs as {', '.join(SUFFIXES)}.")
     return [folder / name for name in sorted(names, key=natural_order)]
