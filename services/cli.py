@@ -312,10 +312,10 @@ def light_for_meter(
     spec = measured_light.in_colour(spec, colour) if colour else spec
     run = power_meter.run_of(spec, level, seconds)
     typer.echo(power_meter.announcement(run))
-    typer.confirm("A power meter stands at the pupil, and no person looks in?", abort=True)
+    typer.confirm("A power meter stands behind the hole on the axis, and no person looks in?", abort=True)
     power_meter.give_pulses(run, data or _default_data(), SystemClock(), _progress)
-    shown_mw = typer.prompt("Reading in mW", type=float)
-    verdict = power_meter.judge_reading(run, shown_mw, peak=peak)
+    shown_uw = typer.prompt("Reading in uW", type=float)
+    verdict = power_meter.judge_reading(run, shown_uw, peak=peak)
     typer.echo(power_meter.words(head, run, verdict))
     raise typer.Exit(0 if verdict.is_go else 1)
 
@@ -323,7 +323,7 @@ def light_for_meter(
 @app.command("light")
 def judge_light(
     head: Annotated[Path, typer.Option(help="Head file whose ring was measured.")],
-    power_mw: Annotated[float, typer.Option(min=0, help="Of the whole ring, one colour, as diffuscope meter asks.")],
+    axis_uw: Annotated[float, typer.Option(min=0, help="Power behind the hole on the axis, as diffuscope meter asks.")],
     waist_mw_per_cm2: Annotated[float, typer.Option(min=0, help="Mean over the brightest disc of 1 mm in the waist.")],
     peak_nm: Annotated[float, typer.Option(min=400, max=700, help="Peak wavelength.")],
     meter: Annotated[str, typer.Option(help="Instrument and date of the reading.")],
@@ -336,16 +336,17 @@ def judge_light(
 
     A reading that such a ring cannot give is refused. The exit status is 1 for NO GO.
     """
+    from device.light_safety.hazard import light_limits
     from services.lab import measured_light, optics_report
 
     spec = load_head(head)
     if colour:
         spec = measured_light.in_colour(spec, colour)
     reading = measured_light.MeterReading(
-        spec.light.colour, power_mw, waist_mw_per_cm2, peak_nm, meter, guard_factor, fwhm_nm
+        spec.light.colour, axis_uw, waist_mw_per_cm2, peak_nm, meter, guard_factor, fwhm_nm
     )
     reading = reading.scaled(level)
-    found = measured_light.judge(spec, optics_report.design_of(spec), reading)
+    found = measured_light.judge(spec, optics_report.design_of(spec), reading, light_limits())
     typer.echo(measured_light.words(reading, found))
     raise typer.Exit(0 if found.is_go else 1)
 

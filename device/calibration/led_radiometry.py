@@ -32,6 +32,7 @@ POWER_MW = (1e-4, 1.0)
 WAIST_MW_PER_CM2 = (1e-2, 130.0)
 MIN_POWER_SHARE = 0.25  # of the strongest of the same colour: a weaker LED is broken or was misaligned with the meter
 MAX_METER_RATIO = 1.3  # largest ratio between two readings of one beam
+MOST_CENTRE_OVER_MEAN = 1.4  # highest irradiance of a retina over that of the power spread evenly (OPTICS.md 4.9)
 EYE_MM = 17.0  # focal length of the eye model of the exposure limits
 COLOURS: tuple[Colour, ...] = ("red", "green", "blue")
 
@@ -177,14 +178,15 @@ def _trims(readings: list[_StoredReading | None]) -> tuple[float, ...] | None:
 def _beam(readings: list[_StoredReading | None], trims: tuple[float, ...], field_deg: float) -> BeamSpec | None:
     """Return the beam of the whole ring in one colour; None if any LED is unknown.
 
-    The shortest wavelength counts for all LEDs and the waist irradiances are added: the worst case of the readings.
+    The shortest wavelength counts for all LEDs and the waist irradiances are added: the worst case of the readings. A
+    power does not say how the light is spread over the field, so the narrowest cap within its tolerances is assumed.
     """
     known = [(one.nm, one.mw, one.waist_mw_per_cm2) for one in readings if one is not None]
     powers = [mw for _, mw, _ in known if mw is not None]
     waists = [waist for _, _, waist in known if waist is not None]
     if not len(powers) == len(waists) == len(trims):
         return None
-    lit_cm2 = pi * (EYE_MM / 10 * tan(radians(field_deg / 2))) ** 2
+    lit_cm2 = pi * (EYE_MM / 10 * tan(radians(field_deg / 2))) ** 2 / MOST_CENTRE_OVER_MEAN
     return BeamSpec(
         wavelength_um=min(nm for nm, _, _ in known) / 1000,
         retina_mw_per_cm2=sum(trim * mw for trim, mw in zip(trims, powers, strict=True)) / lit_cm2,

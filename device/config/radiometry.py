@@ -13,8 +13,9 @@ FIELD_DEG = 33.4  # the paper's; default of a head without [optics]
 
 
 class BeamSpec(Table):
-    """Irradiance of one colour with the whole ring at full drive: on the retina, and in the waist of the beam.
+    """Irradiance of one colour with the whole ring at full drive: the highest of a retina, and in the beam's waist.
 
+    `retina_mw_per_cm2` is the highest local one, intensity on the axis over the square of 17 mm (OPTICS.md 4.9).
     `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm diameter. `wavelength_um` is the peak of the spectrum
     and `fwhm_um` its full width at half maximum.
     """

@@ -12,12 +12,14 @@ from device.optics.eye import Relay, reflex_free_mm, size_mm
 from device.optics.illumination import (
     LED,
     MEAN_OVER_PEAK,
+    TRANSMISSION_TO_EYE,
     Led,
     PhotonBudget,
     half_period_deg,
     photon_budget,
     within_simulated_range,
 )
+from device.optics.led_cap import LedCap, axis_mw_per_sr, cap_height_mm, highest_mw_per_cm2
 from device.optics.light_path import LightPath, relay_of
 from device.optics.matrix import (
     EMITTER_MM,
@@ -64,6 +66,23 @@ class Design:
     def share_in_pupil(self) -> float:
         """Share of the ring's light that passes the eye's pupil, 0 to 1."""
         return share_in_pupil(self.chain, self.relay.angular_magnification, self.emitter_mm, self.pupil_mm)
+
+    @property
+    def cap(self) -> LedCap:
+        """Hole before each LED, as long as makes the cone of the field."""
+        hole_mm, half_deg = self.path.cap.hole_mm, self.relay.led_cone_deg(self.optics.field_deg) / 2
+        return LedCap(hole_mm, cap_height_mm(hole_mm, half_deg), self.emitter_mm)
+
+    @property
+    def axis_mw_per_sr(self) -> float:
+        """Intensity of the whole ring on the axis behind the pupil at full drive, mW/sr."""
+        ring_mw = len(ring(self.chain)) * self.led.power_mw
+        return axis_mw_per_sr(ring_mw, self.relay.angular_magnification, TRANSMISSION_TO_EYE)
+
+    @property
+    def highest_mw_per_cm2(self) -> float:
+        """Highest local irradiance of the retina of the light path's eye at full drive, mW/cm2."""
+        return highest_mw_per_cm2(self.axis_mw_per_sr, self.path.eye.focal_mm)
 
     @property
     def relay(self) -> Relay:
@@ -133,7 +152,7 @@ def design_of_head(path: LightPath, spec: InstrumentSpec) -> Design:
     )  # fmt: skip
     if found.measured is None:
         return found
-    times = found.measured.retina_mw_per_cm2 / _whole_light(found).retina_mw_per_cm2
+    times = found.measured.retina_mw_per_cm2 / found.highest_mw_per_cm2
     return replace(found, led=replace(found.led, power_mw=times * found.led.power_mw))
 
 

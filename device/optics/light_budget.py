@@ -22,6 +22,7 @@ CELL_UM = 10.0
 ENOUGH_E = 5000.0  # electrons per cell of 10 um that a picture of vessels should have: an estimate by eye, no source
 METER_SPREAD = 0.13  # of a measured ring: 1.3, the least guard factor, in 95 %
 DRAWS = 20000
+CONE = "share in the cone"
 Cause = Literal["safety", "LED", "coupling", "polarisers", "splitter", "pupil", "eye", "pixel", "exposure"]
 
 
@@ -111,7 +112,7 @@ def _lamp(design: Design, level: float) -> list[Factor]:
         Factor("drive", level, "", 0.0, "safety", "full drive, or what the light limits permit", 1.0),
         Factor("LEDs", len(ring(design.chain)), "", 0.0, "LED", places),
         Factor("power of an LED", design.led.power_mw, "mW", 0.35, "LED", "estimate; a factor of two until measured"),
-        Factor("share in the cone", sin(radians(half_deg)) ** 2, "", 0.1, "coupling",
+        Factor(CONE, sin(radians(half_deg)) ** 2, "", 0.1, "coupling",
                f"sin^2 of {half_deg:.1f} deg, Lambertian emitter", 1.0),
         Factor("polariser", 0.42, "", 0.1, "polarisers", "film, unpolarised light", 1.0),
         Factor("splitter to the eye", 0.5, "", 0.05, "splitter", "50:50 plate", 1.0),

@@ -31,8 +31,14 @@ class EyeSpec(Table):
     pupil_mm: float = Field(gt=0, le=10)
 
 
+class CapSpec(Table):
+    """Cap of the LEDs: width of the hole before each; its length follows from the field."""
+
+    hole_mm: float = Field(gt=0, le=20)
+
+
 class LightPath(Table):
-    """Components from the eye to the sensor, and the ring of LEDs.
+    """Components from the eye to the sensor, and the ring of LEDs with its cap.
 
     `layout`, `lens` and `glass` are the real lenses of the ray trace (`traced_relay.py`); a file may leave them out.
     """
@@ -41,6 +47,7 @@ class LightPath(Table):
     optics: OpticsSpec
     relay: RelaySpec
     ring: ChainSpec
+    cap: CapSpec
     eye: EyeSpec
     layout: LayoutSpec | None = None
     lens: dict[str, LensSpec] = Field(default_factory=dict)

@@ -5,10 +5,11 @@ y points from the plate to the LEDs, x along the rows of their board. All length
 """
 
 from dataclasses import dataclass
-from math import cos, radians, sin, sqrt, tan
+from math import cos, radians, sin, sqrt
 from pathlib import Path
 
 from device.errors import SpecError
+from device.optics.led_cap import cap_height_mm
 from device.optics.lens_data import LayoutSpec, named_glass
 from device.optics.light_path import LightPath, load_light_path, relay_of
 from device.optics.matrix import led_positions_mm, ring
@@ -152,15 +153,15 @@ class Dimensions:
 
     @property
     def led_hole_mm(self) -> float:
-        """Width of the cap's holes: what the board's pitch leaves after a wall."""
-        return self.path.ring.pitch_mm - self.fit.baffle_mm - 2 * self.fit.slide_mm
+        """Width of the cap's holes."""
+        return self.path.cap.hole_mm
 
     @property
     def cap_end_y_mm(self) -> float:
         """Where the cap's holes end, so that the middle of an LED sees the cone of the field and no more."""
         relay = relay_of(self.path, self.path.optics)
         half_deg = relay.led_cone_deg(self.path.optics.field_deg) / 2
-        return self.led_y_mm - self.led_hole_mm / 2 / tan(radians(half_deg))
+        return self.led_y_mm - cap_height_mm(self.led_hole_mm, half_deg)
 
     @property
     def cap_front_y_mm(self) -> float:

@@ -5,17 +5,19 @@ meter's reading; the electrons are those that the design's pupil lets in.
 """
 
 from dataclasses import dataclass, replace
-from math import ceil, floor, log10, radians
+from math import floor, log10, pi, radians
 
 import numpy as np
 
 from device.config.radiometry import LED_FWHM_UM, WAIST_CM2
 from device.errors import SettingError
 from device.light_safety.hazard import Beam, Hazard, Limits, light_limits, worst_beam
-from device.optics.budget import Design, lit_area_cm2
+from device.optics.budget import Design
 from device.optics.illumination import MEAN_OVER_PEAK, half_period_deg, within_simulated_range
+from device.optics.led_cap import relative_irradiance
 from device.optics.light_budget import (
     CELL_UM,
+    CONE,
     DRAWS,
     ENOUGH_E,
     Factor,
@@ -27,14 +29,17 @@ from device.optics.light_budget import (
     simulated,
     to_cornea,
 )
-from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm
+from device.optics.matrix import inner_ring_at_pupil_mm, ring
 from device.values import Illumination
+from services.lab import light_tolerances
 from services.lab.plot import STYLE, line, text
 
 GUARD = 1.3  # factor of a measured ring, the least that a head file may have
 REFERENCE_CELL_UM = 5.04
 SMALL_PUPIL_MM = 7.0  # beside that of the design: what dilates less
-HOLE_MARGIN_MM = 0.3  # of a meter's hole, so that it need not be centred to better than 0.15 mm
+AXIS_HOLE_MM, AXIS_DISTANCE_MM = 5.0, 100.0  # hole before a power meter, on the axis, so far behind the pupil
+EDGE_DEG = (10.0, 14.0, 16.7, 20.0)  # off the axis
+AXIS_HOLE_SR = pi * (AXIS_HOLE_MM / 2 / AXIS_DISTANCE_MM) ** 2
 WEIGHT_SPREAD = 0.2  # of ln A(lambda) over a bin of 15 nm of green LEDs, by the slope of ln 10 / 50 nm
 
 
@@ -66,19 +71,9 @@ class FullDrive:
     electrons: Spread
 
 
-def meter_hole_mm(design: Design) -> float:
-    """Return the diameter of the hole before a power meter at the eye's pupil, mm: the whole ring shines through it.
-
-    A smaller one, such as a pupil of 7 mm, cuts the spots of the LEDs off, and the meter would miss most of the light.
-    """
-    magnification = design.relay.angular_magnification
-    ring_mm = ring_at_pupil_mm(design.chain, magnification) + magnification * design.emitter_mm
-    return float(ceil(ring_mm + HOLE_MARGIN_MM))
-
-
-def expected_mw(design: Design) -> float:
-    """Return the power that the light budget expects behind the meter's hole at full drive, mW."""
-    return cornea_mw(chain(design))
+def expected_uw(design: Design) -> float:
+    """Return the power that the light budget expects behind the hole on the axis at full drive, uW."""
+    return 1000 * design.axis_mw_per_sr * AXIS_HOLE_SR
 
 
 def expected_beam(design: Design) -> Beam:
@@ -91,25 +86,24 @@ def expected_beam(design: Design) -> Beam:
         scale = table.guard_factor / 1000
         retina, waist = measured.retina_mw_per_cm2, measured.waist_mw_per_cm2
         return Beam(measured.wavelength_um, scale * retina, scale * waist, measured.fwhm_um)
-    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.path.eye.focal_mm)
-    scale, power_mw = GUARD / 1000, expected_mw(design)
-    waist = power_mw / len(ring(design.chain)) / WAIST_CM2
-    return Beam(design.led.wavelength_um, scale * power_mw / lit_cm2, scale * waist, LED_FWHM_UM)
+    scale, waist = GUARD / 1000, cornea_mw(chain(design)) / len(ring(design.chain)) / WAIST_CM2
+    return Beam(design.led.wavelength_um, scale * design.highest_mw_per_cm2, scale * waist, LED_FWHM_UM)
 
 
 def at_full_drive(design: Design, frames: int = 1) -> FullDrive:
     """Return what builds of a design give at full drive, each factor of the chain log-normal and drawn once a build.
 
-    The share has those of the chain up to the cornea, and of an unmeasured ring the wavelength's within a bin.
+    The share has those of the chain up to the cornea without the cone, which the intensity on the axis does not depend
+    on, and of an unmeasured ring the wavelength's within a bin.
     """
     factors, rng = chain(design, frames=frames), np.random.default_rng(0)
-    before = len(to_cornea(factors))
+    bright = [i for i, factor in enumerate(to_cornea(factors)) if factor.name != CONE]
     spreads = np.array([factor.spread for factor in factors])
     logs = rng.standard_normal((DRAWS, len(factors))) * spreads
     weight = 0.0 if design.measured else WEIGHT_SPREAD
     bins = weight * rng.standard_normal(DRAWS)
     used = limit_shares(design, expected_beam(design), light_limits())[0].used
-    share = used * np.exp(logs[:, :before].sum(axis=1) + bins)
+    share = used * np.exp(logs[:, bright].sum(axis=1) + bins)
     electrons = product(factors) * np.exp(logs.sum(axis=1)) * np.minimum(1, 1 / share)
     (low, half, high), (low_e, half_e, high_e) = (np.quantile(one, (0.05, 0.5, 0.95)) for one in (share, electrons))
     return FullDrive(
@@ -171,6 +165,7 @@ def table(design: Design, frames: int = 1) -> str:
         f"electrons in a cell of {CELL_UM:g} um",
         *_chain_lines(design, factors, frames), "",
         *_limit_lines(design, limits, frames), *_build_lines(design, frames), "",
+        *_edge_lines(design, limits), "",
         *_gain_lines(factors),
     ])  # fmt: skip
 
@@ -229,6 +224,21 @@ def _build_lines(design: Design, frames: int) -> list[str]:
         f"  median {electrons.median:.0f} electrons, 90 % {electrons.low:.0f} to {electrons.high:.0f}, half-period "
         f"{_half_period(design, electrons.median)} um",
     ]
+
+
+def _edge_lines(design: Design, limits: Limits) -> list[str]:
+    """Return how the light falls towards the field's edge, and the tolerances."""
+    cap, magnification = design.cap, design.relay.angular_magnification
+    shares = relative_irradiance(cap, magnification, EDGE_DEG)
+    used = limit_shares(design, expected_beam(design), limits)[0].used
+    return [
+        "the limits count the highest irradiance of a retina, that of the axis: "
+        f"{design.highest_mw_per_cm2:.3g} mW/cm2 by {design.axis_mw_per_sr:.3g} mW/sr;",
+        "of it " + ", ".join(f"{share:.2f} at {deg:g} deg" for share, deg in zip(shares, EDGE_DEG, strict=True))
+        + f" off the axis: a die of {cap.emitter_mm:g} mm shines through a hole of {cap.hole_mm:g} mm that ends "
+        f"{cap.height_mm:.2f} mm before it",
+        *light_tolerances.table(light_tolerances.tolerances(design, used, limits)),
+    ]  # fmt: skip
 
 
 def _gain_lines(factors: tuple[Factor, ...]) -> list[str]:

@@ -6,26 +6,38 @@ from typing import get_args
 from device.config.head_file import InstrumentSpec
 from device.config.radiometry import LED_FWHM_UM, WAIST_CM2, BeamSpec, RadiometrySpec
 from device.errors import SettingError, SpecError
-from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
-from device.optics.budget import Design, lit_area_cm2
+from device.light_safety.hazard import LED_POWER_UNCERTAINTY, Limits
+from device.optics.budget import Design
 from device.optics.illumination import TRANSMISSION_TO_EYE
+from device.optics.led_cap import highest_mw_per_cm2
+from device.optics.light_budget import chain, cornea_mw
 from device.optics.matrix import lamps_of
 from device.values import Colour
-from services.lab.light_report import LimitShare, expected_beam, expected_mw, limit_shares, permitted_level
+from services.lab.light_report import (
+    AXIS_HOLE_SR,
+    LimitShare,
+    expected_beam,
+    expected_uw,
+    limit_shares,
+    permitted_level,
+)
 
 PEAK_TOLERANCE_UM = 0.02  # between data sheet and reading
+MOST_OF_BEAM = 1.3  # in the waist's disc, of the beam by the reading on the axis: the error of two readings
 
 
 @dataclass(frozen=True)
 class MeterReading:
-    """Reading of the whole ring in one colour at full drive: power through `meter_hole_mm`, mW, and in the waist.
+    """Reading of the whole ring in one colour at full drive: on the axis, and in the waist.
 
-    `waist_mw_per_cm2` is the mean over the brightest disc of 1 mm; `meter` names instrument and date; `fwhm_nm` is the
-    spectrum's width. `scaled` makes it of a reading at less than full drive.
+    `axis_uw` is the highest power behind a hole of AXIS_HOLE_MM, AXIS_DISTANCE_MM behind the pupil: it gives the
+    intensity, and so the highest irradiance of a retina (OPTICS.md 4.9). `waist_mw_per_cm2` is the mean over the
+    brightest disc of 1 mm; `meter` names instrument and date; `fwhm_nm` is the spectrum's width. `scaled` makes it of a
+    reading at less than full drive.
     """
 
     colour: Colour
-    power_mw: float
+    axis_uw: float
     waist_mw_per_cm2: float
     peak_nm: float
     meter: str
@@ -34,7 +46,7 @@ class MeterReading:
 
     def scaled(self, level: float) -> "MeterReading":
         """Return the reading at full drive of one that was taken at `level` (0 to 1] of it: the drive is a PWM."""
-        return replace(self, power_mw=self.power_mw / level, waist_mw_per_cm2=self.waist_mw_per_cm2 / level)
+        return replace(self, axis_uw=self.axis_uw / level, waist_mw_per_cm2=self.waist_mw_per_cm2 / level)
 
 
 @dataclass(frozen=True)
@@ -66,42 +78,47 @@ def in_colour(spec: InstrumentSpec, colour: str) -> InstrumentSpec:
     return spec.model_copy(update={"light": spec.light.model_copy(update={"colour": found})})
 
 
-def judge(spec: InstrumentSpec, design: Design, reading: MeterReading) -> MeteredLight:
+def judge(spec: InstrumentSpec, design: Design, reading: MeterReading, limits: Limits) -> MeteredLight:
     """Return the judgement of a reading; `design` is that of the head in the reading's colour.
 
     SpecError for a head without LEDs of its own, or not of that colour. SettingError for a reading that such LEDs
-    cannot give: more power than lossless optics with LEDs twice as bright, more in the waist's disc than in the beam,
-    another wavelength; and for one below a thousandth of what is expected, of a lamp that was off.
+    cannot give: more power than lossless optics with LEDs twice as bright, more in the waist's disc than such LEDs
+    have, another wavelength; and for one below a thousandth of what is expected, of a lamp that was off.
     """
     lamp = (lamps_of(spec) or {}).get(reading.colour)
     if lamp is None:
         raise SpecError(f"{spec.name} has no {reading.colour} LEDs", "Give the head file whose ring was measured.")
     unmeasured = replace(design, led=lamp.led, radiometry=None)
-    _refuse_implausible(reading, lamp.led.wavelength_um, expected_mw(unmeasured))
-    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.path.eye.focal_mm)
+    _refuse_implausible(reading, lamp.led.wavelength_um, unmeasured)
+    intensity_mw_per_sr = reading.axis_uw / 1000 / AXIS_HOLE_SR
     beam = BeamSpec(
         wavelength_um=reading.peak_nm / 1000, fwhm_um=reading.fwhm_nm / 1000,
-        retina_mw_per_cm2=reading.power_mw / lit_cm2, waist_mw_per_cm2=reading.waist_mw_per_cm2,
+        retina_mw_per_cm2=highest_mw_per_cm2(intensity_mw_per_sr, design.path.eye.focal_mm),
+        waist_mw_per_cm2=reading.waist_mw_per_cm2,
     )  # fmt: skip
     found = RadiometrySpec(
         measured=reading.meter, guard_factor=reading.guard_factor, **{reading.colour: beam}
     )  # the other colours stay at their worst
-    shares = limit_shares(design, expected_beam(replace(design, radiometry=found)), light_limits())
+    shares = limit_shares(design, expected_beam(replace(design, radiometry=found)), limits)
     return MeteredLight(found, shares, permitted_level(shares))
 
 
-def _refuse_implausible(reading: MeterReading, wavelength_um: float, usual_mw: float) -> None:
-    most_mw = usual_mw * LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE
-    if not usual_mw / 1000 < reading.power_mw <= most_mw:
+def _refuse_implausible(reading: MeterReading, wavelength_um: float, unmeasured: Design) -> None:
+    """Raise SettingError for a reading that the ring of an unmeasured design cannot give."""
+    usual_uw = expected_uw(unmeasured)
+    brightest = LED_POWER_UNCERTAINTY / TRANSMISSION_TO_EYE
+    if not usual_uw / 1000 < reading.axis_uw <= usual_uw * brightest:
         raise SettingError(
-            f"{reading.power_mw:g} mW are not between {usual_mw / 1000:.2g} and {most_mw:.2g} mW, which such a ring "
-            f"can give; {usual_mw:.2g} mW are expected",
-            "Check the meter's range and wavelength, that the lamp was on in this colour, and the head file.",
+            f"{reading.axis_uw:g} uW are not between {usual_uw / 1000:.2g} and {usual_uw * brightest:.2g} uW, which "
+            f"such a ring can give behind the hole on the axis; {usual_uw:.2g} uW are expected",
+            "Check the hole, its distance, the meter's range and wavelength, that the lamp was on in this colour, and "
+            "the head file.",
         )
-    if reading.waist_mw_per_cm2 * WAIST_CM2 > 1.3 * reading.power_mw:
+    beam_mw = cornea_mw(chain(unmeasured)) * reading.axis_uw / usual_uw
+    if reading.waist_mw_per_cm2 * WAIST_CM2 > MOST_OF_BEAM * beam_mw:
         raise SettingError(
-            f"{reading.waist_mw_per_cm2:g} mW/cm2 over a disc of 1 mm are more than the {reading.power_mw:g} mW of "
-            "the whole beam",
+            f"{reading.waist_mw_per_cm2:g} mW/cm2 over a disc of 1 mm are more than the {beam_mw:.2g} mW of the whole "
+            f"beam, by {reading.axis_uw:g} uW on the axis",
             "Measure both again.",
         )
     if abs(reading.peak_nm / 1000 - wavelength_um) > PEAK_TOLERANCE_UM:

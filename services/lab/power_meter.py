@@ -21,9 +21,8 @@ from device.errors import SettingError
 from device.head import hazard_of, open_light, refuse_without_lamp, with_calibrated_light
 from device.light_safety.dose_ledger import Ledger
 from device.light_safety.hazard import LED_POWER_UNCERTAINTY, light_limits
-from device.optics.budget import lit_area_cm2
 from device.values import Illumination
-from services.lab.light_report import GUARD, expected_mw, meter_hole_mm
+from services.lab.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, AXIS_HOLE_SR, GUARD, expected_uw
 from services.lab.optics_report import design_of
 from services.records.capture_store import CaptureStore
 from services.records.dose_ledger_tables import DoseLedgerStore
@@ -35,10 +34,10 @@ LAMP_OFF_SHARE = 1e-3  # of the expected power: below, the meter saw no lamp
 
 @dataclass(frozen=True)
 class MeterRun:
-    """What shines in pulses of `on_s` with equal pauses, and powers behind a hole of `hole_mm` while it is lit, mW.
+    """What shines in pulses of `on_s` with equal pauses, and powers behind the hole on the axis while it is lit, uW.
 
-    `expected_mw` is that of the light budget. No reading may exceed `assumed_mw`, which the guard counts for this
-    level, or `permitted_mw`, with which an eye has the instrument's limit, by the LEDs' spectrum and with a factor of
+    `expected_uw` is that of the light budget. No reading may exceed `assumed_uw`, which the guard counts for this
+    level, or `permitted_uw`, with which an eye has the instrument's limit, by the LEDs' spectrum and with a factor of
     1.3 for the meter's error.
     """
 
@@ -46,17 +45,16 @@ class MeterRun:
     glow: Illumination
     on_s: float
     count: int
-    hole_mm: float
-    expected_mw: float
-    assumed_mw: float
-    permitted_mw: float
+    expected_uw: float
+    assumed_uw: float
+    permitted_uw: float
 
 
 @dataclass(frozen=True)
 class MeterVerdict:
-    """Reading while the ring is lit, mW, and whether it is one with which an eye could be lit at this level."""
+    """Reading while the ring is lit, uW, and whether it is one with which an eye could be lit at this level."""
 
-    power_mw: float
+    axis_uw: float
     is_go: bool
 
 
@@ -71,19 +69,18 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     glow = Illumination(colour, hazard.highest_level(colour) if level is None else level)
     hazard.refuse(glow)
     limits, beam = hazard.limits, hazard.beams[colour]
-    lit_cm2 = lit_area_cm2(design.optics.field_deg, design.eye_mm)
     spectrum = beam.wavelength_um, beam.fwhm_um or LED_FWHM_UM
     most_w_per_cm2 = min(
         limits.photochemical_w_per_cm2 / limits.photochemical_weight.of_spectrum(*spectrum),
         limits.thermal_w_per_cm2 / limits.thermal_weight.of_spectrum(*spectrum),
     )
+    uw_per_w_per_cm2 = 1e6 * (design.path.eye.focal_mm / 10) ** 2 * AXIS_HOLE_SR  # I = E f^2, into the hole
     on_s = ON_SHARE * spec.light.max_on_s
     return MeterRun(
         spec, glow, on_s, ceil(seconds * DUTY / on_s),
-        hole_mm=meter_hole_mm(design),
-        expected_mw=glow.level * expected_mw(design),
-        assumed_mw=glow.level * 1000 * beam.retina_w_per_cm2 * lit_cm2,
-        permitted_mw=1000 * most_w_per_cm2 * lit_cm2 / GUARD,
+        expected_uw=glow.level * expected_uw(design),
+        assumed_uw=glow.level * uw_per_w_per_cm2 * beam.retina_w_per_cm2,
+        permitted_uw=uw_per_w_per_cm2 * most_w_per_cm2 / GUARD,
     )  # fmt: skip
 
 
@@ -107,19 +104,19 @@ def pulse(run: MeterRun, ledger: Ledger, clock: Clock, progress: Callable[[str],
             clock.sleep(clock.now_s() - begin_s)  # as long as the lamp took in fact: no light is left to repay
 
 
-def judge_reading(run: MeterRun, shown_mw: float, *, peak: bool = False) -> MeterVerdict:
-    """Return the judgement of a meter's reading, mW; `peak`: it is that while the ring is lit, else the mean.
+def judge_reading(run: MeterRun, shown_uw: float, *, peak: bool = False) -> MeterVerdict:
+    """Return the judgement of a meter's reading, uW; `peak`: it is that while the ring is lit, else the mean.
 
     The mean over pulses and pauses is half of it: what a slow meter shows must not pass for the whole. SettingError for
     a reading of a lamp that was off.
     """
-    power_mw = shown_mw if peak else shown_mw / DUTY
-    if power_mw <= LAMP_OFF_SHARE * run.expected_mw:
+    axis_uw = shown_uw if peak else shown_uw / DUTY
+    if axis_uw <= LAMP_OFF_SHARE * run.expected_uw:
         raise SettingError(
-            f"{shown_mw:g} mW is no light: {run.expected_mw:.2g} mW are expected",
+            f"{shown_uw:g} uW is no light: {run.expected_uw:.2g} uW are expected",
             "Check that the meter stands in the beam, its range and wavelength, and that the gate has power.",
         )
-    return MeterVerdict(power_mw, power_mw <= min(run.assumed_mw, run.permitted_mw))
+    return MeterVerdict(axis_uw, axis_uw <= min(run.assumed_uw, run.permitted_uw))
 
 
 def announcement(run: MeterRun) -> str:
@@ -127,28 +124,29 @@ def announcement(run: MeterRun) -> str:
     return "\n".join([
         f"{run.spec.name}: {run.glow.colour} at {run.glow.level:g} of full drive, {run.count} pulses of {run.on_s:g} s "
         "with equal pauses",
-        f"through a hole of {run.hole_mm:g} mm at the eye's pupil, the sensor as wide and within 1 mm of it:",
-        f"expected {run.expected_mw:.3g} mW within a factor of two; the guard counts {run.assumed_mw:.3g} mW; "
-        f"an eye may have {run.permitted_mw:.3g} mW",
+        f"through a hole of {AXIS_HOLE_MM:g} mm on the axis, {AXIS_DISTANCE_MM:g} mm behind the eye's pupil, where the "
+        "reading is highest; nothing stands in the pupil:",
+        f"expected {run.expected_uw:.3g} uW within a factor of two; the guard counts {run.assumed_uw:.3g} uW; "
+        f"an eye may have {run.permitted_uw:.3g} uW",
     ])  # fmt: skip
 
 
 def words(head: Path, run: MeterRun, verdict: MeterVerdict) -> str:
     """Return GO or NO GO with the reason, and the command that judges the ring at full drive."""
-    shown = f"{verdict.power_mw:.3g} mW"
-    if verdict.power_mw > run.permitted_mw:
-        return f"NO GO: {shown} are more than the {run.permitted_mw:.3g} mW that an eye may have"
+    shown = f"{verdict.axis_uw:.3g} uW"
+    if verdict.axis_uw > run.permitted_uw:
+        return f"NO GO: {shown} are more than the {run.permitted_uw:.3g} uW that an eye may have"
     if not verdict.is_go:
         return (
-            f"NO GO: {shown} are more than the {run.assumed_mw:.3g} mW that the guard counts for this level: "
+            f"NO GO: {shown} are more than the {run.assumed_uw:.3g} uW that the guard counts for this level: "
             "the LEDs or [light.radiometry] are not those of the head file"
         )
-    times = verdict.power_mw / run.expected_mw
+    times = verdict.axis_uw / run.expected_uw
     usual = 1 / LED_POWER_UNCERTAINTY <= times <= LED_POWER_UNCERTAINTY
     return "\n".join([
         f"GO at this level: {shown}, {times:.2g} times what is expected"
         + ("" if usual else "; look at polarisers, LEDs and the meter's place before you go on"),
         "Measure the brightest disc of 1 mm in the waist as well, and peak and width of the spectrum. Then:",
         f"diffuscope light --head {head} --colour {run.glow.colour} --level {run.glow.level:g} "
-        f'--power-mw {verdict.power_mw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
+        f'--axis-uw {verdict.axis_uw:.4g} --waist-mw-per-cm2 W --peak-nm L --fwhm-nm B --meter "NAME, DATE"',
     ])  # fmt: skip

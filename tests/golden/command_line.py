@@ -54,7 +54,7 @@ CALLS = (  # ordered: later calls use the files of earlier ones
     "doctor --head {0}/none.toml", "frame --head {0}/none.toml -o {0}/f.tiff",
     "frame --head {0}/head.toml -o {0}/f.bmp",
     "meter", "meter --head {0}/none.toml",
-    "light --head {0}/none.toml --power-mw 1 --waist-mw-per-cm2 1 --peak-nm 525 --meter M", "light",
+    "light --head {0}/none.toml --axis-uw 1 --waist-mw-per-cm2 1 --peak-nm 525 --meter M", "light",
     "check --head {0}/head.toml", "check --head {0}/head.toml --archive {0}/none",
     "calibrate --head {0}/head.toml", "calibrate --head {0}/head.toml --archive {0}/a --colours mauve",
     "trial-lenses --head {0}/head.toml", "trial-lenses --head {0}/head.toml --archive {0}/a --vertex-mm 40",

@@ -20,7 +20,7 @@ from device.optics.matrix import inner_ring_at_pupil_mm, ring, ring_at_pupil_mm,
 from device.optics.ray_trace import Surface
 from device.optics.traced_relay import traced_relay
 from services.lab.light_path_plot import draw_light_path
-from services.lab.light_report import at_full_drive, expected_mw
+from services.lab.light_report import AXIS_DISTANCE_MM, AXIS_HOLE_MM, at_full_drive, expected_uw
 from tests.drawings import boxes, overlapping
 from tests.project_files import ROOT, text
 from tests.test_project_files import code_in, unknown_words
@@ -248,9 +248,9 @@ def test_faces_of_the_lens_rims_in_the_guide_are_those_of_the_lens_data() -> Non
 def test_expected_readings_in_the_guide_are_those_of_the_budget() -> None:
     path = load_light_path(HARDWARE / "optics.toml")
     design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
-    full, first = expected_mw(design), 0.252 * expected_mw(design)
+    full, first = expected_uw(design), 0.252 * expected_uw(design)
     guide = " ".join(text("hardware/assembly.md").split())
-    assert f"{full:.3f} mW at full drive, so {first:.3f} mW lit and {first / 2:.3f} mW as the mean" in guide
+    assert f"{full:.2f} uW at full drive, so {first:.2f} uW lit and {first / 2:.2f} uW as the mean" in guide
     weight = light_limits().photochemical_weight
     times = weight.of_spectrum(0.525, LED_FWHM_UM) / weight.at(0.525)
     assert f"{1000 * LED_FWHM_UM:.0f} nm counts {times:.2f} times its peak" in guide
@@ -295,14 +295,21 @@ def test_other_pinholes_of_the_guide_match_the_optics() -> None:
 
 
 def test_width_of_the_meter_in_the_guide_matches_the_optics() -> None:
-    """Behind the pupil the light of the field spreads from the ring of spots, by the widest emitter of a head."""
+    """Behind the hole the light spreads as the ring of spots is seen from it, by the widest emitter of a head."""
     path = load_light_path(HARDWARE / "optics.toml")
     design = design_of_head(path, load_head(HARDWARE / "heads" / "imx296_power.toml"))
     spots_mm = ring_at_pupil_mm(design.chain, 0.75) + 0.75 * design.emitter_mm
-    spread = 2 * tan(radians(path.optics.field_deg / 2))
-    claim = (f"{spots_mm:.1f} mm wide and {spread:.1f} mm more for each millimetre that it lies behind the card: "
-             f"{spots_mm + spread:.1f} mm at 1 mm, {spots_mm + 14 * spread:.1f} mm at 14 mm")  # fmt: skip
+    spread = (spots_mm + AXIS_HOLE_MM) / AXIS_DISTANCE_MM
+    claim = f"a sensor of {AXIS_HOLE_MM + 8 * spread:.0f} mm or more that lies at most 8 mm behind the hole"
     assert claim in " ".join(text("hardware/assembly.md").split())
+
+
+def test_drawing_of_the_meter_has_the_hole_of_the_command() -> None:
+    drawn, guide = text("hardware/pictures/power-meter.svg"), text("hardware/assembly.md")
+    assert "(pictures/power-meter.svg)" in guide
+    for figure in (f"hole of {AXIS_HOLE_MM:g} mm", f"{AXIS_DISTANCE_MM:g} mm"):
+        assert figure in drawn
+        assert figure in guide
 
 
 def printed() -> set[str]:

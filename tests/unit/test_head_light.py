@@ -1,6 +1,5 @@
 """Light of a scene by the budget of a head's LEDs: `[sim] peak_e = "budget"` and `[light] head`."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from device.config.head_file import InstrumentSpec, LightSpec, load_head
 from device.config.radiometry import BeamSpec, RadiometrySpec
 from device.config.shipped_heads import HEADS
 from device.errors import SpecError
-from device.optics.light_budget import chain, product, retina_mw_per_cm2
+from device.optics.light_budget import chain, product
 from device.sim.optical_setup import Scene
 from device.sim.scene_files import simulate
 from device.sim.world import World
@@ -61,7 +60,7 @@ def test_budget_follows_pixels_exposure_and_eye() -> None:
 
 
 def test_measured_irradiance_replaces_the_estimate_and_is_named(tmp_path: Path) -> None:
-    expected = retina_mw_per_cm2(chain(replace(design_of(SIM), pupil_mm=9.0)))  # behind the hole before a meter
+    expected = design_of(SIM).highest_mw_per_cm2
     beam = BeamSpec(wavelength_um=0.522, retina_mw_per_cm2=3 * expected, waist_mw_per_cm2=1.0)
     table = RadiometrySpec(measured="2026-11-02, PM100D", guard_factor=1.3, green=beam)
     measured = SIM.model_copy(update={"light": SIM.light.model_copy(update={"radiometry": table})})

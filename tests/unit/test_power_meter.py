@@ -87,34 +87,34 @@ def test_a_head_without_such_leds_is_refused(head: str, why: str) -> None:
 
 def test_a_reading_above_a_limit_is_no_go_and_says_which() -> None:
     run = run_of(POWER, None, 20)
-    assert run.permitted_mw < run.assumed_mw
+    assert run.permitted_uw < run.assumed_uw
     head = Path("head.toml")
-    for shown_mw, go, says in [
-        (run.expected_mw, True, "1 times"), (3 * run.expected_mw, True, "look at polarisers"),
-        (1.01 * run.permitted_mw, False, "an eye may have"),
+    for shown_uw, go, says in [
+        (run.expected_uw, True, "1 times"), (3 * run.expected_uw, True, "look at polarisers"),
+        (1.01 * run.permitted_uw, False, "an eye may have"),
     ]:  # fmt: skip
-        verdict = judge_reading(run, shown_mw, peak=True)
+        verdict = judge_reading(run, shown_uw, peak=True)
         assert verdict.is_go == go
         assert says in words(head, run, verdict)
-    measured = replace(run, assumed_mw=0.2)
-    assert "the guard counts for this level" in words(head, measured, judge_reading(measured, 0.21, peak=True))
+    measured = replace(run, assumed_uw=1.4)
+    assert "the guard counts for this level" in words(head, measured, judge_reading(measured, 1.5, peak=True))
     with pytest.raises(SettingError, match="no light"):
         judge_reading(run, 1e-5)
 
 
 def test_a_slow_meter_shows_half() -> None:
     run = run_of(POWER, None, 20)
-    assert judge_reading(run, 0.1).power_mw == pytest.approx(0.2), "what may be the mean counts twice"
+    assert judge_reading(run, 1.0).axis_uw == pytest.approx(2.0), "what may be the mean counts twice"
 
 
 def test_a_reading_at_a_level_is_judged_as_at_full_drive() -> None:
-    full = MeterReading("green", 1.3, 43.0, 525.0, "meter X, 2026-11-25")
-    dim = replace(full, power_mw=0.252 * full.power_mw, waist_mw_per_cm2=0.252 * full.waist_mw_per_cm2).scaled(0.252)
-    shares = [judge(POWER, design_of(POWER), one).shares for one in (full, dim)]
+    full = MeterReading("green", 9.0, 43.0, 525.0, "meter X, 2026-11-25")
+    dim = replace(full, axis_uw=0.252 * full.axis_uw, waist_mw_per_cm2=0.252 * full.waist_mw_per_cm2).scaled(0.252)
+    shares = [judge(POWER, design_of(POWER), one, light_limits()).shares for one in (full, dim)]
     assert [one.value for one in shares[1]] == pytest.approx([one.value for one in shares[0]])
 
 
-@pytest.mark.parametrize(("shown", "status", "says"), [("0.14", 0, "GO at this level"), ("9", 1, "NO GO")])
+@pytest.mark.parametrize(("shown", "status", "says"), [("1", 0, "GO at this level"), ("60", 1, "NO GO")])
 def test_the_command_asks_lights_and_judges(tmp_path: Path, shown: str, status: int, says: str) -> None:
     text = small_head_toml("small", exposure_s=0.05).replace("[light]", "[light]\nmax_on_s = 0.1")
     (head := tmp_path / "head.toml").write_text(text)
