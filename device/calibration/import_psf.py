@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from device.config.image_files import (
     Raw,
+    as_companion,
     as_psf,
     as_raw,
     is_marked_simulated,
@@ -17,7 +16,7 @@ from device.config.image_files import (
     saturated_share,
 )
 from device.errors import FrameError, PsfError
-from device.values import Calibration, Psf, Sensor
+from device.values import Calibration, Image, Psf, Sensor
 
 MAX_SATURATED_SHARE = 0.01  # share of the light
 ALWAYS_UNKNOWN = ("serial", "gain_e_per_dn", "read_noise_e", "geometry", "field_deg", "dark_dn", "flat", "bad")
@@ -70,7 +69,7 @@ def _read(path: Path, known: ImportedPsfInfo) -> tuple[Psf, float]:
         array = read_image(path)
         psf = as_psf(array, path.name)
         raw = as_raw(array)
-        dark = None if known.dark is None else read_image(known.dark)
+        dark = None if known.dark is None else as_companion(read_image(known.dark), known.dark.name)
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
     share = saturated_share(psf, raw, known.white_dn)
@@ -82,11 +81,11 @@ def _read(path: Path, known: ImportedPsfInfo) -> tuple[Psf, float]:
     return (psf, share) if dark is None else (_subtract_dark(dark, raw, path.name), share)
 
 
-def _subtract_dark(dark: NDArray[Any], raw: Raw, name: str) -> Psf:
+def _subtract_dark(dark: Image, raw: Raw, name: str) -> Psf:
     """Return the PSF of the raw image less the dark frame; PsfError if their shapes differ."""
     pixels = raw.pixels.astype(np.float32)
     if dark.shape != pixels.shape:
         raise PsfError(f"the dark frame has the shape {dark.shape}, {name} {pixels.shape}", "Give the PSF's own dark.")
-    lit = pixels - dark.astype(np.float32) / np.float32(2**raw.shift)
-    lit[raw.bad] = np.median(lit)
+    lit = pixels - dark / np.float32(2**raw.shift)
+    lit[raw.bad | np.isnan(lit)] = np.nanmedian(lit)
     return as_psf(lit, name)

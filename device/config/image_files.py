@@ -14,6 +14,7 @@ import json
 import struct
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -28,11 +29,11 @@ from PIL import UnidentifiedImageError
 from PIL.PngImagePlugin import PngImageFile
 
 from device.config.bayer import PATTERNS, Bayer
+from device.config.ceiling import CHANCE_PIXELS, ceiling_of
 from device.errors import FrameError, PsfError, SettingError
 from device.values import Image, Mask, Psf
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")  # of the images of a recording's folder
-MIN_SATURATED_PIXELS = 8  # so few pixels may reach the maximum by chance
 MEASURE_PSF = "Give an image of one point of light in a dark room, neither saturated nor processed."
 READABLE = (*SUFFIXES, ".npz", ".dng")
 Pixels = NDArray[Any]
@@ -302,8 +303,9 @@ def write_linear(path: Path, picture: Image) -> None:
 class Raw:
     """Raw image for the solver: uint16 counts or float32, (rows, cols) or (rows, cols, 3).
 
-    `white_dn` is the saturation level (infinite for float) and `bad` the mask of invalid pixels, (rows, cols). `shift`
-    is the number of bits by which left-justified data were shifted right, `stored_bits` the bits of one stored value.
+    Pixels of at least `white_dn` are saturated: the ceiling of a clipped image, else the highest count of the converter
+    (infinite for float). `bad` is the mask of invalid pixels, (rows, cols), `shift` the number of bits by which
+    left-justified data were shifted right, `stored_bits` the bits of one stored value.
     """
 
     pixels: NDArray[np.uint16] | NDArray[np.float32]
@@ -319,11 +321,11 @@ def as_raw(array: Pixels, name: str = "this image") -> Raw:
     12-bit data in 16-bit words are often left-justified by 4 bits. Then almost every count is a multiple of 16: counts
     are shifted right, and the few that are no multiple become bad pixels. NaN and infinite values become 0 and bad.
     """
+    stored_bits = 8 * array.itemsize
     if array.dtype.kind == "f":
         invalid = ~np.isfinite(array)
-        return Raw(
-            np.where(invalid, 0, array).astype(np.float32), float("inf"), _any_channel(invalid), 0, 8 * array.itemsize
-        )
+        values, bad = np.where(invalid, 0, array).astype(np.float32), _any_channel(invalid)
+        return Raw(*_ended(values, bad, float("inf")), bad, 0, stored_bits)
     if array.dtype.kind == "i" and array.size and array.min() < 0:
         raise FrameError(
             f"{name} holds negative whole numbers, which no sensor counts",
@@ -337,7 +339,49 @@ def as_raw(array: Pixels, name: str = "this image") -> Raw:
     bad = _any_channel(stray)
     top = int(counts[~bad].max()) if not bad.all() else 0
     bits = next(bits for bits in (8, 10, 12, 14, 16) if top < 2**bits)
-    return Raw(counts, float(2**bits - 1), bad, shift, 8 * array.itemsize)
+    return Raw(*_ended(counts, bad, float(2**bits - 1)), bad, shift, stored_bits)
+
+
+def _ended(pixels: Pixels, bad: Mask, highest_dn: float) -> tuple[Pixels, float]:
+    """Return pixels, (rows, cols) or with channels, and their saturation level; `highest_dn` for those not clipped.
+
+    Channels of a white balance end at different values: clipped pixels are then raised to one level for all channels.
+    """
+    planes = pixels[..., None] if pixels.ndim == 2 else pixels
+    known = [np.where(bad, plane.min(), plane) for plane in np.moveaxis(planes, -1, 0)]
+    ends = [ceiling_of(plane) for plane in known]
+    found = [end for end in ends if end is not None]
+    top = max(float(plane.max()) for plane in known)
+    if not found:
+        return pixels, highest_dn
+    white_dn = max(found)
+    if white_dn < top:  # of a channel that is not clipped
+        white_dn = min(highest_dn, float(np.nextafter(np.float32(top), np.float32(np.inf))))
+    if min(found) == white_dn:
+        return pixels, white_dn
+    raised = [
+        plane if end is None else np.where(plane >= end, white_dn, plane)
+        for plane, end in zip(known, ends, strict=True)
+    ]
+    return np.stack(raised, axis=-1).astype(pixels.dtype), white_dn
+
+
+def common_white_dn(raws: Sequence[Raw]) -> float:
+    """Return the saturation level of raws of one sensor: the lowest one that no pixel of any raw exceeds.
+
+    The highest count of a converter follows from the brightest pixel of a file, and only clipped files show a ceiling.
+    """
+    top = max(float(raw.pixels.max()) for raw in raws)
+    return min(raw.white_dn for raw in raws if raw.white_dn >= top)
+
+
+def as_companion(array: Pixels, name: str) -> Image:
+    """Return a dark or flat frame of any number type as float32, in its units, NaN where it is saturated (`as_raw`)."""
+    is_counts = array.dtype.kind in "ui" and array.min() >= 0 and array.max() <= 65535
+    values = array.astype(np.float32)
+    raw = as_raw(array if is_counts else values, name)
+    full = raw.pixels >= raw.white_dn
+    return np.where(full, np.float32(np.nan), values) if np.count_nonzero(full) > CHANCE_PIXELS else values
 
 
 def _any_channel(mask: Mask) -> Mask:
@@ -390,16 +434,13 @@ def psf_counts(array: Pixels, name: str) -> Raw:
 
 
 def saturated_share(psf: Psf, raw: Raw, white_dn: float | None = None) -> float:
-    """Return the share of light in more than 8 pixels at the converter's limit (floats: at the maximum); else 0.0.
+    """Return the share of the PSF's light in more than CHANCE_PIXELS saturated pixels; else 0.0.
 
     `raw` holds the counts of the PSF, `white_dn` its saturation level if that is known.
     """
     brightest = raw.pixels if raw.pixels.ndim == 2 else raw.pixels.max(axis=2)
-    white = min(raw.white_dn, float("inf") if white_dn is None else white_dn)
-    top = (brightest >= min(white, float(brightest.max()))) if np.isinf(white) else brightest >= white
-    if np.count_nonzero(top) <= MIN_SATURATED_PIXELS:
-        return 0.0
-    return float(psf.pixels[top].sum(dtype=np.float64))
+    full = brightest >= min(raw.white_dn, float("inf") if white_dn is None else white_dn)
+    return float(psf.pixels[full].sum(dtype=np.float64)) if np.count_nonzero(full) > CHANCE_PIXELS else 0.0
 
 
 def _cleaned(raw: Raw, name: str) -> Psf:

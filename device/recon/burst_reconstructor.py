@@ -14,7 +14,7 @@ from device.recon.burst import BurstJoiner, JoinedFrame, SeenFrame
 from device.recon.estimation.refraction_task import RefractionTask
 from device.recon.model.fft_plans import Planner
 from device.recon.model.kernels import Pixels
-from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step
+from device.recon.reconstructor import DurationEstimate, Reconstructor, RoundDone, StageResult, Step, noise_frame
 from device.values import FrameUse, Reconstruction
 
 NO_TIME = "the time budget left no time to join the burst"
@@ -47,7 +47,7 @@ class BurstReconstructor:
 
     def _warm_up(self) -> None:
         """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
-        noise = np.random.default_rng(0).integers(100, 200, self.single.shape, dtype=np.uint16)
+        noise = noise_frame(self.single.calibration, self.single.shape)
         for _ in range(2):  # the first one compiles
             self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()
             run = _Run(self, None)

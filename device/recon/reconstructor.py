@@ -212,7 +212,7 @@ class Reconstructor:
 
     def _warm_up(self, timed: bool) -> None:
         """Run on noise to compile the kernels, touch the memory and, with `timed`, measure the cost of each step."""
-        noise = np.random.default_rng(0).integers(100, 200, self.shape, dtype=np.uint16)
+        noise = noise_frame(self.calibration, self.shape)
         self(noise, rounds=1)  # compiles, if the cache of compiled code is empty
         if not timed:
             return
@@ -513,6 +513,13 @@ class _Run:
             return True
         others_s = (channels_left - 1) * (stage.start_cost.seconds + (self.rounds_done + 1) * stage.round_cost.seconds)
         return self.deadline.fits(stage.round_cost.seconds + others_s + stage.finish_cost.seconds)
+
+
+def noise_frame(calibration: Calibration, shape: tuple[int, int]) -> Pixels:
+    """Return noise of `shape` below the white level: 100 to 200 DN, or less, as float32, for a level of 200 or less."""
+    noise = np.random.default_rng(0).integers(100, 200, shape, dtype=np.uint16)
+    white_dn = calibration.sensor.white_dn
+    return noise if white_dn > 200 else noise * np.float32(white_dn / 256)
 
 
 def without_sensor(calibration: Calibration) -> Calibration:

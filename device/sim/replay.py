@@ -16,7 +16,9 @@ from device.config.head_file import CameraSpec, InstrumentSpec, LightSpec, Repla
 from device.config.image_files import (
     SUFFIXES,
     Raw,
+    as_companion,
     as_raw,
+    common_white_dn,
     is_marked_simulated,
     read_image,
     read_psf,
@@ -102,9 +104,9 @@ class ReplayCamera:
         if len({raw.pixels.shape for raw in raws}) > 1:
             raise SpecError("the raws of one recording must all have the same rows and columns")
         self._simulated = any(is_marked_simulated(path) for path in recording.raws)
-        self.white_dn = max(min(raw.white_dn, 65535.0) for raw in raws)
         self.bad: Mask = np.logical_or.reduce([raw.bad for raw in raws])
         on_counts = _scale(raws)
+        self.white_dn = min(float(np.rint(on_counts(np.array(common_white_dn(raws))))), 65535.0)
         self.black_dn = float(on_counts(np.array(recording.black_dn)))
         self._frames = [_to_counts(on_counts(raw.pixels)) for raw in raws]
         self._dark = self._constant(self.black_dn)
@@ -189,7 +191,7 @@ def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibrat
     require_same_shape(psfs, camera.shape)
     flat: Image | None = None
     if spec.replay.flat is not None:
-        flat = read_image(spec.replay.flat).astype(np.float32)
+        flat = as_companion(read_image(spec.replay.flat), spec.replay.flat.name)
         flat = flat.mean(axis=2) if flat.ndim == 3 else flat
     geometry = spec.optics.geometry(spec.camera.pitch_um) if spec.optics else None
     return Calibration(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from device.clock import Deadline, SystemClock
-from device.config.image_files import Raw
+from device.config.image_files import Raw, common_white_dn
 from device.errors import FrameError, SettingError
 from device.recon.burst import MOST_FRAMES, BurstJoiner
 from device.recon.estimation.psf_selection import most_likely_psf
@@ -159,7 +159,7 @@ def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
                 f"{one.name} is stored in another way than {first.name}: other levels, or other types of numbers",
                 "Give the raws of one burst, saved in one format.",
             )
-    white_dn = max(one.raw.white_dn for one in usable)
+    white_dn = common_white_dn([one.raw for one in usable])
     return replace(first, raw=replace(first.raw, white_dn=white_dn, bad=np.zeros(first.solved_shape, np.bool_)))
 
 

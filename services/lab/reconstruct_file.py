@@ -40,10 +40,12 @@ from services.lab.reconstruct_inputs import (
     Shape,
     Source,
     companion,
+    companion_notes,
     load_calibrations,
     load_psfs,
     load_raw,
     swap_notes,
+    without_unknown,
 )
 
 ENDINGS = (".npy", ".tif", ".tiff", ".png")
@@ -130,8 +132,10 @@ class FileReconstructor:
         loaded = load_raw(source, self._options.bayer)
         psfs = self._psfs_for(loaded)
         plan = self._last = self._plan(loaded, psfs)
+        own = None if dark is None else companion(dark, "the dark frame", loaded)
+        pixels, own = without_unknown(loaded.raw.pixels, own)
         try:
-            made = plan.solve(loaded, None if dark is None else companion(dark, "the dark frame", loaded))
+            made = plan.solve(replace(loaded, raw=replace(loaded.raw, pixels=pixels)), own)
         except FrameError as error:  # its remedy is for the operator of a head
             raise FrameError(
                 f"{loaded.name}: {error.message}",
@@ -142,7 +146,8 @@ class FileReconstructor:
                 f"{loaded.name} holds no signal above the black level",
                 "Give a frame that was taken with light; look whether the dark frame belongs to it.",
             )
-        notes = loaded.notes if psfs is None else (*loaded.notes, *psfs.notes)
+        of_psfs = () if psfs is None else psfs.notes
+        notes = (*loaded.notes, *of_psfs, *companion_notes(self._options, plan.calibrations[0]))
         warnings, swapped = made.report.warnings, () if psfs is None else swap_notes(loaded, psfs)
         if swapped:  # the reason why the PSF does not match
             warnings = tuple(warning for warning in warnings if warning not in MISMATCHES.values())

@@ -11,10 +11,12 @@ from device.calibration.archive import Archive
 from device.calibration.import_psf import MAX_SATURATED_SHARE
 from device.config import bayer
 from device.config.bayer import Bayer
+from device.config.ceiling import CHANCE_PIXELS
 from device.config.head_file import CameraSpec, InstrumentSpec, load_head
 from device.config.image_files import (
     ImageFile,
     Raw,
+    as_companion,
     as_raw,
     clean_channels,
     frames_of,
@@ -28,11 +30,13 @@ from device.config.image_files import (
 )
 from device.errors import FrameError, PsfError, SettingError, SpecError
 from device.recon.method_settings import Settings
+from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import MOST_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
 Shape = tuple[int, int]
+MOST_EQUAL = 0.9  # share of a raw's pixels that may have its maximum: with more, the others are too few to show noise
 SWAPPED = 1.1  # ratio of `concentration`, raw over PSF: recordings have 0.56 to 0.85, swapped 1.18 to 1.80
 
 
@@ -155,10 +159,10 @@ def refuse_without_signal(raw: Raw, name: str) -> None:
             "Save the frame again without NaN or infinite values.",
         )
     pixels = raw.pixels if raw.pixels.ndim == 2 else raw.pixels.max(axis=2)
-    saturated = float((pixels >= raw.white_dn).mean())
-    if saturated > MOST_BAD:
+    saturated, equal = float((pixels >= raw.white_dn).mean()), float((pixels == pixels.max()).mean())
+    if saturated > MOST_BAD or MOST_EQUAL < equal < 1:
         raise FrameError(
-            f"{name} is saturated: {saturated:.0%} of its pixels have the highest value, {raw.white_dn:g}",
+            f"{name} is saturated: {max(saturated, equal):.0%} of its pixels have the highest value, {pixels.max():g}",
             "Take the frame with a shorter exposure.",
         )
     seen = raw.pixels[~raw.bad]
@@ -382,19 +386,48 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
 
 
 def companion(source: Source, what: str, loaded: LoadedRaw) -> Image:
-    """Return a dark or flat frame in the counts of its raw frame, divided by `2**raw.shift`.
+    """Return a dark or flat frame in the counts of its raw frame, divided by `2**raw.shift`; NaN where it is saturated.
 
-    (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3).
+    (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3). FrameError for one that is saturated
+    in more than MOST_BAD of its pixels, or has another shape.
     """
     name = name_of(source, what)
-    pixels = only_frame(_read(source, name).frames, name).astype(np.float32) / np.float32(2**loaded.raw.shift)
+    pixels = as_companion(only_frame(_read(source, name).frames, name), name) / np.float32(2**loaded.raw.shift)
     pixels = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
     if pixels.shape != loaded.shape:
         raise FrameError(
             f"{name} has {pixels.shape[0]} x {pixels.shape[1]} pixels, the raw {loaded.shape[0]} x {loaded.shape[1]}",
             "Use files of one and the same camera mode.",
         )
+    saturated = float(np.isnan(pixels).mean())
+    if saturated > MOST_BAD:
+        raise FrameError(
+            f"{name} is saturated: {saturated:.0%} of its pixels have the highest value",
+            "Take it with a shorter exposure.",
+        )
     return bayer.split(pixels, loaded.bayer) if loaded.bayer is not None else np.asarray(pixels, np.float32)
+
+
+def companion_notes(options: ReconstructOptions, calibration: Calibration) -> tuple[str, ...]:
+    """Return a note for a dark or flat frame of the options that is saturated in more than CHANCE_PIXELS pixels."""
+    given = ("dark", options.dark, calibration.dark_dn), ("flat", options.flat, calibration.flat)
+    return tuple(
+        f"the {name} frame is saturated in {np.isnan(image).mean():.1%} of its pixels; these were left out. "
+        "Take it with a shorter exposure."
+        for name, source, image in given
+        if source is not None and image is not None and np.count_nonzero(np.isnan(image)) > CHANCE_PIXELS
+    )
+
+
+def without_unknown(pixels: Pixels, dark: Image | None) -> tuple[Pixels, Image | None]:
+    """Return a frame with NaN where its dark frame is unknown (NaN), and that dark frame without NaN.
+
+    A dark frame (rows, cols) holds for all channels of the frame.
+    """
+    if dark is None or not np.isnan(dark).any():
+        return pixels, dark
+    unknown = np.isnan(dark if dark.ndim == pixels.ndim else dark[..., None])
+    return np.where(unknown, np.float32(np.nan), pixels.astype(np.float32)), np.nan_to_num(dark)
 
 
 def _plane(image: Image | None, c: int) -> Image | None:

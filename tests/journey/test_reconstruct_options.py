@@ -63,6 +63,18 @@ def test_setting_replaces_the_value_of_the_frame(method: str, setting: str) -> N
     assert other.report.regularisation[setting] == 2 * value + 1
 
 
+def test_an_overexposed_frame_gives_one_picture_whatever_its_ceiling() -> None:
+    clipped = np.minimum(scene(), 1023)  # 5 % of the pixels
+    as_stored = reconstruct_file(options(clipped, [caustic()]))
+    for scale, black_dn in ((1.0, 15), (1 / 1023, 0)):
+        other = (clipped - np.minimum(clipped, black_dn)) * scale
+        made = reconstruct_file(options(other.astype(np.float32 if scale < 1 else np.uint16), [caustic()]))
+        assert made.report.warnings == as_stored.report.warnings
+        assert any("saturated and were left out" in warning for warning in made.report.warnings)
+        agreement = np.corrcoef(made.picture.ravel(), as_stored.picture.ravel())[0, 1]
+        assert agreement > 0.99  # the black level and the noise of the estimate differ; with the clipped pixels 0.9
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

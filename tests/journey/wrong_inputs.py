@@ -96,6 +96,13 @@ def psf_of(name: str, array: Any) -> Write:
     return words
 
 
+def clipped_flat(folder: Path) -> list[str]:
+    rows = np.linspace(-1, 1, SHAPE[0])[:, None]
+    flat = np.random.default_rng(3).normal(4400 - 1500 * rows**2, 20, SHAPE)
+    np.save(folder / "flat.npy", np.minimum(flat, 4350).astype(np.float32))
+    return reconstruct(folder, "--flat", str(folder / "flat.npy"))
+
+
 def option(*more: str) -> Write:
     return lambda folder: reconstruct(folder, *(word.replace("DIR", str(folder)) for word in more))
 
@@ -159,6 +166,13 @@ WRONG_INPUTS = (
     WrongInput("NaN everywhere", raw_of("nan.npy", saved(np.full(SHAPE, np.nan))), "not numbers"),
     WrongInput("black frame", raw_of("black.npy", saved(np.zeros(SHAPE, np.uint16))), "no signal"),
     WrongInput("saturated frame", raw_of("white.npy", saved(np.full(SHAPE, 4095, np.uint16))), "is saturated"),
+    WrongInput(
+        "nearly all at one maximum", raw_of("glare.npy", saved(np.minimum(scene(), 21))), "have the highest value, 21"
+    ),
+    WrongInput(
+        "clipped below full scale", raw_of("clipped.npy", saved(np.minimum(scene(), 900))), "too bright", noted=True
+    ),
+    WrongInput("saturated flat frame", clipped_flat, "the flat frame is saturated in", noted=True),
     WrongInput(
         "npz of two arrays", raw_of("two.npz", lambda path: np.savez(path, raw=scene(), psf=caustic())), "raw, psf"
     ),

@@ -127,7 +127,10 @@ def test_float_pixels_are_kept_and_non_finite_ones_are_bad(array: Any) -> None:
     assert np.array_equal(raw.bad, ~np.isfinite(array))
     assert np.array_equal(raw.pixels[~raw.bad], array[~raw.bad].astype(np.float32))
     assert (raw.pixels[raw.bad] == 0).all()
-    assert raw.white_dn == float("inf")
+
+
+def test_float_pixels_that_are_not_clipped_have_no_saturation_level() -> None:
+    assert as_raw(np.random.default_rng(5).random(SHAPE)).white_dn == float("inf")
 
 
 # Point spread functions
