@@ -2,6 +2,8 @@
 
 `write_atomically` replaces one file; the steps of a longer write are separate functions, and `replace_durably` is the
 last one. Each step is on the disk before the next begins, so a power cut leaves the old or the new state.
+Files and folders are private (PRIVATE_FILE, PRIVATE_FOLDER) unless the caller gives another mode; None is that of the
+umask, for what a command writes to a path that its user names.
 """
 
 import errno
@@ -13,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+PRIVATE_FILE, PRIVATE_FOLDER = 0o600, 0o700  # of data about people and of keys, whatever the umask
 RESERVE_BYTES = 200_000_000  # left free for logs and updates of the operating system, which else may not boot
 # EFBIG is a limit on the length of one file: for the operator the same as a full disk.
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -42,26 +45,40 @@ def is_full(error: OSError) -> bool:
     return error.errno in _FULL
 
 
-def make_folder(folder: Path) -> None:
-    """Make a folder and its missing parents durably: the parent of each new folder is synced; no-op if it exists."""
+def make_folder(folder: Path, mode: int | None = PRIVATE_FOLDER) -> None:
+    """Make a folder and its missing parents durably: the parent of each new folder is synced; no-op if it exists.
+
+    `mode`: permission bits of each new folder, independent of the umask; None: those of an ordinary new folder.
+    """
     if not folder.is_dir():
-        make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
+        make_folder(folder.parent, mode)
+        _make_one(folder, mode, exist_ok=True)
         fsync_folder(folder.parent)
 
 
-def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Make a new folder with `files`, content and file names durable on return.
+def _make_one(folder: Path, mode: int | None, exist_ok: bool = False) -> None:
+    folder.mkdir(0o777 if mode is None else mode, exist_ok=exist_ok)
+    if mode is not None:
+        folder.chmod(mode)
+
+
+def write_folder(folder: Path, files: Mapping[str, bytes], private: bool = True) -> None:
+    """Make a new folder with `files`, content and file names durable on return; not `private`: with the umask's modes.
 
     The folder's own name is durable only after `fsync_folder` of its parent. FileExistsError if the folder exists.
     """
-    folder.mkdir()
+    _make_one(folder, PRIVATE_FOLDER if private else None)
     for name, content in files.items():
-        write_file(folder / name, content)
+        write_file(folder / name, content, PRIVATE_FILE if private else None)
     fsync_folder(folder)
 
 
-def write_file(path: Path, content: bytes, mode: int | None = None) -> None:
+def private_opener(path: str | os.PathLike[str], flags: int) -> int:
+    """Return a descriptor of a file, private if it is new; the argument `opener` of `open`."""
+    return os.open(path, flags | os.O_CLOEXEC, PRIVATE_FILE)
+
+
+def write_file(path: Path, content: bytes, mode: int | None = PRIVATE_FILE) -> None:
     """Write a new file and fsync it; its name is durable only after `fsync_folder`. FileExistsError if it exists.
 
     `mode`: permission bits of the file, independent of the umask; None: those of an ordinary new file.
@@ -75,7 +92,7 @@ def write_file(path: Path, content: bytes, mode: int | None = None) -> None:
         os.fsync(descriptor)
 
 
-def write_atomically(path: Path, content: bytes, mode: int | None = None) -> None:
+def write_atomically(path: Path, content: bytes, mode: int | None = PRIVATE_FILE) -> None:
     """Write or replace a file durably: after a power cut it has the old or the new content. `mode` as in `write_file`.
 
     After an OSError `path` is unchanged, unless the last step, the fsync of the folder, failed.
@@ -93,9 +110,11 @@ def write_atomically(path: Path, content: bytes, mode: int | None = None) -> Non
 
 
 def write_atomically_unsynced(path: Path, content: bytes) -> None:
-    """Write or replace a file atomically for other processes, but not durably: a power cut may leave it incomplete."""
+    """Write or replace a private file atomically for other processes; a power cut may leave it incomplete."""
     part = path.with_name(f".{path.name}.part")
-    part.write_bytes(content)
+    part.unlink(missing_ok=True)  # left by a killed process
+    with open(part, "wb", opener=private_opener) as file:
+        file.write(content)
     part.rename(path)
 
 
@@ -170,13 +189,13 @@ def remove(place: Path) -> None:
 
 
 @contextmanager
-def file_lock(lock: Path, wait: bool = True) -> Iterator[None]:
+def file_lock(lock: Path, wait: bool = True, private: bool = True) -> Iterator[None]:
     """Hold an exclusive lock (flock) on the file `lock`, a mutex across threads and processes.
 
     Without `wait`: BlockingIOError if the lock is held elsewhere. OSError if the file cannot be opened. The kernel
     releases the lock of a killed process. The file is opened for each lock because flock belongs to the open file
     description: threads that share one would not exclude each other.
     """
-    with lock.open("ab") as file:
+    with open(lock, "ab", opener=private_opener if private else None) as file:
         fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield

@@ -423,6 +423,35 @@ def test_files_are_written_durably_and_locked_in_one_module() -> None:
     check_rule(file_calls, names, allowed, "use write_atomically, replace_durably, fsync_file or file_lock")
 
 
+def umask_writes(source: str) -> Iterator[Violation]:
+    """Find new files and folders with the modes of the umask: those of other users may read them."""
+    for node in nodes(source):
+        if isinstance(node, ast.Call):
+            name = node.func.attr if isinstance(node.func, ast.Attribute) else ast.unparse(node.func)
+            texts = [
+                one.value for one in (*node.args, *(k.value for k in node.keywords)) if isinstance(one, ast.Constant)
+            ]
+            opens = name == "open" and any(isinstance(one, str) and one and one[0] in "wax" for one in texts)
+            is_private = any(keyword.arg == "opener" for keyword in node.keywords)
+            if name in ("mkdir", "makedirs", "write_text", "write_bytes", "touch") or (opens and not is_private):
+                yield node.lineno, name, "use device/atomic_io.py, or its private_opener"
+
+
+def test_data_is_written_private_whatever_the_umask() -> None:
+    """A person who starts the program by hand has umask 022: other users of the computer could read names."""
+    user = ("services/lab/", "services/cli.py", "device/sim/scene_files.py")  # write where their user says
+    names = [name for name in python_files("device", "services") if not name.startswith((*user, "device/atomic_io.py"))]
+    public = "in a folder of every boot, for services of other users"
+    allowed = {
+        "services/health/clock_request.py: write_text": public,
+        "services/identity/apply_at_boot.py: write_text": public, "services/identity/apply_at_boot.py: mkdir": public,
+        "services/identity/apply_settings.py: mkdir": public,
+        "services/identity/apply_settings.py: write_bytes": public,
+        "services/backup/store_contents.py: open": "a tar archive in memory, which is encrypted before it is written",
+    }  # fmt: skip
+    check_rule(umask_writes, names, allowed, "write data with device/atomic_io.py")
+
+
 def folder_lists(source: str) -> Iterator[Violation]:
     """Find lists of the files of a folder: they may hold companions `._NAME` that macOS has written."""
     for node in nodes(source):
@@ -595,6 +624,10 @@ BROKEN: list[tuple[Finder, str]] = [
     (file_calls, "part.replace(path)"),
     (file_calls, "part.rename(path)"),
     (file_calls, "import fcntl\nfcntl.flock(file, fcntl.LOCK_EX)"),
+    (umask_writes, "path.write_text('a')"),
+    (umask_writes, "folder.mkdir(parents=True)"),
+    (umask_writes, "open(path, 'a')"),
+    (umask_writes, "path.open('wb')"),
     (folder_lists, "for path in folder.iterdir(): ..."),
     (folder_lists, "sorted(folder.glob('*.tiff'))"),
     (folder_lists, "import os\nos.walk('.')"),

@@ -64,9 +64,9 @@ def create_key_pair(path: Path, name: str) -> Signer:
         raise SettingError(f"{path} or {beside} is there already", "Choose another name: a key is never overwritten.")
     try:
         private = key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption())
-        atomic_io.write_file(path, private, mode=0o600)
+        atomic_io.write_file(path, private)
         line = signer.key.public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH)
-        atomic_io.write_file(beside, line + f" {signer_name}\n".encode())
+        atomic_io.write_file(beside, line + f" {signer_name}\n".encode(), mode=None)
         atomic_io.fsync_folder(path.parent)
     except OSError as error:
         raise SettingError(f"{path} cannot be written: {error.strerror}", "Choose another folder.") from error
@@ -103,7 +103,7 @@ def export(files: Mapping[str, bytes], path: Path, private: Path) -> Signer:
         )
     header = f"{MAGIC} {FORMAT}\n{signer.fingerprint}\n{signer.name}\n".encode()
     try:
-        atomic_io.write_atomically(path, header + key.sign(header + packed).hex().encode() + b"\n" + packed)
+        atomic_io.write_atomically(path, header + key.sign(header + packed).hex().encode() + b"\n" + packed, mode=None)
     except OSError as error:
         raise SettingError(f"{path} cannot be written: {error.strerror}", "Choose another folder.") from error
     return signer

@@ -13,7 +13,6 @@ the earlier ones complete, and the next one continues.
 """
 
 import hashlib
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -66,8 +65,7 @@ class BackupFolder:
         with drive_errors(self.folder):
             _write_and_read_back(self._objects / f"{sha256}.age", encrypted)
             line = f"\n{name} {sha256} {len(encrypted)}\n".encode()  # a torn line before it stays a line of its own
-            descriptor = os.open(self._index, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
-            with open(descriptor, "ab") as index:
+            with open(self._index, "ab", opener=atomic_io.private_opener) as index:
                 index.write(line)
             atomic_io.fsync_file(self._index)
         self._known[name] = (sha256, len(encrypted))

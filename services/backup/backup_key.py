@@ -142,7 +142,7 @@ def read_key(store: Path) -> BackupKey | None:
 
 def write_key(store: Path, key: BackupKey) -> None:
     """Write the key into the folder of a store, atomically; OSError if the disk refuses."""
-    atomic_io.write_atomically(store / KEY_FILE, encoded_model(key), 0o600)
+    atomic_io.write_atomically(store / KEY_FILE, encoded_model(key))
 
 
 def read_header(folder: Path) -> BackupHeader:

@@ -123,7 +123,7 @@ def _newest_readable(folder: Path, key: SecretKey, number: int | None) -> tuple[
 
 
 def _manifest(archive: bytes) -> Manifest:
-    path, _, content = next(store_contents.unpacked(archive))
+    path, content = next(store_contents.unpacked(archive))
     if str(path) != MANIFEST:
         raise BackupDamaged("the archive of the backup has no list of its content")
     return Manifest.model_validate_json(content)
@@ -145,10 +145,10 @@ def _refuse_without_room(folder: Path, manifest: Manifest, rest_bytes: int, free
 
 
 def _write_files(part: Path, archive: bytes) -> None:
-    for path, mode, content in store_contents.unpacked(archive):
+    for path, content in store_contents.unpacked(archive):
         if str(path) != MANIFEST:
-            (part / path).parent.mkdir(parents=True, exist_ok=True)
-            atomic_io.write_file(part / path, content, mode)
+            atomic_io.make_folder((part / path).parent)
+            atomic_io.write_file(part / path, content)
 
 
 def _sync_folders(part: Path) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 
+from device import atomic_io
 from device.user_files import files_in
 from services.errors import BackupDamaged, StoreDamaged
 from services.records import blobs, device_identity, reserve_file, schema, snapshots
@@ -77,14 +78,13 @@ def packed(files: Mapping[str, Path | bytes]) -> bytes:
         for name, source in files.items():
             entry = tarfile.TarInfo(name)
             content = source if isinstance(source, bytes) else blobs.read_blob(source)
-            entry.mode = 0o600 if isinstance(source, bytes) else source.stat().st_mode & 0o777
-            entry.size = len(content)
+            entry.mode, entry.size = atomic_io.PRIVATE_FILE, len(content)
             archive.addfile(entry, io.BytesIO(content))
     return out.getvalue()
 
 
-def unpacked(content: bytes) -> Iterator[tuple[Path, int, bytes]]:
-    """Yield path in the store, mode and content of each file of a tar archive; BackupDamaged for an unsafe path."""
+def unpacked(content: bytes) -> Iterator[tuple[Path, bytes]]:
+    """Yield path in the store and content of each file of a tar archive; BackupDamaged for an unsafe path."""
     try:
         with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as archive:
             for entry in archive:
@@ -92,7 +92,7 @@ def unpacked(content: bytes) -> Iterator[tuple[Path, int, bytes]]:
                 file = archive.extractfile(entry)
                 if file is None or path.is_absolute() or ".." in path.parts:
                     raise BackupDamaged(f"{entry.name!r:.80} is no file of a store")
-                yield path, entry.mode & 0o777, file.read()
+                yield path, file.read()
     except tarfile.TarError as error:
         raise BackupDamaged(f"an archive of the backup cannot be read: {error}") from error
 

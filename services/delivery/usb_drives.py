@@ -74,7 +74,7 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
         temporary = drive / f".{target.name}.part"
         shutil.rmtree(temporary, ignore_errors=True)  # left by an interrupted copy
         try:
-            atomic_io.write_folder(temporary, files)
+            atomic_io.write_folder(temporary, files, private=False)
             atomic_io.replace_durably(temporary, target)
         except OSError:
             shutil.rmtree(temporary, ignore_errors=True)  # no effect on a removed drive

@@ -11,11 +11,14 @@ import logging
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from itertools import islice
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
+
+from device import atomic_io
 
 FILE_NAME = "diary.jsonl"
 FILE_BYTES, FILES = 500_000, 4  # some months of a clinic
@@ -38,6 +41,13 @@ class LogEntry:
     detail: str | None = None
 
 
+class _PrivateFileHandler(RotatingFileHandler):
+    """Handler whose files are private, whatever the umask: the log names patients' visits."""
+
+    def _open(self) -> TextIOWrapper:
+        return open(self.baseFilename, "a", encoding=self.encoding, opener=atomic_io.private_opener)
+
+
 class EventLog:
     """Log file of the loggers `device` and `services`, from level INFO on.
 
@@ -45,9 +55,9 @@ class EventLog:
     """
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        atomic_io.make_folder(folder)
         self._path = folder / FILE_NAME
-        self._handler = RotatingFileHandler(self._path, maxBytes=FILE_BYTES, backupCount=FILES - 1, encoding="utf-8")
+        self._handler = _PrivateFileHandler(self._path, maxBytes=FILE_BYTES, backupCount=FILES - 1, encoding="utf-8")
         self._handler.setFormatter(_JsonLine())
         self._levels = {name: logging.getLogger(name).level for name in LOGGER_NAMES}
         for name in LOGGER_NAMES:

@@ -58,7 +58,7 @@ class PinAuthenticator:
             salt = secrets.token_bytes(16)
             content = digested_json.encoded({"salt": salt.hex(), "hash": _hash(pin, salt).hex()})
             try:
-                atomic_io.write_atomically(self._file, content, mode=0o600)
+                atomic_io.write_atomically(self._file, content)
             except OSError as error:
                 raise StoreError(f"the PIN cannot be kept: {error}", "Free some space, then set it again.") from error
             return self._issue_token()

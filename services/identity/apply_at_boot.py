@@ -7,6 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from device import atomic_io
 from device.clock import Clock
 from services.identity.certificates import create_server_certificate
 from services.identity.provision import Identity
@@ -64,10 +65,8 @@ class Computer:
 
     def _write_private(self, name: str, content: bytes) -> None:
         """Write a file below `root` with mode 0600."""
-        path = self.root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(mode=0o600)
-        path.write_bytes(content)
+        atomic_io.make_folder((self.root / name).parent)
+        atomic_io.write_atomically_unsynced(self.root / name, content)
 
     def _set_machine_id(self, machine_id: str) -> None:
         """Use the identity's machine id for the journal, and move the earlier records; restart journald.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from device import atomic_io
 from device.errors import DiffuscopeError, SpecError
 from services.identity.card_settings import (
     FILE,
@@ -120,10 +121,8 @@ class CardBoot:
         (folder / name).chmod(0o644)
 
     def _write_private(self, name: str, content: str) -> None:
-        path = self.root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(mode=0o600)
-        path.write_text(content, encoding="utf-8")
+        atomic_io.make_folder((self.root / name).parent)
+        atomic_io.write_atomically_unsynced(self.root / name, content.encode())
 
 
 def _attempt(step: Callable[[], DiffuscopeError | None]) -> DiffuscopeError | None:

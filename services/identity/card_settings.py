@@ -96,8 +96,8 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
         atomic_io.make_folder(kept)
         kept.chmod(0o700)
         for name, text in beside.items():
-            atomic_io.write_atomically(kept / name, text, 0o600)
-        atomic_io.write_atomically(kept / FILE, content, 0o600)
+            atomic_io.write_atomically(kept / name, text)
+        atomic_io.write_atomically(kept / FILE, content)
         _forget(kept, {FILE, UPDATES, *beside})
         _overwrite_password(source)
     except DiffuscopeError as error:

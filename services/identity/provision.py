@@ -68,7 +68,6 @@ def load_or_create_identity(folder: Path, serial: str, clock: Clock) -> Identity
         )
         contents = (serial.encode(), secrets.token_hex(16).encode(), wifi.encode(), key, crt)
         atomic_io.write_folder(part, dict(zip(FILES, contents, strict=True)))
-        part.chmod(0o700)
         atomic_io.replace_durably(part, folder)
     return _read(folder)
 

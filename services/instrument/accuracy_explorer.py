@@ -167,7 +167,7 @@ class AccuracyExplorer:
         return read if isinstance(read, dict) else {}
 
     def _write(self, name: str, content: Mapping[str, JsonValue]) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_io.make_folder(self.folder)
         atomic_io.write_atomically(self.folder / name, json.dumps(content, indent=1).encode())
 
 

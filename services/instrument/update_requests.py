@@ -150,7 +150,7 @@ class UpdateRequests:
         part = self._part(state)
         try:
             self._refuse_without_space(part.parent, length)
-            with part.open("wb") as file:
+            with open(part, "wb", opener=atomic_io.private_opener) as file:
                 yield BundleUpload(part, file, length)
         except OSError as error:
             if not atomic_io.is_full(error):

@@ -107,6 +107,7 @@ class CaptureStore:
             with atomic_io.file_lock(self._lock):  # a capture that another process is writing is not incomplete
                 finish_restoration(folder)
                 damage = self._set_damaged_database_aside()
+                schema.make_private(database)
                 schema.migrate(self.engine, snapshots.create)
                 if refusal is None:
                     self.recovery = Recovery(folder, self.engine, damage).run()

@@ -9,7 +9,6 @@ its last line.
 """
 
 import json
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -45,13 +44,10 @@ class DoseLedgerLog:
         """Append a ledger, without fsync, and remove the copy of an earlier release; OSError if the disk refuses."""
         line = _line(state)
         if self._path.exists() and self._path.stat().st_size + len(line) > MAX_BYTES:
-            atomic_io.write_atomically(self._path, line, 0o600)
+            atomic_io.write_atomically(self._path, line)
             return
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
-        try:
-            os.write(descriptor, line)
-        finally:
-            os.close(descriptor)
+        with open(self._path, "ab", buffering=0, opener=atomic_io.private_opener) as file:
+            file.write(line)
         # Outdated from now on: with table and log gone, it would be used instead of counting both eyes as full.
         self._earlier.unlink(missing_ok=True)
 

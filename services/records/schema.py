@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import stat
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -33,6 +35,7 @@ from sqlalchemy import (
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 from sqlalchemy.pool import ConnectionPoolEntry
 
+from device import atomic_io
 from device.errors import SettingError, StoreError
 from services.records.capture import Capture
 from services.records.capture_report import report_as_json
@@ -363,6 +366,13 @@ def open_engine(path: Path) -> Engine:
     event.listen(engine, "connect", _prepare)
     event.listen(engine, "begin", _begin)
     return engine
+
+
+def make_private(database: Path) -> None:
+    """Make the file of a database, empty if it is missing, private; its logs get its mode. OSError if disk refuses."""
+    with open(database, "ab", opener=atomic_io.private_opener) as file:
+        if stat.S_IMODE(os.fstat(file.fileno()).st_mode) != atomic_io.PRIVATE_FILE:
+            os.fchmod(file.fileno(), atomic_io.PRIVATE_FILE)
 
 
 def folder_of(engine: Engine) -> Path:

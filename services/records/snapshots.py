@@ -7,7 +7,6 @@ After a rollback of an update the older release reads the newer tables (README, 
 only after a harmful migration. They hold the database only: migrations do not change the files of captures.
 """
 
-import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -53,6 +52,7 @@ class Snapshots:
             size_bytes = _number(tables, "page_count") * _number(tables, "page_size")
             self._refuse_without_room(size_bytes)
             try:
+                atomic_io.write_file(part, b"")  # private; SQLite writes into an empty file
                 tables.execute("VACUUM INTO ?", (str(part),))
             except sqlite3.Error:
                 part.unlink(missing_ok=True)
@@ -73,7 +73,8 @@ class Snapshots:
         _refuse_damaged(self.folder / name)
         refuse_in_use(self.database)
         new = self.database.with_name(".shelf.part")
-        shutil.copyfile(self.folder / name, new)
+        new.unlink(missing_ok=True)  # left by an interrupted restoration
+        atomic_io.write_file(new, (self.folder / name).read_bytes())
         carry_dose(self.database, new)
         atomic_io.fsync_file(new)
         atomic_io.fsync_folder(self.database.parent)

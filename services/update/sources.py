@@ -201,7 +201,7 @@ def _append(part: Path, pieces: Iterator[bytes], size: int, progress: Progress) 
 
     Read errors are raised unchanged; UpdateNoRoom on a full disk.
     """
-    with part.open("ab", buffering=0) as file:
+    with open(part, "ab", buffering=0, opener=atomic_io.private_opener) as file:
         for piece in pieces:
             with _disk_errors(part, size):
                 file.write(piece)

@@ -118,7 +118,7 @@ def test_a_backup_holds_the_versions_and_notices_a_new_one(store: CaptureStore) 
     before = store_contents.fingerprint(store.folder, unit)
     store.versions.adopt(version(store), NOON)
     assert store_contents.fingerprint(store.folder, unit) != before
-    names = {path.name for path, _, _ in store_contents.unpacked(store_contents.packed_unit(store.folder, unit))}
+    names = {path.name for path, _ in store_contents.unpacked(store_contents.packed_unit(store.folder, unit))}
     assert {"picture-1.png", "report-1.json", "picture.png"} <= names
 
 

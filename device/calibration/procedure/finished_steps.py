@@ -35,7 +35,7 @@ class StepCheckpoints:
         out = io.BytesIO()
         made_at = self.clock.wall().isoformat()
         np.savez(out, whose=self.key, made_at=made_at, simulated=self.simulated, **vars(measured))
-        self.folder.mkdir(parents=True, exist_ok=True)
+        atomic_io.make_folder(self.folder)
         atomic_io.write_atomically(self._path(name), out.getvalue())
 
     def load(self, name: str, kind: type[Step]) -> Step | None:

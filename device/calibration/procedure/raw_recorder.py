@@ -47,11 +47,12 @@ class RawRecorder:
         np.save(out, frame.counts, allow_pickle=False)
         content = out.getvalue()
         try:
-            self._step.mkdir(parents=True, exist_ok=True)
+            atomic_io.make_folder(self._step)
             if not atomic_io.has_room(len(content), atomic_io.free_bytes(self._step), self.reserve_bytes):
                 raise OSError(errno.ENOSPC, f"less than {self.reserve_bytes / 1e6:.0f} MB are left")
-            path.write_bytes(content)
-            with (self._step / SUMS).open("a", encoding="ascii") as sums:
+            with open(path, "wb", opener=atomic_io.private_opener) as file:
+                file.write(content)
+            with open(self._step / SUMS, "a", encoding="ascii", opener=atomic_io.private_opener) as sums:
                 sums.write(f"{hashlib.sha256(content).hexdigest()}  {path.name}\n")
         except OSError as error:
             self.failed = True

@@ -96,7 +96,7 @@ class Planner:
     def _write_wisdom(wisdom: tuple[bytes, ...], file: Path) -> None:
         content = json.dumps([text.decode("ascii") for text in wisdom]).encode("ascii")
         try:
-            file.parent.mkdir(parents=True, exist_ok=True)
+            atomic_io.make_folder(file.parent)
             atomic_io.write_atomically(file, content)
         except OSError as error:
             log.warning("cannot write FFT wisdom to %s (%s): the next start plans again", file.parent, error)

@@ -138,7 +138,7 @@ def encoded(plan: Plan) -> bytes:
 
 def write_plan(plan: Plan, path: Path) -> None:
     """Write a plan atomically; StoreError, or StoreFull for a full disk."""
-    write_or_raise(path, lambda: atomic_io.write_atomically(path, encoded(plan)))
+    write_or_raise(path, lambda: atomic_io.write_atomically(path, encoded(plan), mode=None))
 
 
 def read_plan(path: Path) -> Plan:

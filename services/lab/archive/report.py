@@ -91,7 +91,7 @@ def write_report(folder: Path, output: Path, progress: Callable[[str], None]) ->
     progress(f"{len(columns)} captures")
     found = changes(columns)
     page = html(folder, columns, found)
-    write_or_raise(output, lambda: atomic_io.write_atomically(output, page.encode()))
+    write_or_raise(output, lambda: atomic_io.write_atomically(output, page.encode(), mode=None))
     losses = sum(one.is_loss for one in found)
     return f"{len(columns)} captures, {len(found)} compared with an earlier picture, {losses} got worse"
 

@@ -104,13 +104,13 @@ class ResultFolder:
         An earlier plan is moved to `earlier-plans`; results that both have stay. StoreError if it cannot be written.
         """
         for folder in (self._results, self._quarantine):
-            write_or_raise(folder, lambda folder=folder: atomic_io.make_folder(folder))  # type: ignore[misc]
+            write_or_raise(folder, lambda folder=folder: atomic_io.make_folder(folder, None))  # type: ignore[misc]
         kept = self.root / PLAN
         if kept.is_file() and read_plan(kept) != plan:
             earlier = self.root / EARLIER_PLANS / f"{file_digest(kept)[:12]}.toml"
-            write_or_raise(earlier, lambda: atomic_io.make_folder(earlier.parent))
+            write_or_raise(earlier, lambda: atomic_io.make_folder(earlier.parent, None))
             write_or_raise(earlier, lambda: atomic_io.replace_durably(kept, earlier))
-        write_or_raise(kept, lambda: atomic_io.write_atomically(kept, encoded(plan)))
+        write_or_raise(kept, lambda: atomic_io.write_atomically(kept, encoded(plan), mode=None))
         for part in self._results.glob("*/.*.part"):
             shutil.rmtree(part, ignore_errors=True)
 
@@ -129,9 +129,9 @@ class ResultFolder:
         """
         place = self.place(name)
         part = place.with_name(f".{name}.{uuid4().hex[:8]}.part")
-        atomic_io.make_folder(place.parent)
+        atomic_io.make_folder(place.parent, None)
         try:
-            atomic_io.write_folder(part, files)
+            atomic_io.write_folder(part, files, private=False)
             if not place.is_dir():
                 atomic_io.replace_durably(part, place)
         except OSError:
@@ -148,7 +148,7 @@ class ResultFolder:
     def quarantine(self, one: Quarantined) -> None:
         """Store why a capture has no result; OSError if the disk refuses."""
         path = self._quarantine / f"{one.name}.json"
-        atomic_io.write_atomically(path, json.dumps(asdict(one), indent=1).encode())
+        atomic_io.write_atomically(path, json.dumps(asdict(one), indent=1).encode(), mode=None)
 
     def release(self, name: str) -> None:
         """Take a capture out of quarantine; no-op if it is not there."""

@@ -45,9 +45,9 @@ def run_plan(
         )
     root = root.absolute()  # workers have other working directories
     results = ResultFolder(root)
-    write_or_raise(root, lambda: atomic_io.make_folder(root))
+    write_or_raise(root, lambda: atomic_io.make_folder(root, None))
     try:
-        with atomic_io.file_lock(results.lock, wait=False):
+        with atomic_io.file_lock(results.lock, wait=False, private=False):
             results.prepare(plan)
             return _run(plan, results, clock, progress, workers, scheduler)
     except BlockingIOError as error:

@@ -48,7 +48,7 @@ Row = dict[str, object]
 
 def write_table(plan: Plan, results: ResultFolder) -> None:
     """Write `captures.parquet` atomically: captures with a result, in quarantine, left out, and not yet computed."""
-    atomic_io.write_atomically(results.root / TABLE, encoded_table(_rows(plan, results)))
+    atomic_io.write_atomically(results.root / TABLE, encoded_table(_rows(plan, results)), mode=None)
 
 
 def encoded_table(rows: Iterable[Row]) -> bytes:
