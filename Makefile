@@ -148,7 +148,7 @@ ARCHIVE_LOCK := services/lab/archive/requirements.lock
 test-archive: .archive-venv/ready ## Reprocess small archives on Dask: results, table, kills of workers, runs and schedulers.
 	@.archive-venv/bin/python -m pytest -n 2 -m archive tests/archive
 
-test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store and exam against seeded mutants; ten minutes, not in CI.
+test-mutants: .venv/ready ## Run the tests of guard, dose ledger, store, exam and marks against seeded mutants; a quarter of an hour, not in CI.
 	@$(BIN)/python -m tests.golden mutants
 
 bundle: .venv/ready ## Build a signed update in out/, as root; KEYS=folder, FORMAT=plain, ARCH=arm64.

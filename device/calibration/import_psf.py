@@ -10,11 +10,11 @@ from device.config.image_files import (
     as_companion,
     as_psf,
     as_raw,
-    is_marked_simulated,
     read_image,
     require_same_shape,
     saturated_share,
 )
+from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
 from device.values import Calibration, Image, Psf, Sensor
 

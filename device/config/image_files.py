@@ -1,4 +1,4 @@
-"""Image files: read TIFF, PNG, npy, npz and DNG, write TIFF and npy; FrameError or PsfError for no valid image.
+"""Image files: read TIFF, PNG, npy, npz and DNG; FrameError or PsfError for no valid image.
 
 Layouts of an array, by the number of its axes; `frames_of` returns the frames of each:
 
@@ -10,7 +10,6 @@ Layouts of an array, by the number of its axes; `frames_of` returns the frames o
 A raw is one frame; n PSFs are a stack (refraction or depth).
 """
 
-import json
 import struct
 import zipfile
 import zlib
@@ -30,7 +29,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from device.config.bayer import PATTERNS, Bayer
 from device.config.ceiling import CHANCE_PIXELS, ceiling_of
-from device.errors import FrameError, PsfError, SettingError
+from device.errors import FrameError, PsfError
 from device.values import Image, Mask, Psf
 
 SUFFIXES = (".tif", ".tiff", ".png", ".npy")  # of the images of a recording's folder
@@ -276,27 +275,6 @@ def _refuse_16_bit_alpha_png(path: Path, data: bytes) -> None:
     depth, colour = data[24:25], data[25:26]  # of the header, which the format fixes
     if data[1:4] == b"PNG" and depth == b"\x10" and colour in b"\x04\x06":
         raise FrameError(f"{path} holds 16-bit colour, which a png here cannot bring whole", "Save it as tiff or npy.")
-
-
-def is_marked_simulated(path: Path) -> bool:
-    """Return true if a TIFF's description marks it as simulated, as in every raw of the simulator; else false."""
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            facts = json.loads(tiff.pages.first.description)
-    except (*_DECODER_ERRORS, AttributeError):  # not a tiff, or one without such a description
-        return False
-    return isinstance(facts, dict) and facts.get("simulated") is True
-
-
-def write_linear(path: Path, picture: Image) -> None:
-    """Write a linear float32 picture as `.npy`, `.tif` or `.tiff`, by the suffix; SettingError for another suffix."""
-    match path.suffix.lower():
-        case ".npy":
-            np.save(path, picture)
-        case ".tif" | ".tiff":
-            tifffile.imwrite(path, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
-        case other:
-            raise SettingError(f"{path}: linear pictures are written as .npy or .tiff, not '{other}'")
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from device.config.image_files import (
     as_companion,
     as_raw,
     common_white_dn,
-    is_marked_simulated,
     read_image,
     read_psf,
     require_same_shape,
 )
+from device.config.marked_files import is_marked_simulated
 from device.errors import CameraMissing, FrameError, SpecError
 from device.sim.light import LampContext
 from device.user_files import files_in

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
-from PIL import Image as Pictures
 
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec
+from device.config.marked_files import png_bytes, tiff_bytes, write_npy
 from device.errors import StoreError
 from device.sim.camera import SimCamera
 from device.sim.eyes import EffectSelector
@@ -72,15 +71,16 @@ def write(world: World, counts: Counts, folder: Path) -> None:
     """Write a frame of a simulated world with its ground truth.
 
     Files: raw.tiff, uint16; truth.npy (reflectance) and psf.tiff (noise-free PSF of this eye), float32 on the sensor
-    grid (rows, cols); vessels.png if the vessels are known; plan.json. StoreError if the folder cannot be written.
+    grid (rows, cols); vessels.png if the vessels are known; plan.json. The pictures are marked as simulated.
+    StoreError if the folder cannot be written.
     """
     colour = world.spec.light.colour
     plan = plan_as_json(world.plan, world.setup(colour).spent_ms)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        tifffile.imwrite(folder / "raw.tiff", counts, description=json.dumps({"simulated": True}))
-        np.save(folder / "truth.npy", world.truth(colour))
-        tifffile.imwrite(folder / "psf.tiff", crop_or_pad(world.psf(colour), world.shape))
+        (folder / "raw.tiff").write_bytes(tiff_bytes(counts, True))
+        write_npy(folder / "truth.npy", world.truth(colour), True)
+        (folder / "psf.tiff").write_bytes(tiff_bytes(crop_or_pad(world.psf(colour), world.shape), True))
         _write_vessels(world, folder / "vessels.png")
         (folder / "plan.json").write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
@@ -103,4 +103,4 @@ def _write_vessels(world: World, path: Path) -> None:
     mask = world.retina.vessels
     if mask is not None:
         on_sensor = crop_or_pad(mask.astype(np.float32), world.shape) > 0
-        Pictures.fromarray(on_sensor.astype(np.uint8) * 255).save(path)
+        path.write_bytes(png_bytes(on_sensor.astype(np.uint8) * 255, True, for_eyes=False))

@@ -7,35 +7,31 @@ Linear pixels would show vessels too dark; any other curve would change their co
 import json
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from io import BytesIO
-from itertools import accumulate
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image as Pillow
-from PIL import ImageDraw, ImageFont
-from PIL.PngImagePlugin import PngInfo
 
+from device.config.marked_files import jpeg_bytes, png_bytes, stated_in, tiff_bytes, with_band, without_band
 from device.errors import FrameError, SettingError
 from device.recon.model.resampling import block_mean
 from device.values import Counts, Image, check_image_shape
-from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metadata
+from services.imaging.raw_metadata import RawMetadata, metadata_entries, read_metadata
 
 Pixels = NDArray[np.uint8]
 
-MARK, PREDICTED = "SIMULATED", "PREDICTED"
-_TEXTS = ("simulated", "predicted")  # text chunks besides the note
+PREDICTED = "PREDICTED"
+_PREDICTED_TEXT = "predicted"  # text chunk
 _BROKEN_TIFF = (tifffile.TiffFileError, struct.error, zlib.error)  # exceptions of tifffile on truncated data
 _LOW, _HIGH = 0.5, 99.8  # percentiles of the lit pixels: noise below, reflections above
 _SAMPLES = 40_000  # error of the percentiles below a grey level, in 1 % of the time for all pixels
 _BLACK_LIMIT = 1e-30  # a picture below this is black; a division by its range would overflow
 _SATURATED_SHARE = 0.05  # of the pixels of a block: the block is shown as saturated
 _STEPS = 4096  # in linear light, finer than 8 bits of sRGB anywhere (its slope is at most 12.92)
-_LETTER_RATIO = 1 / 18  # letter size of the mark over picture height: legible on a telephone at arm's length
-_LETTER_LEAST_PX = 12.0  # smaller letters touch each other
 _PREDICTED_RATIO = 1 / 32  # of the mark of predicted channels
 
 
@@ -48,31 +44,19 @@ def to_png(picture: Image, simulated: bool, note: str = "", predicted: Sequence[
     chunk `predicted`. Raises FrameError if any value is NaN or infinite.
     """
     _refuse_invalid_picture(picture)
-    pixels = _marked(_display_pixels(picture), simulated)
-    texts = {"simulated": "true" if simulated else "false"}
+    pixels, texts = _display_pixels(picture), {}
     if predicted:
-        texts["predicted"] = ", ".join(predicted)
-        pixels = _with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
-    return _png(Pillow.fromarray(pixels), texts, note)
+        texts = {_PREDICTED_TEXT: ", ".join(predicted)}
+        pixels = with_band(pixels, f"{' + '.join(predicted).upper()} {PREDICTED}", _PREDICTED_RATIO, at_right=True)
+    return png_bytes(pixels, simulated, texts, note)
 
 
 def with_note(png: bytes, note: str) -> bytes:
     """Return a PNG of `to_png` with another note and the same pixels."""
     with Pillow.open(BytesIO(png)) as image:
-        return _png(image, {name: str(image.info[name]) for name in _TEXTS if name in image.info}, note)
-
-
-def _png(image: Pillow.Image, texts: Mapping[str, str], note: str) -> bytes:
-    chunks = PngInfo()
-    chunks.add(b"sRGB", b"\0")
-    for name, text in texts.items():
-        chunks.add_text(name, text)
-    if note:
-        chunks.add_itxt("note", note)
-    out = BytesIO()
-    # Level 1: level 6 takes four times as long and hardly shrinks a noisy picture further.
-    image.save(out, "PNG", pnginfo=chunks, compress_level=1)
-    return out.getvalue()
+        texts = {name: str(image.info[name]) for name in (_PREDICTED_TEXT,) if name in image.info}
+        simulated = stated_in("picture.png", BytesIO(png)) is True
+        return png_bytes(np.asarray(image), simulated, texts, note, for_eyes=False)  # they have their marks
 
 
 def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int = 70) -> bytes:
@@ -89,10 +73,7 @@ def to_jpeg(picture: Image, longest_side_px: int, simulated: bool, quality: int 
     image.thumbnail(
         (longest_side_px, longest_side_px), Pillow.Resampling.BILINEAR
     )  # remaining reduction below a factor of two
-    out = BytesIO()
-    comment = f"simulated={'true' if simulated else 'false'}"
-    Pillow.fromarray(_marked(np.asarray(image), simulated)).save(out, "JPEG", quality=quality, comment=comment)
-    return out.getvalue()
+    return jpeg_bytes(np.asarray(image), simulated, quality)
 
 
 def counts_jpeg(counts: Counts, black_dn: float, white_dn: float, longest_side_px: int, simulated: bool) -> bytes:
@@ -105,9 +86,7 @@ def counts_jpeg(counts: Counts, black_dn: float, white_dn: float, longest_side_p
     grey = _srgb_curve().take((np.clip(share, 0, 1) * (_STEPS - 1)).astype(np.uint16))
     full = block_mean((counts >= white_dn).astype(np.float32), smaller) > _SATURATED_SHARE
     pixels = np.stack([np.where(full, 255, grey), *[np.where(full, 0, grey)] * 2], -1).astype(np.uint8)
-    out = BytesIO()
-    Pillow.fromarray(_marked(pixels, simulated)).save(out, "JPEG", quality=80)
-    return out.getvalue()
+    return jpeg_bytes(pixels, simulated, 80)
 
 
 def raw_tiff(counts: Counts, metadata: RawMetadata) -> bytes:
@@ -119,18 +98,7 @@ def raw_tiff(counts: Counts, metadata: RawMetadata) -> bytes:
     check_image_shape(counts.shape)
     if counts.dtype != np.uint16:
         raise FrameError(f"a raw frame holds uint16 counts, not {counts.dtype}")
-    text = metadata_text(metadata)
-    out = BytesIO()
-    tifffile.imwrite(
-        out,
-        counts,
-        photometric="rgb" if counts.ndim == 3 else "minisblack",
-        compression="zlib",  # level 1: fast on a Raspberry Pi; sensor noise does not shrink further
-        compressionargs={"level": 1},
-        description=text,
-        metadata=None,
-    )
-    return out.getvalue()
+    return tiff_bytes(counts, metadata.simulated, metadata_entries(metadata), deflated=True)
 
 
 def read_raw_tiff(data: bytes) -> tuple[Counts, RawMetadata]:
@@ -188,41 +156,6 @@ def _srgb_curve() -> Pixels:
     return pixels
 
 
-def _marked(pixels: Pixels, simulated: bool) -> Pixels:
-    """Return a copy of the pixels with the mark in the bottom left corner if `simulated`, else the same array."""
-    return _with_band(pixels, MARK, _LETTER_RATIO) if simulated else pixels
-
-
-def _with_band(pixels: Pixels, text: str, ratio: float, *, at_right: bool = False) -> Pixels:
-    """Return a copy of the pixels with `text` in a bottom corner; `ratio`: letter size over the picture's height."""
-    band = _band(*pixels.shape[:2], text, ratio)
-    rows, cols = band.shape
-    marked = pixels.copy()
-    corner = marked[-rows:, -cols:] if at_right else marked[-rows:, :cols]
-    corner[...] = band if pixels.ndim == 2 else band[..., np.newaxis]
-    return marked
-
-
-@lru_cache(maxsize=16)
-def _band(rows: int, cols: int, text: str, ratio: float) -> Pixels:
-    """Return a mark (text, white on black, grey pixels) for a picture of rows x cols, not larger than it."""
-    size = max(_LETTER_LEAST_PX, rows * ratio)
-    size = max(1.0, size * min(1.0, cols / _lengths(text, size)[-1]))
-    font, ends = ImageFont.load_default(size), _lengths(text, size)
-    width, height = min(cols, round(ends[-1])), min(rows, round(1.25 * size))
-    band = Pillow.new("L", (width, height), 0)
-    for letter, end in zip(text, ends, strict=False):  # the last value is the right margin
-        ImageDraw.Draw(band).text((end, height / 2), letter, fill=255, font=font, anchor="rm")
-    return np.asarray(band)
-
-
-def _lengths(text: str, size: float) -> list[float]:
-    """Return the right end of each letter of a mark, and last the width of its band, pixels; `size`: letter size."""
-    font, gap = ImageFont.load_default(size), 0.15 * size
-    ends = list(accumulate((font.getlength(letter) + gap for letter in text), initial=0.3 * size))
-    return [*ends[1:], ends[-1] + 0.45 * size]
-
-
 def read_png(png: bytes) -> Image:
     """Return the linear light, 0 to 1, of a picture that `to_png` wrote, float32 (rows, cols) or (rows, cols, 3).
 
@@ -230,14 +163,11 @@ def read_png(png: bytes) -> Image:
     """
     try:
         with Pillow.open(BytesIO(png)) as image:
-            pixels, simulated = np.asarray(image), image.info.get("simulated") == "true"
+            pixels = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as error:  # SyntaxError: Pillow, for a damaged PNG
         raise FrameError(f"this is not a whole PNG: {error}") from error
     light = from_srgb(pixels)
-    if simulated:
-        rows, cols = _band(*light.shape[:2], MARK, _LETTER_RATIO).shape
-        light[-rows:, :cols] = 0
-    return light
+    return without_band(light) if stated_in("picture.png", BytesIO(png)) else light
 
 
 def from_srgb(pixels: NDArray[np.uint8]) -> Image:

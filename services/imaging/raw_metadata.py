@@ -1,12 +1,11 @@
 """Metadata of a raw frame, stored as JSON in the tag ImageDescription of its TIFF: one writer and one reader."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import get_args
 
-from device.errors import SettingError
+from device.config.marked_files import KEY, stated_by
 from device.values import EYES, Colour, Eye, Illumination
 
 
@@ -27,34 +26,30 @@ class RawMetadata:
     head: str | None = None
 
 
-def metadata_text(metadata: RawMetadata) -> str:
-    """Return the metadata as JSON; SettingError for an exposure time that is NaN or infinite."""
-    entries = {
+def metadata_entries(metadata: RawMetadata) -> dict[str, object]:
+    """Return the metadata as the entries of a JSON document."""
+    return {
         "id": metadata.id,
         "eye": metadata.eye,
         "taken_at": None if metadata.taken_at is None else metadata.taken_at.isoformat(),
         "exposure_s": metadata.exposure_s,
         "glow": None if metadata.illumination is None else asdict(metadata.illumination),
-        "simulated": metadata.simulated,
+        KEY: metadata.simulated,
         "calibration_id": metadata.calibration_id,
         "head": metadata.head,
     }
-    try:
-        return json.dumps(entries, allow_nan=False)
-    except ValueError as error:
-        raise SettingError(f"the description of a raw frame cannot be written down: {error}") from error
 
 
 def read_metadata(entries: Mapping[str, object]) -> RawMetadata:
     """Return the metadata with these JSON entries; None for one that is missing or of another type or range."""
-    eye, simulated = entries.get("eye"), entries.get("simulated")
+    eye = entries.get("eye")
     return RawMetadata(
         id=_text(entries.get("id")),
         eye=next((one for one in EYES if one == eye), None),
         taken_at=_time(entries.get("taken_at")),
         exposure_s=_number(entries.get("exposure_s")),
         illumination=_illumination(entries.get("glow")),
-        simulated=simulated if isinstance(simulated, bool) else None,
+        simulated=stated_by(entries),
         calibration_id=_text(entries.get("calibration_id")),
         head=_text(entries.get("head")),
     )

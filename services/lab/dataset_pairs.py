@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from device.config.image_files import Raw, as_psf, as_raw, is_marked_simulated, read_image
+from device.config.image_files import Raw, as_psf, as_raw, read_image
+from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
 from device.values import Image, Psf
 

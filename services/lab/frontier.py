@@ -306,7 +306,7 @@ class _Bench:
             shown.append(Shown(lines, self.moved(_grey(self._reconstruct(recipe).picture))))
         lines = _label(choice, self.methods)
         shown.append(Shown((lines[0], lines[1], f"{lines[2]}, chosen"), self.chosen))
-        return thumbnail_panel(shown, self.case.truth, self.inside)
+        return thumbnail_panel(shown, self.case.truth, self.inside, self.case.calibration.simulated)
 
     def light_points(self) -> tuple[LightPoint, ...]:
         """Return the bursts of the case; none if it has no frames for them."""

@@ -4,14 +4,13 @@ from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from io import BytesIO
 from math import log
 from textwrap import wrap
 
 import numpy as np
-from PIL import Image as Pictures
 from scipy import ndimage
 
+from device.config.marked_files import png_bytes
 from device.recon.assessment.metrics import Plane, fit_intensity
 from device.values import Image, Mask
 from services.lab.frontier_result import Point
@@ -44,11 +43,11 @@ def nearest_points(points: Sequence[Point], most_s: float) -> tuple[Point, ...]:
     return tuple(sorted(chosen, key=lambda p: p.seconds_median))
 
 
-def thumbnail_panel(shown: Sequence[Shown], truth: Image, inside: Mask) -> Panel:
+def thumbnail_panel(shown: Sequence[Shown], truth: Image, inside: Mask, simulated: bool) -> Panel:
     """Return the row of thumbnails: `shown` pictures with their letters, then the truth, and how much each shows.
 
     All have the intensity that fits the truth best in the region `inside`, and one grey scale. The place is the square
-    of the region where the truth has most fine detail.
+    of the region where the truth has most fine detail. `simulated` pictures are marked.
     """
     true = np.nan_to_num(np.asarray(truth, np.float64))
     place = detailed_place(true, inside)
@@ -59,7 +58,7 @@ def thumbnail_panel(shown: Sequence[Shown], truth: Image, inside: Mask) -> Panel
     elements = [text(LEFT, 20, "The same place in these pictures and in the truth", "small")]
     for k, (lines, crop) in enumerate(zip([*(one.lines for one in shown), ("truth",)], [*fitted, wanted], strict=True)):
         letter = f"{LETTERS[k]}: " if k < len(shown) else ""
-        elements += _thumbnail(LEFT + k * PITCH_PX, (letter + lines[0], *lines[1:]), _png(crop, low, high))
+        elements += _thumbnail(LEFT + k * PITCH_PX, (letter + lines[0], *lines[1:]), _png(crop, low, high, simulated))
     each = ", ".join(f"{letter} {count}" for letter, count in zip(LETTERS, seen, strict=False))
     caption = (
         f"Of the {spots} places where this crop of the truth differs most from its surroundings (vessels, spots), "
@@ -117,12 +116,10 @@ def _thumbnail(x: float, lines: Sequence[str], png: str) -> list[str]:
     return [picture, *(text(x, below + 16 * k, words, "small") for k, words in enumerate(lines))]
 
 
-def _png(crop: Plane, low: float, high: float) -> str:
+def _png(crop: Plane, low: float, high: float, simulated: bool) -> str:
     """Return a crop as base64 of a PNG with at most SIDE_PX pixels a side; grey from `low` to `high`."""
     n = max(1, crop.shape[0] // SIDE_PX)
     rows, cols = crop.shape[0] // n, crop.shape[1] // n
     mean = crop[: rows * n, : cols * n].reshape(rows, n, cols, n).mean(axis=(1, 3))
     grey = np.clip((mean - low) / max(high - low, 1e-30), 0, 1) * 255
-    buffer = BytesIO()
-    Pictures.fromarray(np.round(grey).astype(np.uint8)).save(buffer, "PNG", optimize=True)
-    return b64encode(buffer.getvalue()).decode()
+    return b64encode(png_bytes(np.round(grey).astype(np.uint8), simulated)).decode()

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from device.config.head_file import load_head
-from device.config.image_files import is_marked_simulated, only_frame, read_image_file
+from device.config.image_files import only_frame, read_image_file
+from device.config.marked_files import KEY, is_marked_simulated, unstated_notes, without_band
 from device.errors import FrameError, SpecError
 from device.recon.montage import Montage, make_montage
 from device.values import Image
@@ -22,6 +23,7 @@ def montage_files(
 ) -> Montage:  # fmt: skip
     """Join picture files (.npy, .tiff or .png), write the montage and its report, and return it.
 
+    The montage is marked as simulated if a picture is.
     `progress` gets a line for each picture that is placed. `head` is the head file of the instrument that took them:
     its scale in degrees places them on the sphere; None: on the plane. FrameError for a file that is no picture, or for
     pictures of different sizes; SettingError for an output that cannot be written or would replace a picture; SpecError
@@ -34,11 +36,15 @@ def montage_files(
         [read_picture(path) for path in pictures], lambda done: progress(f"{done} of {len(pictures)} pictures placed"),
         px_per_deg,
     )  # fmt: skip
-    write_picture(output, joined.picture, any(is_marked_simulated(path) for path in pictures))
+    for note in unstated_notes(pictures):
+        progress(f"note: {note}")
+    simulated = any(is_marked_simulated(path) for path in pictures)
+    write_picture(output, joined.picture, simulated)
     if report is not None:
         entries = {
             "placed": [asdict(one) for one in joined.placed], "origin_px": joined.origin_px,
             "projection": joined.projection, "px_per_deg": joined.px_per_deg,
+            KEY: simulated,
         }  # fmt: skip
         text = json.dumps(entries, indent=1)
         write_or_raise(report, lambda: report.write_text(text + "\n", encoding="utf-8"))
@@ -56,12 +62,14 @@ def _scale_px_per_deg(head: Path) -> float:
 def read_picture(path: Path) -> Image:
     """Return a picture file as linear float32, (rows, cols) or (rows, cols, 3); an 8-bit PNG is decoded from sRGB.
 
-    FrameError for values that are not numbers, or for a black picture.
+    The band of a marked PNG is replaced by 0. FrameError for values that are not numbers, or for a black picture.
     """
     name = str(path)
     stored = only_frame(read_image_file(path).frames, name)
     is_coded = path.suffix.lower() == ".png" and stored.dtype == np.uint8
     pixels = from_srgb(stored.astype(np.uint8)) if is_coded else np.asarray(stored, np.float32)
+    if is_coded and is_marked_simulated(path):
+        pixels = without_band(pixels)
     if not np.isfinite(pixels).all():
         raise FrameError(f"{name} holds values that are not numbers", "Reconstruct the picture again.")
     if not pixels.max() > 0:

@@ -16,7 +16,7 @@ import numpy as np
 from device.clock import Deadline, SystemClock
 from device.config import bayer
 from device.config.bayer import Bayer
-from device.config.image_files import write_linear
+from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
 from device.recon.assessment.psf_consistency import PsfConsistency
@@ -84,7 +84,7 @@ class FileReconstruction(Reconstruction):
         return f"{report.method}, bin {report.bin}, solved on {rows} x {cols}, {seconds:.3f} s"
 
     def save(self, path: str | Path) -> None:
-        """Write the picture: .png scaled for eyes, marked if simulated; .tiff or .npy linear float32.
+        """Write the picture, marked if simulated: .png scaled for eyes; .tiff or .npy linear float32.
 
         SettingError for another ending or a folder that does not exist; StoreError if the file cannot be written.
         """
@@ -94,7 +94,7 @@ class FileReconstruction(Reconstruction):
 
     def report_json(self) -> str:
         """Return the report as the text of a JSON file."""
-        return json.dumps(asdict(self.report), indent=1) + "\n"
+        return json.dumps(asdict(self.report) | {KEY: self.simulated}, indent=1) + "\n"
 
 
 def reconstruct_file(options: ReconstructOptions) -> FileReconstruction:
@@ -460,4 +460,4 @@ def write_picture(path: Path, picture: Image, simulated: bool) -> None:
     if path.suffix.lower() == ".png":
         write_or_raise(path, lambda: path.write_bytes(to_png(picture, simulated)))
     else:
-        write_or_raise(path, lambda: write_linear(path, picture))
+        write_or_raise(path, lambda: write_linear(path, picture, simulated))

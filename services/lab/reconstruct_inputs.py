@@ -20,7 +20,6 @@ from device.config.image_files import (
     as_raw,
     clean_channels,
     frames_of,
-    is_marked_simulated,
     only_frame,
     psf_counts,
     read_image_file,
@@ -28,6 +27,7 @@ from device.config.image_files import (
     require_same_shape,
     saturated_share,
 )
+from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels

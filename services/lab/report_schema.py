@@ -277,7 +277,7 @@ def report_schema() -> dict[str, JsonValue]:
         "title": "report.json of Diffuscope",
         "description": (
             "Report of a reconstruction. Of the entries that are not required, `diffuscope reconstruct` writes solved, "
-            "given, psf_channels and bayer, the instrument the instrument the others; both write frames and channels. "
+            "given, psf_channels and bayer, the instrument the others; both write frames, channels and simulated. "
             "Later versions add entries; readers ignore those that they do not know."
         ),
         "type": "object",

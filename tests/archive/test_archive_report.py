@@ -1,10 +1,15 @@
 """The page about a large table, and figures of a table with every state."""
 
+import re
 import time
+from base64 import b64decode
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from device.config.marked_files import stated_in, tiff_bytes
 from services.lab.archive.report import write_report
 from services.lab.archive.table import age_days, encoded_table
 
@@ -50,6 +55,17 @@ def test_an_archive_without_earlier_pictures_shows_what_is_least_explained(tmp_p
     assert "Nothing to compare" in page
     assert "got worse" not in page
     assert page.index("c7: residual 8") < page.index("c6: residual 7")
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_pictures_are_marked_where_their_frames_are_simulated(tmp_path: Path, simulated: bool) -> None:
+    picture = np.random.default_rng(0).uniform(0, 1, (90, 160)).astype(np.float32)
+    (tmp_path / "picture.tiff").write_bytes(tiff_bytes(picture, simulated))
+    row = {"id": "c", "state": "done", "residual": 1.0, "messages": [], "picture": "picture.tiff"}
+    (tmp_path / "captures.parquet").write_bytes(encoded_table([row | {"simulated": simulated}]))
+    write_report(tmp_path, tmp_path / "report.html", lambda _: None)
+    (jpeg,) = re.findall(r"data:image/jpeg;base64,([^\"]+)", (tmp_path / "report.html").read_text())
+    assert stated_in("x.jpg", BytesIO(b64decode(jpeg))) is simulated
 
 
 def test_the_age_of_a_calibration_is_in_days_or_unknown() -> None:

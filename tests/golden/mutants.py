@@ -1,4 +1,4 @@
-"""Seeded mutants of guard, dose ledger, store and exam, each with the test that must fail.
+"""Seeded mutants of guard, dose ledger, store, exam and marks of pictures, each with the test that must fail.
 
 Each mutant is one replacement in one file, whose old text occurs there exactly once. `run` applies each mutant to a
 copy of the tree.
@@ -55,6 +55,11 @@ def scenario(name: str) -> str:
     return f"{T_TRACE}::test_a_scenario_is_as_recorded[{name}]"
 
 
+def mark(name: str) -> str:
+    """Return one test of the mark of simulated pictures."""
+    return f"tests/property/test_simulated_mark.py::test_{name}"
+
+
 class Mutant(NamedTuple):
     """One changed place: a file, its exact old text, the new text, and the pytest arguments."""
 
@@ -64,6 +69,122 @@ class Mutant(NamedTuple):
     test: str
 
 
+MARKS = (  # file, old text, new text, and test of the mark of simulated pictures
+    (
+        "device/calibration/procedure/raw_recorder.py", "write_side_file(path, frame.simulated)",
+        "write_side_file(path, False)", "raw_frames_of_a_calibration",
+    ),
+    ("device/calibration/import_psf.py", "simulated=simulated)", "simulated=False)", "calibrations"),
+    (
+        "device/config/marked_files.py", "write_npy(path, picture, simulated)",
+        "write_npy(path, picture, False)", "reconstruct",
+    ),
+    ("device/config/marked_files.py", "tiff_bytes(picture, simulated)", "tiff_bytes(picture, False)", "reconstruct"),
+    ("device/config/marked_files.py", "simulated and for_eyes", "False", "reconstruct"),
+    ("device/config/marked_files.py", "{KEY: _WORDS[simulated]} |", '{KEY: "false"} |', "reconstruct"),
+    (
+        "device/config/marked_files.py", 'comment = f"{KEY}={_WORDS[simulated]}"',
+        'comment = f"{KEY}=false"', "files_of_a_capture",
+    ),
+    ("device/sim/scene_files.py", "tiff_bytes(counts, True)", "tiff_bytes(counts, False)", "simulate_and_frame"),
+    ("device/sim/scene_files.py", "world.truth(colour), True)", "world.truth(colour), False)", "simulate_and_frame"),
+    ("device/sim/scene_files.py", "world.shape), True)", "world.shape), False)", "simulate_and_frame"),
+    ("device/sim/scene_files.py", "255, True, for_eyes", "255, False, for_eyes", "simulate_and_frame"),
+    (
+        "services/imaging/picture_files.py", "png_bytes(pixels, simulated, texts, note)",
+        "png_bytes(pixels, False, texts, note)", "reconstruct",
+    ),
+    (
+        "services/imaging/picture_files.py", "png_bytes(np.asarray(image), simulated, texts",
+        "png_bytes(np.asarray(image), False, texts", "export_after_a_correction_of_the_eye",
+    ),
+    (
+        "services/imaging/picture_files.py", "jpeg_bytes(np.asarray(image), simulated, quality)",
+        "jpeg_bytes(np.asarray(image), False, quality)", "files_of_a_capture",
+    ),
+    (
+        "services/imaging/picture_files.py", "jpeg_bytes(pixels, simulated, 80)",
+        "jpeg_bytes(pixels, False, 80)", "live_picture_of_a_calibration",
+    ),
+    (
+        "services/imaging/picture_files.py", "tiff_bytes(counts, metadata.simulated,",
+        "tiff_bytes(counts, False,", "files_of_a_capture",
+    ),
+    (
+        "services/instrument/accuracy_explorer.py", "to_png(shown, made.simulated,",
+        "to_png(shown, False,", "picture_of_another_method",
+    ),
+    (
+        "services/instrument/camera_tap.py", "LONGEST_SIDE_PX, frame.simulated)",
+        "LONGEST_SIDE_PX, False)", "live_picture_of_a_calibration",
+    ),
+    (
+        "services/instrument/capture.py", "illumination=light, simulated=simulated)",
+        "illumination=light, simulated=False)", "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture.py", "to_png(shown, capture.simulated,",
+        "to_png(shown, False,", "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture.py", "to_png(colour, capture.simulated,",
+        "to_png(colour, False,", "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture.py", "QUICK_PX, capture.simulated)",
+        "QUICK_PX, False)", "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture.py", '{"simulated": capture.simulated}',
+        '{"simulated": False}', "encoded_files_of_a_capture",
+    ),
+    (
+        "services/instrument/capture_pipeline.py", "PREVIEW_PX, made.simulated)",
+        "PREVIEW_PX, False)", "quick_look_and_live_picture",
+    ),
+    ("services/instrument/capture_pipeline.py", "shot.frame.simulated\n", "False\n", "files_of_a_capture"),
+    (
+        "services/instrument/exam_events.py", "to_jpeg(look, QUICK_PX, simulated)",
+        "to_jpeg(look, QUICK_PX, False)", "files_of_a_capture",
+    ),
+    (
+        "services/instrument/visit_montage.py", 'to_png(joined.picture, simulated, "montage")',
+        'to_png(joined.picture, False, "montage")', "montage_of_a_visit",
+    ),
+    ("services/lab/archive/adopt.py", "to_png(colour, stored.simulated,", "to_png(colour, False,", "adopted_pictures"),
+    (
+        "services/lab/archive/adopt.py", "to_png(picture, stored.simulated,",
+        "to_png(picture, False,", "adopted_pictures",
+    ),
+    (
+        "services/lab/archive/solve.py", "tiff_bytes(made.solved.made.picture, simulated)",
+        "tiff_bytes(made.solved.made.picture, False)", "pictures_of_an_archive",
+    ),
+    (
+        "services/lab/frontier_thumbnails.py", ".astype(np.uint8), simulated)",
+        ".astype(np.uint8), False)", "thumbnails_of_a_frontier",
+    ),
+    ("services/lab/montage_files.py", "joined.picture, simulated)", "joined.picture, False)", "montage"),
+    ("services/lab/montage_files.py", "KEY: simulated,", "KEY: False,", "montage"),
+    ("services/lab/paper/pictures.py", "png_bytes(grey, True)", "png_bytes(grey, False)", "pictures_of_the_paper"),
+    (
+        "services/lab/reconstruct_burst.py", "made.picture, report, made.simulated or calibration.simulated)",
+        "made.picture, report, False)", "reconstruct_burst",
+    ),
+    (
+        "services/lab/reconstruct_colour.py", "any(one.simulated for one in made.values())",
+        "False", "reconstruct_channels",
+    ),
+    ("services/lab/reconstruct_each.py", "made.picture), made.simulated)", "made.picture), False)", "reconstruct_each"),
+    (
+        "services/lab/reconstruct_file.py", "write_picture(place, self.picture, self.simulated)",
+        "write_picture(place, self.picture, False)", "python",
+    ),
+    ("services/lab/reconstruct_file.py", "made.picture), made.simulated)", "made.picture), False)", "reconstruct"),
+    ("services/lab/reconstruct_file.py", "{KEY: self.simulated}", "{KEY: False}", "reconstruct"),
+    ("services/lab/reconstruct_inputs.py", "isinstance(source, SimulatedCounts)", "False", "python"),
+    ("services/lab/take_frames.py", "simulated=frame.simulated", "simulated=False", "simulate_and_frame"),
+)  # fmt: skip
 MUTANTS: tuple[Mutant, ...] = (
     # Guard
     Mutant(GUARD, "  # when it had ended this stretch\n        light.off()\n", "\n", T_GUARD),
@@ -210,6 +331,7 @@ MUTANTS: tuple[Mutant, ...] = (
         EXAM, "            requests.remember(one.press)\n", "            pass\n",
         f"{T_INTERRUPTED}::test_the_next_start_stores_a_shorter_burst_under_the_same_id_and_key",
     ),
+    *(Mutant(file, old, new, mark(test)) for file, old, new, test in MARKS),
 )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from tests.journey.conftest import Diffuscope
 REPORT_KEYS = {  # the public interface
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
     "refraction_scatter", "regularisation", "noise_dn", "residual", "quality", "warnings", "solved", "given",
-    "psf_channels", "bayer", "frames", "channels",
+    "psf_channels", "bayer", "frames", "channels", "simulated",
 }  # fmt: skip
 
 
@@ -89,6 +89,7 @@ def test_reconstruct_writes_picture_and_report(
     assert np.corrcoef(picture[seen], truth[seen])[0, 1] > 0.8
     facts = json.loads(report.read_text())
     assert set(facts) == REPORT_KEYS
+    assert facts["simulated"] is True
     assert facts["stopped"] == "done"
     assert all(seconds >= 0 for seconds in facts["seconds"].values())
 

@@ -13,7 +13,7 @@ from PIL import Image as Pillow
 from device.config.head_file import InstrumentSpec
 from device.errors import DiffuscopeError
 from device.sim.eyes import FIXATION_DEG
-from services.imaging.picture_files import MARK, read_png, to_png
+from services.imaging.picture_files import read_png, to_png
 from services.instrument.head_arbiter import AIMING_S
 from services.instrument.visit_montage import join_pictures
 from tests.journey.asking import visit_with_consent
@@ -71,7 +71,7 @@ def test_two_fields_of_one_eye_become_one_picture(eye_rig: Rig) -> None:
     with Pillow.open(BytesIO(eye_rig.store.read(first["id"], "picture.png"))) as one:
         assert shown.shape[1] > 1.2 * one.width, "wider than one field"
     rows = round(shown.shape[0] / 18)  # letters of the mark in the bottom left corner, which is in no field
-    assert (shown[-rows:, : 3 * rows] > 200).any(), MARK
+    assert (shown[-rows:, : 3 * rows] > 200).any(), "the band"
     assert montage(eye_rig, visit)["digest"] == joined["digest"]
     assert montage(eye_rig, visit, "OS")["state"] == "none"
 

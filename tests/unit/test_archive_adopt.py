@@ -42,7 +42,9 @@ def planned(store: Path, name: str) -> PlannedCapture:
     )  # fmt: skip
 
 
-def write_results(folder: Path, captures: list[PlannedCapture], without: tuple[str, ...] = ()) -> Path:
+def write_results(
+    folder: Path, captures: list[PlannedCapture], without: tuple[str, ...] = (), simulated: bool = True
+) -> Path:  # fmt: skip
     """Write a folder of results: a picture of 6 x 8 pixels whose field is 4 x 6, and one in colour."""
     plan = Plan(
         made_at="2026-01-01", sources=("a",), settings=PlanSettings(), software=software(), captures=tuple(captures),
@@ -52,7 +54,7 @@ def write_results(folder: Path, captures: list[PlannedCapture], without: tuple[s
     folder.mkdir()
     results.prepare(plan)
     report = {"method": "variation", "channels": [{"name": "blue", "predicted": True}]}
-    document = {"report": report, "simulated": True, "field_px": [1, 5, 1, 7]}
+    document = {"report": report, "simulated": simulated, "field_px": [1, 5, 1, 7]}
     for one in captures:
         if one.id not in without:
             pictures = {"picture.tiff": encoded(picture), "colour.tiff": encoded(np.stack([picture[1:5, 1:7]] * 3, 2))}

@@ -69,7 +69,7 @@ def thumbnails(rng: np.random.Generator, found: Frontier):
     truth = rng.uniform(0, 1, (600, 900))
     points = nearest_points(drawn_points(found), found.choice.seconds_median)
     shown = [Shown(("5.0 ms, 29.1 dB", "variation, bin 3", "12 rounds, chosen"), truth) for _ in range(len(points) + 1)]
-    return thumbnail_panel(shown, truth, np.ones(truth.shape, np.bool_))
+    return thumbnail_panel(shown, truth, np.ones(truth.shape, np.bool_), False)
 
 
 def letters(drawing: str) -> list[str]:

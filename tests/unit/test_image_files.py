@@ -18,13 +18,12 @@ from PIL import Image
 from device.config.image_files import (
     as_psf,
     as_raw,
-    is_marked_simulated,
     read_image,
     read_image_file,
     read_psf,
     require_same_shape,
-    write_linear,
 )
+from device.config.marked_files import is_marked_simulated, write_linear
 from device.errors import FrameError, PsfError, SettingError
 from device.values import Psf
 from services.imaging.picture_files import raw_tiff
@@ -441,7 +440,7 @@ def test_raw_tiff_is_marked_as_simulated(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["x.npy", "x.tiff", "x.tif"])
 def test_linear_pictures_round_trip(tmp_path: Path, name: str) -> None:
     picture = np.random.default_rng(0).normal(size=(5, 7, 3)).astype(np.float32)
-    write_linear(tmp_path / name, picture)
+    write_linear(tmp_path / name, picture, False)
     assert np.array_equal(read_image(tmp_path / name), picture)
     with pytest.raises(SettingError, match=r"not '\.bmp'"):
-        write_linear(tmp_path / "x.bmp", picture)
+        write_linear(tmp_path / "x.bmp", picture, False)

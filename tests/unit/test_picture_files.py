@@ -16,10 +16,11 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as Pillow
 from scipy import ndimage
 
+from device.config.marked_files import LETTERS
 from device.errors import FrameError, SettingError
 from device.values import EYES, Illumination
-from services.imaging.picture_files import MARK, raw_tiff, read_png, read_raw_tiff, to_jpeg, to_png
-from services.imaging.raw_metadata import RawMetadata, metadata_text, read_metadata
+from services.imaging.picture_files import raw_tiff, read_png, read_raw_tiff, to_jpeg, to_png
+from services.imaging.raw_metadata import RawMetadata, metadata_entries, read_metadata
 
 SHAPES = [(120, 160), (270, 480), (600, 600), (1080, 1920), (480, 270), (100, 130), (500, 130), (270, 480, 3)]
 
@@ -68,7 +69,7 @@ def test_the_mark_has_nine_separate_letters_in_one_corner_and_nothing_else_chang
     top, right = rows.min(), cols.max() + 1
     letters, number = ndimage.label(grey[top:, :right] > 90, np.ones((3, 3)))
     heights = [box[0].stop - box[0].start for box in ndimage.find_objects(letters)]
-    assert number == len(MARK)
+    assert number == len(LETTERS)
     assert min(heights) >= min(0.035 * shape[0], 0.07 * shape[1])
     assert grey[top:, :right].min() < 30
     edge = max(6, shape[0] // 25)  # margin of the band around its letters
@@ -222,7 +223,7 @@ def test_the_metadata_of_a_release_are_read_whole_and_written_to_the_same_bytes(
         glow = Illumination("red" if path.name == "raw-red.tiff" else "green")
         assert metadata.illumination == (glow if path.name.startswith("raw") else None)
         assert metadata.id == path.parent.name
-        assert metadata_text(metadata) == written
+        assert metadata_entries(metadata) == json.loads(written)
 
 
 @pytest.mark.parametrize("glow", ["green", {}, {"colour": "green", "level": 2.0}, {"colour": "white", "level": 1.0}])
@@ -232,7 +233,7 @@ def test_metadata_of_another_type_are_unknown(glow: object) -> None:
         "id": 7, "eye": "left", "taken_at": "yesterday", "exposure_s": "0.1", "glow": glow, "simulated": "true",
         "calibration_id": [], "head": {},
     }  # fmt: skip
-    assert set(wrong) == set(json.loads(metadata_text(RawMetadata())))
+    assert set(wrong) == set(metadata_entries(RawMetadata()))
     assert read_metadata(wrong) == read_metadata({}) == RawMetadata()
 
 

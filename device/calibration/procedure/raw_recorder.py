@@ -1,6 +1,6 @@
 """Optional recording of every raw frame of a calibration beside the calibration.
 
-FOLDER/<step>/00001_0.1s.npy    uint16 counts (rows, cols)
+FOLDER/<step>/00001_0.1s.npy    uint16 counts (rows, cols), and in NAME.json whether it is simulated
 FOLDER/<step>/SHA256SUMS        for `sha256sum --check`
 """
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from device import atomic_io
+from device.config.marked_files import write_side_file
 from device.values import Frame
 
 SUMS = "SHA256SUMS"
@@ -52,6 +53,7 @@ class RawRecorder:
                 raise OSError(errno.ENOSPC, f"less than {self.reserve_bytes / 1e6:.0f} MB are left")
             with open(path, "wb", opener=atomic_io.private_opener) as file:
                 file.write(content)
+            write_side_file(path, frame.simulated, atomic_io.private_opener)
             with open(self._step / SUMS, "a", encoding="ascii", opener=atomic_io.private_opener) as sums:
                 sums.write(f"{hashlib.sha256(content).hexdigest()}  {path.name}\n")
         except OSError as error:

@@ -218,7 +218,7 @@ def _least_explained(folder: Path, columns: Columns) -> str:
     ids, places, simulated = columns.words("id"), columns.words("picture"), columns.values("simulated")
     out = []
     for residual, row in worst:
-        picture = _thumbnail(folder / places[row] if places[row] else None, simulated[row] is True, "after")
+        picture = _thumbnail(folder / places[row] if places[row] else None, simulated[row] is not False, "after")
         words = (
             f"{ids[row]}: residual {-residual:.3g} (rms over the noise; about 1 where the picture explains the frame)"
         )
@@ -231,7 +231,7 @@ def _pictures(folder: Path, columns: Columns, shown: Sequence[Change]) -> str:
     out = []
     for one in shown:
         place, messages = columns.words("picture")[one.row], columns.values("messages")[one.row]
-        before, simulated = columns.words("before_picture")[one.row], columns.values("simulated")[one.row] is True
+        before, simulated = columns.words("before_picture")[one.row], columns.values("simulated")[one.row] is not False
         pair = _thumbnail(Path(before) if before else None, simulated, "before")
         pair += _thumbnail(folder / place if place else None, simulated, "after")
         notes = "; ".join(map(str, messages)) if isinstance(messages, list) else ""

@@ -7,15 +7,14 @@ import shutil
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import tifffile
 
 from device.clock import Clock, SystemClock
 from device.config.image_files import only_frame, read_image_file
+from device.config.marked_files import tiff_bytes
 from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError
 from device.recon.assessment.exposure_split import dark_fits
 from device.recon.model.fft_plans import Planner
@@ -128,13 +127,14 @@ class Solvers:
         total_s = self._clock.now_s() - begin_s
         run = {"seconds": made.solved.made.report.seconds, "total_s": total_s, "worker": worker,
                "finished_at": self._clock.wall().isoformat(timespec="seconds")}  # fmt: skip
+        simulated = made.solved.made.simulated
         files = {
-            PICTURE: _tiff(made.solved.made.picture),
+            PICTURE: tiff_bytes(made.solved.made.picture, simulated),
             REPORT: encoded_document(_report(task, made)),
             RUN: encoded_document(run),
         }
         if made.solved.colour is not None:
-            files[COLOUR_PICTURE] = _tiff(made.solved.colour)
+            files[COLOUR_PICTURE] = tiff_bytes(made.solved.colour, simulated)
         results.add(name, files)
         return Outcome(name, self._clock.now_s() - begin_s)
 
@@ -286,9 +286,3 @@ def _report(task: Task, made: _Made) -> dict[str, object]:
         "scores": made.scores, "rows": rows, "cols": cols, "simulated": solved.made.simulated,
         "field_px": [top, bottom, left, right],
     }  # fmt: skip
-
-
-def _tiff(picture: Image) -> bytes:
-    out = BytesIO()
-    tifffile.imwrite(out, picture, photometric="rgb" if picture.ndim == 3 else "minisblack")
-    return out.getvalue()

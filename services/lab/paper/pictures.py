@@ -1,12 +1,12 @@
-"""Pictures of the report as data URLs: grey images (PNG) and plots (SVG)."""
+"""Pictures of the report as data URLs: grey images (PNG, all marked as simulated) and plots (SVG)."""
 
-from base64 import b64decode, b64encode
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from io import BytesIO
 
 import numpy as np
 from PIL import Image as Pictures
 
+from device.config.marked_files import Pixels, marked_pixels, png_bytes
 from device.recon.assessment.metrics import fit_intensity
 from device.values import Image, Mask
 from services.lab.paper.bench import SimulatedFrame
@@ -25,10 +25,15 @@ def plane(caption: str, image: Image, inside: Mask | None = None, box: Mask | No
     Black and white are the percentiles DARKEST and BRIGHTEST of the values inside.
     """
     inside = np.ones(image.shape, np.bool_) if inside is None else inside
+    return Figure(caption, _png(_grey(image, inside, inside if box is None else box)))
+
+
+def _grey(image: Image, inside: Mask, box: Mask) -> Pixels:
+    """Return the 8-bit pixels of `plane`."""
     low, high = np.percentile(image[inside], [DARKEST, BRIGHTEST])
     grey = np.clip((image - low) / max(float(high - low), 1e-30), 0, 1)
-    rows, cols = _around(inside if box is None else box)
-    return Figure(caption, _png((255 * grey[rows, cols]).astype(np.uint8)))
+    rows, cols = _around(box)
+    return _enlarged((255 * grey[rows, cols]).astype(np.uint8))
 
 
 def compared(take: SimulatedFrame, pictures: Mapping[str, Image], name: str = "") -> tuple[Figure, ...]:
@@ -114,10 +119,10 @@ def side_by_side(caption: str, file: str, pictures: Sequence[tuple[Image, Mask]]
     """Return pictures cut to their fields, at one height in one row; the report also writes it to `file`."""
     tiles = []
     for image, inside in pictures:
-        content = b64decode(plane("", np.where(inside, image, 0), inside).address.split(",", 1)[1])
-        tile = Pictures.open(BytesIO(content))
-        tiles.append(tile.resize((round(tile.width * TILE_PX / tile.height), TILE_PX), Pictures.Resampling.LANCZOS))
-    row = np.hstack([np.pad(np.asarray(tile), ((0, 0), (0, MARGIN_PX))) for tile in tiles])
+        tile = Pictures.fromarray(_grey(np.where(inside, image, 0), inside, inside))
+        size = round(tile.width * TILE_PX / tile.height), TILE_PX
+        tiles.append(marked_pixels(np.asarray(tile.resize(size, Pictures.Resampling.LANCZOS)), True))
+    row = np.hstack([np.pad(tile, ((0, 0), (0, MARGIN_PX))) for tile in tiles])
     return Figure(caption, _png(row), wide=True, file=file)
 
 
@@ -125,13 +130,14 @@ def _svg(caption: str, plot: Plot) -> Figure:
     return Figure(caption, f"data:image/svg+xml;base64,{b64encode(svg(plot).encode()).decode()}", wide=True)
 
 
-def _png(grey: np.ndarray) -> str:
-    picture = Pictures.fromarray(grey)
-    if (enlarge := LEAST_SIDE_PX // max(min(grey.shape), 1)) > 1:
-        picture = picture.resize((grey.shape[1] * enlarge, grey.shape[0] * enlarge), Pictures.Resampling.NEAREST)
-    buffer = BytesIO()
-    picture.save(buffer, "PNG", optimize=True)
-    return f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}"
+def _enlarged(grey: Pixels) -> Pixels:
+    """Return a small picture with each pixel repeated, so that its shorter side has at least LEAST_SIDE_PX."""
+    enlarge = max(1, LEAST_SIDE_PX // max(min(grey.shape), 1))
+    return grey.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+
+
+def _png(grey: Pixels) -> str:
+    return f"data:image/png;base64,{b64encode(png_bytes(grey, True)).decode()}"
 
 
 def _around(mask: Mask) -> tuple[slice, slice]:
