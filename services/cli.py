@@ -25,6 +25,7 @@ from services.lab.archive import command as archive_command
 from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
 from services.lab.montage_files import montage_files, placed_lines
+from services.lab.named_files import head_file, scene_file
 from services.lab.peers import ENVIRONMENT, installed_peer
 from services.lab.psf_stack import psf_stack
 from services.lab.reconstruct_burst import reconstruct_burst
@@ -156,7 +157,9 @@ def reconstruct(  # size: each option of the command is one declared parameter
         typer.Option(metavar="[NAME=]FILE", help="Dark frame of the same exposure; with NAME that of one channel."),
     ] = None,
     flat: Annotated[Path | None, typer.Option(help="Flat frame: the sensor's response to even light.")] = None,
-    head: Annotated[Path | None, typer.Option(help="Head file, for the geometry.")] = None,
+    head: Annotated[
+        Path | None, typer.Option(help="Head file, or the name of a shipped one or of a scene, for the geometry.")
+    ] = None,
     field_deg: Annotated[float | None, typer.Option(help="Illuminated disc around the centre, in degrees.")] = None,
     field_fixed: Annotated[
         bool, typer.Option("--field-fixed", help="Take the illuminated disc as exact for the refraction.")
@@ -183,8 +186,8 @@ def reconstruct(  # size: each option of the command is one declared parameter
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
         raws[0] if raws else Path(), psf_stack(psf or ()), None if each else output, method, budget_s, common_dark,
-        flat, head, field_deg, even, resources.fft_plans(), None if each else report, sweep, calibration, bin, rounds,
-        parse_settings(setting or ()), parse_bayer(bayer), field_fixed, not no_refraction,
+        flat, head and head_file(head), field_deg, even, resources.fft_plans(), None if each else report, sweep,
+        calibration, bin, rounds, parse_settings(setting or ()), parse_bayer(bayer), field_fixed, not no_refraction,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
     if each:
@@ -214,7 +217,7 @@ def montage(
 
     Without a head file their scale in degrees is unknown, and they are joined on the plane; the report says so.
     """
-    joined = montage_files(picture, output, report, _progress, head)
+    joined = montage_files(picture, output, report, _progress, head and head_file(head))
     rows, cols = joined.picture.shape[:2]
     used = sum(one.used for one in joined.placed)
     typer.echo(f"{output}: {used} of {len(picture)} pictures on the {joined.projection}, {rows} x {cols} pixels")
@@ -518,7 +521,7 @@ def draw_chart(
 
 @app.command()
 def simulate(
-    scene: Annotated[Path, typer.Argument(help="Scene file; ready ones are in device/sim/scenes/.")],
+    scene: Annotated[Path, typer.Argument(help="Scene file, or the name of one of device/sim/scenes/: healthy.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write into.")] = None,
     explain: Annotated[bool, typer.Option("--explain", help="Print the plan, and render nothing.")] = False,
     everything: Annotated[bool, typer.Option("--all", help="Simulate all effects, seen or not.")] = False,
@@ -531,7 +534,7 @@ def simulate(
     """
     from services.lab import simulate_scene  # imports the simulator only for this command
 
-    spec = load_head(scene)
+    spec = load_head(scene_file(scene))
     selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
     if explain:
         typer.echo(simulate_scene.explain_plan(spec, selected))
@@ -546,7 +549,7 @@ def simulate(
 def frontier(
     json_file: Annotated[Path, typer.Option("--json", help="Where to write every point, as JSON.")],
     plot: Annotated[Path, typer.Option(help="Where to draw accuracy against time, as SVG.")],
-    scene: Annotated[Path | None, typer.Option(help="Scene file; its truth is known.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="Scene file, or its name; its truth is known.")] = None,
     raw: Annotated[Path | None, typer.Option(help="Raw frame, with --psf and --truth.")] = None,
     psf: Annotated[Path | None, typer.Option(help="Measured PSF of the raw frame.")] = None,
     truth: Annotated[Path | None, typer.Option(help="What the picture should be, on the raw's own pixels.")] = None,
@@ -565,8 +568,8 @@ def frontier(
     from services.lab import frontier_pairs
 
     request = measured.FrontierRequest(
-        scene, raw, psf, truth, head, field_deg, json_file, plot, budget_s, repeats, resources.fft_plans(),
-        tuple(method or ()),
+        scene and scene_file(scene), raw, psf, truth, head and head_file(head), field_deg, json_file, plot, budget_s,
+        repeats, resources.fft_plans(), tuple(method or ()),
     )  # fmt: skip
     wanted = None if data is None else frontier_pairs.dataset_request(request, data, limit)
     with installed_peer(None if no_peers else peers, frontier_pairs.LENSLESS_ROUNDS, _progress) as peer:

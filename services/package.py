@@ -2,7 +2,7 @@
 
     import diffuscope
     scene = diffuscope.simulate("healthy")
-    made = diffuscope.reconstruct(scene.raw, scene.psf)
+    made = diffuscope.reconstruct(scene.raw, scene.psf, head=scene)
     made.picture, made.report
 
 The wheel installs this module as `diffuscope/__init__.py`; the packages `device` and `services` hold the program.
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from device.errors import DiffuscopeError, FrameError, PsfError, SettingError, SpecError
     from device.recon.methods import Method
+    from services.lab.dataset_pairs import Dataset, Pair
     from services.lab.datasets import open_dataset
     from services.lab.frontier_result import Frontier
     from services.lab.python_api import (
@@ -31,15 +32,16 @@ if TYPE_CHECKING:
     from services.lab.reconstruct_file import FileReconstruction, FileReport
 
 __all__ = [
-    "DiffuscopeError", "FileReconstruction", "FileReport", "ForwardModel", "FrameError", "Frontier", "Method",
-    "PsfError", "ReconstructionOptions", "Reconstructor", "SettingError", "SimulatedScene", "SpecError", "__version__",
-    "frontier", "methods", "open_dataset", "reconstruct", "simulate",
+    "Dataset", "DiffuscopeError", "FileReconstruction", "FileReport", "ForwardModel", "FrameError", "Frontier",
+    "Method", "Pair", "PsfError", "ReconstructionOptions", "Reconstructor", "SettingError", "SimulatedScene",
+    "SpecError", "__version__", "frontier", "methods", "open_dataset", "reconstruct", "simulate",
 ]  # fmt: skip
 __version__ = version("diffuscope")
 
 _MODULES = {
     "device.errors": ("DiffuscopeError", "FrameError", "PsfError", "SettingError", "SpecError"),
     "device.recon.methods": ("Method",),
+    "services.lab.dataset_pairs": ("Dataset", "Pair"),
     "services.lab.datasets": ("open_dataset",),
     "services.lab.frontier_result": ("Frontier",),
     "services.lab.python_api": (

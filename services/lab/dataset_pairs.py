@@ -5,7 +5,7 @@ Every frame that is read is upright, its channels are red, green and blue, and i
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from PIL import Image as Pillow
 from device.config.image_files import Raw, as_psf, as_raw, read_image
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
-from device.values import Image, Psf
+from device.values import Image, Psf, SimulatedCounts
 
 Stored = Literal["upright", "upside down", "rotated by 180 degrees"]
 Pixels = NDArray[Any]
@@ -146,7 +146,10 @@ class Dataset:
         shape = (raw.pixels.shape[0], raw.pixels.shape[1])
         psfs = _read_psfs(entry.psfs, self.layout.frames, self.layout.bgr, shape)
         truth = None if entry.truth is None else _read_truth(entry.truth, self.layout, shape)
-        return Pair(entry.name, raw, psfs, truth, is_marked_simulated(entry.raw))
+        simulated = is_marked_simulated(entry.raw)
+        if simulated:  # the counts alone carry the mark, too
+            raw = replace(raw, pixels=raw.pixels.view(SimulatedCounts))
+        return Pair(entry.name, raw, psfs, truth, simulated)
 
 
 def _upright(array: Pixels, stored: Stored, bgr: bool) -> Pixels:

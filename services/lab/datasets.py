@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from device.config.image_files import SUFFIXES, read_image
 from device.errors import FrameError, SettingError
@@ -81,6 +81,8 @@ def open_dataset(folder: Path | str, psf: Path | str | None = None, split: Split
     layout, or without a PSF that fits.
     """
     folder = Path(folder)
+    if split not in get_args(Split):
+        raise SettingError(f"there is no split '{split}'", f"Choose one of: {', '.join(get_args(Split))}.")
     if not folder.is_dir():
         raise SettingError(f"{folder} is not a folder", "Give the folder into which you unpacked the data set.")
     for recogniser in RECOGNISERS:

@@ -17,7 +17,7 @@ import pyfftw
 
 from device.clock import Clock, Deadline, SystemClock
 from device.config.head_file import InstrumentSpec, load_head
-from device.config.image_files import read_image
+from device.config.image_files import Raw, read_image
 from device.errors import DiffuscopeError, FrameError, SettingError
 from device.recon.assessment.metrics import FIT, RANGE, PictureScorer, Scores, shift_px
 from device.recon.installed_methods import available_methods, find_method
@@ -51,7 +51,7 @@ from services.lab.pair_scores import LeftOut, left
 from services.lab.peers import LenslessPeer
 from services.lab.plot import Panel
 from services.lab.reconstruct_file import require_writable, write_or_raise
-from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_calibration, load_raw, name_of
+from services.lab.reconstruct_inputs import RawSource, ReconstructOptions, Source, load_calibration, load_raw, name_of
 
 ROUNDS = (0, 1, 2, 4, 8, 12, 20)
 MOST_BIN, LEAST_SAMPLES = 4, 48
@@ -477,7 +477,12 @@ def _case(request: FrontierRequest) -> Case:
 
 
 def recorded_case(
-    raw: Source, psf: Source, truth: Source, head: Path | None, field_deg: float | None, plans: Path
+    raw: RawSource,
+    psf: Source,
+    truth: Source,
+    head: Path | InstrumentSpec | None,
+    field_deg: float | None,
+    plans: Path,
 ) -> Case:
     """Return a recorded frame with its truth, files or arrays; FrameError for a truth of another shape.
 
@@ -491,6 +496,7 @@ def recorded_case(
             f"the raw {frame.shape[0]} x {frame.shape[1]}",
             "Give the truth on the sensor's grid: one value per pixel of the raw frame.",
         )
-    options = ReconstructOptions(raw, (psf,), None, None, None, None, None, head, field_deg, False, plans)
+    file = raw.pixels if isinstance(raw, Raw) else raw
+    options = ReconstructOptions(file, (psf,), None, None, None, None, None, head, field_deg, False, plans)
     name = raw.name if isinstance(raw, Path) else frame.name
     return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame.raw), True)

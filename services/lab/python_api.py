@@ -13,8 +13,8 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from device.config.head_file import load_head
-from device.config.image_files import as_psf, read_psf
+from device.config.head_file import InstrumentSpec, load_head
+from device.config.image_files import Raw, as_psf, read_psf
 from device.errors import FrameError, SettingError
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.installed_methods import available_methods
@@ -27,32 +27,32 @@ from device.sim.plan import Decision, decide, format_plan
 from device.sim.render import crop_or_pad
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.user_files import files_in
-from device.values import Image, Mask, SimulatedCounts
+from device.values import Image, Mask, Psf, SimulatedCounts
 from services import resources
 from services.lab.frontier import Case, measure_frontier, recorded_case, scene_case, selected_methods
 from services.lab.frontier_result import Frontier
+from services.lab.named_files import head_file, scene_file
 from services.lab.psf_stack import psf_stack
 from services.lab.reconstruct_file import FileReconstruction, FileReconstructor, parse_bayer
-from services.lab.reconstruct_inputs import ReconstructOptions, Source
+from services.lab.reconstruct_inputs import RawSource, ReconstructOptions, Source
 
-ImageSource = str | Path | NDArray[Any]
+ImageSource = str | Path | NDArray[Any] | Raw | Psf
 
 
 class ReconstructionOptions(TypedDict, total=False):
     """Keywords of `reconstruct` and `Reconstructor`; an option that is left out is chosen from PSF and frame.
 
-    `dark`: dark frame of the same exposure. `flat`: frame of even light. `head`: head file, for the geometry of the
-    light path and the sensor. `field_deg`: diameter of the illuminated disc in degrees, with `head`. `method`: name of
-    `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels per sample. `rounds`: largest number of rounds of an iterative
-    method. `settings`: parameters of the method, such as {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the
-    raw is a mosaic of this pattern, "rggb", "bggr", "grbg" or "gbrg". `refraction`: False leaves out the eye's
-    refraction, which is estimated with `head`.
+    `dark`: dark frame of the same exposure. `flat`: frame of even light. `head`: geometry of the light path and sensor,
+    as a head file, the name of a shipped head or scene, or the result of `simulate`. `field_deg`: diameter of the
+    illuminated disc in degrees, with `head`. `method`: name of `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels
+    per sample. `rounds`: largest number of rounds of an iterative method. `settings`: parameters of the method, such as
+    {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the raw is a mosaic of this pattern, "rggb", "bggr",
+    "grbg" or "gbrg". `refraction`: False leaves out the eye's refraction, which is estimated with `head`.
     """
 
     dark: ImageSource
     flat: ImageSource
-    head: str | Path
+    head: "str | Path | SimulatedScene"
     field_deg: float
     method: str
     bin: int
@@ -68,11 +68,12 @@ def reconstruct(
 ) -> FileReconstruction:
     """Return the picture of one raw frame, with its report.
 
-    `raw`: counts, (rows, cols) or (rows, cols, 3), an array or a file (tiff, png, npy, npz, dng). `psf`: image of one
-    bright point, (rows, cols) as `raw`; several are a stack, of which the most likely one is used. `options`:
-    `ReconstructionOptions`. `picture` of the result is float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`;
-    `report` is typed; `simulated` is True if `raw` came from `simulate`. FrameError, PsfError or SettingError with a
-    remedy for input that cannot be used. Source: paper, section "Algorithm"; NUMERICS.md.
+    `raw`: counts, (rows, cols) or (rows, cols, 3), an array, a file (tiff, png, npy, npz, dng), or the raw of a `Pair`.
+    `psf`: image of one bright point, (rows, cols) as `raw`, or the PSFs of a `Pair`; several, or a folder of files, are
+    a stack, of which the most likely one is used. `options`: `ReconstructionOptions`; TypeError for another keyword.
+    `picture` of the result is float32 in linear DN, (rows, cols) or (rows, cols, 3) of `raw`; `report` is typed;
+    `simulated` is True if `raw` came from `simulate`. FrameError, PsfError or SettingError with a remedy for input that
+    cannot be used. Source: paper, section "Algorithm"; NUMERICS.md.
     """
     return Reconstructor(psf, **options)(raw)
 
@@ -89,7 +90,7 @@ class Reconstructor:
 
     def __call__(self, raw: ImageSource) -> FileReconstruction:
         """Return the picture of one raw frame (rows, cols) or (rows, cols, 3), as `reconstruct` does."""
-        return self._reconstruct(_source(raw))
+        return self._reconstruct(_raw(raw))
 
 
 class ForwardModel:
@@ -203,7 +204,7 @@ def simulate(
     seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. SettingError for an
     unknown scene or effect, SpecError for an invalid scene file.
     """
-    spec = load_head(_scene_file(scene))
+    spec = load_head(scene_file(scene))
     world, counts = scene_files.expose(
         spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without))
     )
@@ -219,8 +220,8 @@ def simulate(
 
 def frontier(
     raw: ImageSource | None = None, psf: ImageSource | None = None, truth: ImageSource | None = None, *,
-    scene: str | Path | SimulatedScene | None = None, head: str | Path | None = None, field_deg: float | None = None,
-    method: str | Sequence[str] = (), budget_s: float = 0.26, repeats: int = 7,
+    scene: str | Path | SimulatedScene | None = None, head: str | Path | SimulatedScene | None = None,
+    field_deg: float | None = None, method: str | Sequence[str] = (), budget_s: float = 0.26, repeats: int = 7,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Frontier:  # fmt: skip
     """Return accuracy against time of every method, bin and number of rounds, on this machine.
@@ -243,8 +244,8 @@ def frontier(
         assert raw is not None
         assert psf is not None
         assert truth is not None
-        place = None if head is None else Path(head)
-        case = recorded_case(_source(raw), _source(psf), _source(truth), place, field_deg, resources.fft_plans())
+        files = _raw(raw), _source(psf), _source(truth)
+        case = recorded_case(*files, _head(head), field_deg, resources.fft_plans())
     chosen = selected_methods((method,) if isinstance(method, str) else method)
     return measure_frontier(case, resources.fft_plans(), budget_s, repeats, progress, chosen)
 
@@ -258,39 +259,49 @@ def methods() -> dict[str, Method]:
 
 
 def _options(psf: ImageSource | Sequence[ImageSource], given: ReconstructionOptions) -> ReconstructOptions:
-    head, dark, flat = given.get("head"), given.get("dark"), given.get("flat")
+    _refuse_unknown(given)
+    dark, flat = given.get("dark"), given.get("flat")
     psfs = psf if isinstance(psf, list | tuple) else (psf,)
     return ReconstructOptions(
         raw=Path(), psfs=psf_stack([_source(one) for one in psfs]), output=None, method=given.get("method"),
         budget_s=given.get("budget_s"), dark=None if dark is None else _source(dark),
-        flat=None if flat is None else _source(flat), head=None if head is None else Path(head),
+        flat=None if flat is None else _source(flat), head=_head(given.get("head")),
         field_deg=given.get("field_deg"), even=False, plans=resources.fft_plans(), bin=given.get("bin"),
         rounds=given.get("rounds"), settings=dict(given.get("settings", {})), bayer=parse_bayer(given.get("bayer")),
         refraction=given.get("refraction", True),
     )  # fmt: skip
 
 
+def _raw(image: ImageSource) -> RawSource:
+    return image if isinstance(image, Raw) else _source(image)
+
+
 def _source(image: ImageSource) -> Source:
+    """Return an image as an input of a reconstruction; a PSF without pedestal stays as it is when cleaned again."""
+    if isinstance(image, Psf | Raw):
+        return image.pixels
     return Path(image) if isinstance(image, str) else image
 
 
-def _scene_file(scene: str | Path) -> Path:
-    """Return the path of a scene file; SettingError for a name that no shipped scene has."""
-    if isinstance(scene, Path) or scene.endswith(".toml"):
-        return Path(scene)
-    place = resources.SCENES / f"{scene}.toml"
-    if not place.is_file():
-        names = [path.stem for path in files_in(resources.SCENES, "*.toml")]
-        near = difflib.get_close_matches(scene, names, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        remedy = f"Give the path of a scene file, or one of: {', '.join(names)}."
-        raise SettingError(f"there is no scene '{scene}'{hint}", remedy)
-    return place
+def _refuse_unknown(given: ReconstructionOptions) -> None:
+    """Raise TypeError for a keyword that is no option, with the nearest one, as Python does for an unknown argument."""
+    known = ReconstructionOptions.__annotations__
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"choose from {', '.join(known)}"
+            raise TypeError(f"'{name}' is no option of a reconstruction: {hint}")
+
+
+def _head(head: "str | Path | SimulatedScene | None") -> Path | InstrumentSpec | None:
+    if isinstance(head, SimulatedScene):
+        return head.world.spec
+    return None if head is None else head_file(head)
 
 
 def _scene_case(scene: str | Path | SimulatedScene) -> Case:
     if not isinstance(scene, SimulatedScene):
-        return scene_case(load_head(_scene_file(scene)))
+        return scene_case(load_head(scene_file(scene)))
     counts, calibration = np.asarray(scene.raw), simulated_calibration(scene.world)
     return Case(scene.name, counts, scene.truth, scene.vessels, calibration, False)
 

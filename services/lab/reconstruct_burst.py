@@ -25,6 +25,7 @@ from device.values import FrameUse, Report
 from services.lab.burst_frames import refuse_psfs, refuse_repeated, refuse_without_first
 from services.lab.reconstruct_file import (
     FileReconstruction,
+    doubts,
     file_report,
     plan_reconstructor,
     refuse_invalid,
@@ -100,7 +101,10 @@ def solve_burst(loaded: Sequence[LoadedRaw], options: ReconstructOptions, planne
     report = replace(
         file_report(report, solver, options),
         seconds={"join": join_s} | report.seconds, frames=joined.frames,
-        warnings=(*report.warnings, *rejections(loaded, joined.frames), *(psfs.notes if psfs else ()), *notes),
+        warnings=(
+            *report.warnings, *doubts(report, solver, notes), *rejections(loaded, joined.frames),
+            *(psfs.notes if psfs else ()), *notes,
+        ),
     )  # fmt: skip
     return FileReconstruction(made.picture, report, made.simulated or calibration.simulated)
 

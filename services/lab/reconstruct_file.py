@@ -7,7 +7,7 @@ import errno
 import json
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -36,6 +36,7 @@ from services.lab import sweep_plot
 from services.lab.reconstruct_inputs import (
     LoadedPsfs,
     LoadedRaw,
+    RawSource,
     ReconstructOptions,
     Shape,
     Source,
@@ -51,6 +52,7 @@ from services.lab.reconstruct_inputs import (
 ENDINGS = (".npy", ".tif", ".tiff", ".png")
 LEAST_SAMPLES = 16  # of the shorter side
 MOST_ROUNDS = 100_000
+MOST_RESIDUAL = 3.0  # times the noise; 1 in frames that the model explains
 KEPT_PLANS = 4  # a recording changes between few sets of levels; each takes up to about 300 MB at full sensor size
 
 
@@ -124,7 +126,7 @@ class FileReconstructor:
         self._plans: OrderedDict[tuple[object, ...], _Plan] = OrderedDict()
         self._last: _Plan | None = None
 
-    def __call__(self, source: Source, dark: Source | None = None) -> FileReconstruction:
+    def __call__(self, source: RawSource, dark: Source | None = None) -> FileReconstruction:
         """Return the picture of a raw, a file or an array; FrameError or PsfError for one that cannot be solved.
 
         `dark`: the dark frame of this raw alone, (rows, cols) of it.
@@ -229,7 +231,8 @@ class _Plan:
         main = made[0 if len(made) == 1 else _brightest(pixels)].report
         picture = made[0].picture if len(made) == 1 else np.stack([one.picture for one in made], axis=2)
         report = replace(
-            file_report(main, solvers[0], options), seconds=summed_seconds(made), warnings=_united(made),
+            file_report(main, solvers[0], options), seconds=summed_seconds(made),
+            warnings=(*_united(made), *doubts(main, solvers[0], loaded.notes)),
             psf_channels=len(made), bayer=loaded.bayer,
         )  # fmt: skip
         return FileReconstruction(picture, report, loaded.simulated or self.calibrations[0].simulated)
@@ -260,6 +263,23 @@ def file_report(report: Report, solver: Reconstructor, options: ReconstructOptio
     return FileReport(**vars(report), solved=_solved_size(solver, report), given=given_options(options))
 
 
+def doubts(report: Report, solver: Reconstructor, notes: Collection[str]) -> tuple[str, ...]:
+    """Return what to doubt: a closed form without a known field, a residual that neither noise nor `notes` explain."""
+    found = []
+    if solver.stages[_place_of(solver, report)].is_closed_form and not np.isfinite(field_radius_px(solver.calibration)):
+        found.append(
+            f"No field is known, and the closed form '{report.method}' takes the whole frame as lit. Where only a disc "
+            "is lit, give the head (--head), or use the method 'open'."
+        )
+    residual = report.residual or 0.0
+    if residual > MOST_RESIDUAL and not notes and not set(MISMATCHES.values()) & set(report.warnings):
+        found.append(
+            f"The residual is {residual:.1f} times the noise, and about 1 where the PSF explains the frame: parts "
+            "of the picture may be false."
+        )
+    return tuple(found)
+
+
 def _share_s(deadline: Deadline, channels_left: int) -> float:
     """Return the seconds for the next channel: an equal share of what is left, and at least a microsecond."""
     return max(deadline.left_s() / channels_left, 1e-6)
@@ -288,8 +308,13 @@ def _united(made: Iterable[Reconstruction]) -> tuple[str, ...]:
 
 def _solved_size(solver: Reconstructor, report: Report) -> Shape:
     """Return (rows, cols) in samples of the frame in the stage that made the picture."""
-    found = [stage for stage in solver.stages if (stage.recipe.method, stage.recipe.bin) == (report.method, report.bin)]
-    return found[-1].grid.window
+    return solver.stages[_place_of(solver, report)].grid.window
+
+
+def _place_of(solver: Reconstructor, report: Report) -> int:
+    """Return the index of the stage that made the picture."""
+    recipes = [(stage.recipe.method, stage.recipe.bin) for stage in solver.stages]
+    return max(k for k, recipe in enumerate(recipes) if recipe == (report.method, report.bin))
 
 
 def given_options(options: ReconstructOptions) -> dict[str, float | str | dict[str, float]]:
@@ -378,8 +403,8 @@ def _refuse_outputs(options: ReconstructOptions) -> None:
     refuse_overwriting((options.output, options.report, options.sweep), inputs)
 
 
-def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[Source | None]) -> None:
-    """Raise SettingError for an output that cannot be written or is an input; None and arrays are skipped."""
+def refuse_overwriting(outputs: Iterable[Path | None], inputs: Iterable[object]) -> None:
+    """Raise SettingError for an output that cannot be written or is an input; what is no path is skipped."""
     read = {path.resolve() for path in inputs if isinstance(path, Path)}
     for path in outputs:
         if path is None:

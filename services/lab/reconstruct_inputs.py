@@ -35,6 +35,7 @@ from device.recon.model.preprocessing import MOST_BAD
 from device.values import Calibration, Colour, Geometry, Image, Psf, Sensor, SimulatedCounts
 
 Source = Path | NDArray[Any]  # a file, or an array in one of the layouts of device/config/image_files.py
+RawSource = Source | Raw  # or counts that are read
 Shape = tuple[int, int]
 MOST_EQUAL = 0.9  # share of a raw's pixels that may have its maximum: with more, the others are too few to show noise
 SWAPPED = 1.1  # ratio of `concentration`, raw over PSF: recordings have 0.56 to 0.85, swapped 1.18 to 1.80
@@ -44,12 +45,12 @@ SWAPPED = 1.1  # ratio of `concentration`, raw over PSF: recordings have 0.56 to
 class ReconstructOptions:
     """Options of `diffuscope reconstruct`; `plans` is the folder of cached FFT plans (None: not cached).
 
-    Images are paths or arrays. `output` None writes nothing. `even`: flat-field correction of the picture.
-    `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and `settings` (of the method, see
-    device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`: the raw is a mosaic.
-    `field_fixed`: the field is known exactly, and the refraction does not estimate its edge. `refraction` False leaves
-    the refraction out. `light`: colour of the
-    raw, for which the PSFs of an archived calibration are chosen (None: all are used).
+    Images are paths or arrays, `head` a file or what it holds. `output` None writes nothing. `even`: flat-field
+    correction of the picture. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
+    `settings` (of the method, see device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`:
+    the raw is a mosaic. `field_fixed`: the field is known exactly, and the refraction does not estimate its edge.
+    `refraction` False leaves the refraction out. `light`: colour of the raw, for which the PSFs of an archived
+    calibration are chosen (None: all are used).
     """
 
     raw: Source
@@ -59,7 +60,7 @@ class ReconstructOptions:
     budget_s: float | None
     dark: Source | None
     flat: Source | None
-    head: Path | None
+    head: Path | InstrumentSpec | None
     field_deg: float | None
     even: bool
     plans: Path | None
@@ -111,24 +112,26 @@ class LoadedPsfs:
     notes: tuple[str, ...]
 
 
-def name_of(source: Source, name: str) -> str:
+def name_of(source: RawSource, name: str) -> str:
     """Return the path of a file, or `name` for an array."""
     return str(source) if isinstance(source, Path) else name
 
 
-def is_simulated(source: Source) -> bool:
+def is_simulated(source: RawSource) -> bool:
     """Return True for counts of the simulator: a file with its mark, or an array of its type."""
-    return is_marked_simulated(source) if isinstance(source, Path) else isinstance(source, SimulatedCounts)
+    if isinstance(source, Path):
+        return is_marked_simulated(source)
+    return isinstance(source.pixels if isinstance(source, Raw) else source, SimulatedCounts)
 
 
-def load_raw(source: Source, pattern: Bayer | None = None, checked: bool = True) -> LoadedRaw:
+def load_raw(source: RawSource, pattern: Bayer | None = None, checked: bool = True) -> LoadedRaw:
     """Return the raw frame of a file or array; FrameError for one that cannot be read or, if `checked`, be solved.
 
     `pattern` None: the pattern that a DNG states, else no mosaic.
     """
     name = name_of(source, "the raw")
     file = _read(source, name)
-    raw = as_raw(only_frame(file.frames, name), name)
+    raw = source if isinstance(source, Raw) else as_raw(only_frame(file.frames, name), name)
     if checked:
         refuse_without_signal(raw, name)
     pattern = pattern or (file.bayer if raw.pixels.ndim == 2 else None)
@@ -146,8 +149,10 @@ def load_raw(source: Source, pattern: Bayer | None = None, checked: bool = True)
     return LoadedRaw(raw, name, (rows, cols), pattern, file.black_dn, simulated, notes)
 
 
-def _read(source: Source, name: str) -> ImageFile:
-    return read_image_file(source) if isinstance(source, Path) else ImageFile(frames_of(np.asarray(source), name))
+def _read(source: RawSource, name: str) -> ImageFile:
+    if isinstance(source, Path):
+        return read_image_file(source)
+    return ImageFile(frames_of(np.asarray(source.pixels if isinstance(source, Raw) else source), name))
 
 
 def refuse_without_signal(raw: Raw, name: str) -> None:
@@ -296,7 +301,7 @@ def load_calibrations(
     if psfs is None:
         return (_archived(options.calibration or "", options, loaded),)
     raw = loaded.raw
-    spec = None if options.head is None else load_head(options.head)
+    spec = load_head(options.head) if isinstance(options.head, Path) else options.head
     geometry, field_deg = _geometry(options, spec, loaded.bayer is not None)
     black_dn = loaded.black_dn or 0.0
     sensor = Sensor(black_dn, white_dn=raw.white_dn) if spec is None else _sensor(spec.camera, raw)
@@ -334,7 +339,7 @@ def _geometry(
     geometry: Geometry | None = None
     if spec is not None:
         if spec.optics is None:
-            raise SpecError(f"{options.head} has no [optics], so it gives no geometry")
+            raise SpecError(f"{spec.name} has no [optics], so it gives no geometry")
         geometry = spec.optics.geometry(spec.camera.pitch_um * (2 if is_mosaic else 1))
         field_deg = field_deg if field_deg is not None else spec.optics.field_deg
     elif field_deg is not None:

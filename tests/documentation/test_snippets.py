@@ -7,7 +7,9 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.project_files import BIN, ROOT, files, text
@@ -35,7 +37,7 @@ peak_e = 15000
 
 def snippets(page: str) -> list[tuple[str, str]]:
     """Return the fenced blocks of a page as (language, code)."""
-    return [(found[1], found[2]) for found in re.finditer(r"^```(\w+)\n(.*?)^```$", text(page), re.M | re.S)]
+    return [(found[1], found[2]) for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text(page), re.M | re.S)]
 
 
 PAGES = [
@@ -94,3 +96,26 @@ def test_the_snippets_of_a_page_run(page: str, recording: Path, tmp_path: Path) 
         elif language == "python":
             with in_folder(tmp_path):
                 exec(compile(code, page, "exec"), names)
+
+
+def test_the_readme_s_two_examples_give_one_picture(tmp_path: Path) -> None:
+    """The command's picture has the correlation with the truth that each picture of the Python example has."""
+    (tmp_path / "out").mkdir()
+    shell, code = (
+        next(found for _, found in snippets("README.md") if word in found) for word in ("simulate", "import")
+    )
+    commands = [line for line in shell.splitlines() if line.startswith("diffuscope")]
+    run("\n".join(commands).replace("picture.png", "picture.npy"), tmp_path)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    with in_folder(tmp_path):
+        exec(compile(code, "README.md", "exec"), names)
+    truth = names["scene"].truth
+    lit = truth > 0
+    pictures = (
+        np.load(tmp_path / "out" / "picture.npy"),
+        names["made"].picture,
+        names["again"](names["scene"].raw).picture,
+    )
+    found = [np.corrcoef(one[lit], truth[lit])[0, 1] for one in pictures]
+    assert found[0] > 0.9
+    assert found == pytest.approx([found[0]] * 3, abs=1e-3)

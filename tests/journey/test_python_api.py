@@ -4,6 +4,7 @@ import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import diffuscope
 import numpy as np
@@ -12,6 +13,7 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services import resources
 from services.cli import main
 from services.imaging.picture_files import to_png
 from tests.scenes import speckle
@@ -106,6 +108,65 @@ def test_frontier_of_a_recording_and_of_a_scene(tmp_path: Path) -> None:
     assert lines
     recorded = diffuscope.frontier(scene.raw, scene.psf, scene.truth, repeats=1)
     assert recorded.frame == found.frame
+
+
+def test_an_unknown_keyword_is_a_type_error_with_the_nearest_name(scene: diffuscope.SimulatedScene) -> None:
+    misspelt: Any = {"mehtod": "gradient"}
+    for call in (diffuscope.reconstruct, lambda _, psf, **given: diffuscope.Reconstructor(psf, **given)):
+        with pytest.raises(TypeError, match="'mehtod' is no option of a reconstruction: did you mean 'method'"):
+            call(scene.raw, scene.psf, **misspelt)
+    with pytest.raises(diffuscope.SettingError, match="there is no split 'tset'"):
+        diffuscope.open_dataset(".", split=cast(Any, "tset"))
+
+
+def test_a_head_is_a_path_a_scene_or_a_name(scene: diffuscope.SimulatedScene, tmp_path: Path) -> None:
+    path = tmp_path / "head.toml"
+    path.write_text(small_head_toml("Small simulated head"))
+    options: Any = {"method": "gradient", "refraction": False}
+    pictures = [
+        diffuscope.reconstruct(scene.raw, scene.psf, head=head, **options).picture for head in (path, str(path), scene)
+    ]
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+    assert not np.array_equal(pictures[0], diffuscope.reconstruct(scene.raw, scene.psf, **options).picture)
+    named = diffuscope.reconstruct(scene.raw, scene.psf, head="sim", **options)
+    file = diffuscope.reconstruct(scene.raw, scene.psf, head=resources.HEADS / "sim.toml", **options)
+    np.testing.assert_array_equal(named.picture, file.picture)
+    with pytest.raises(diffuscope.SettingError, match="there is no head 'helthy'; did you mean 'healthy'"):
+        diffuscope.reconstruct(scene.raw, scene.psf, head="helthy")
+
+
+def test_a_closed_form_without_a_field_warns(scene: diffuscope.SimulatedScene) -> None:
+    for method in ("tikhonov", "gradient", "evidence"):
+        notes = diffuscope.reconstruct(scene.raw, scene.psf, method=method).report.warnings
+        assert f"the closed form '{method}' takes the whole frame as lit" in notes[0]
+    assert not diffuscope.reconstruct(scene.raw, scene.psf, method="open").report.warnings
+    with_field = diffuscope.reconstruct(scene.raw, scene.psf, head=scene, method="gradient", refraction=False)
+    assert not with_field.report.warnings
+    assert with_field.report.refraction_dpt is None
+
+
+def test_a_residual_that_noise_does_not_explain_is_said(scene: diffuscope.SimulatedScene) -> None:
+    """Light that the PSF does not explain, a bright square, is left over."""
+    spoilt = scene.raw.copy()
+    rows, cols = (size // 2 for size in spoilt.shape)
+    spoilt[rows : rows + 40, cols : cols + 40] += 200
+    made = diffuscope.reconstruct(spoilt, scene.psf, method="gradient")
+    assert made.report.residual is not None
+    assert made.report.residual > 3
+    assert any(f"The residual is {made.report.residual:.1f} times the noise" in one for one in made.report.warnings)
+
+
+def test_a_pair_of_a_data_set_is_reconstructed_and_stays_simulated(
+    scene: diffuscope.SimulatedScene, tmp_path: Path
+) -> None:
+    scene.write(tmp_path / "one")
+    (pair,) = diffuscope.open_dataset(tmp_path)
+    assert isinstance(pair, diffuscope.Pair)
+    made = diffuscope.reconstruct(pair.raw, pair.psfs, rounds=2)
+    assert made.simulated
+    files = diffuscope.reconstruct(tmp_path / "one" / "raw.tiff", tmp_path / "one" / "psf.tiff", rounds=2)
+    assert made.picture == pytest.approx(files.picture, rel=1e-3, abs=1e-3 * float(files.picture.max()))
 
 
 def wrong(scene: diffuscope.SimulatedScene) -> dict[str, Callable[[], object]]:
