@@ -71,8 +71,8 @@ class Mutant(NamedTuple):
 
 MARKS = (  # file, old text, new text, and test of the mark of simulated pictures
     (
-        "device/calibration/procedure/raw_recorder.py", "write_side_file(path, frame.simulated)",
-        "write_side_file(path, False)", "raw_frames_of_a_calibration",
+        "device/calibration/procedure/raw_recorder.py", "write_side_file(path, frame.simulated,",
+        "write_side_file(path, False,", "raw_frames_of_a_calibration",
     ),
     ("device/calibration/import_psf.py", "simulated=simulated)", "simulated=False)", "calibrations"),
     (
