@@ -93,6 +93,7 @@ def run(
     """Serve the page: one button, one true picture."""
     from services.delivery.uploader import HttpsUploader, load_settings
     from services.http.server import (  # imports the web stack, which only this command needs
+        base_url,
         bind_socket,
         inherited_socket,
         serve,
@@ -107,7 +108,7 @@ def run(
     address = inherited_socket(os.environ) or bind_socket(host, port)
     served, at = address.getsockname()[:2]
     serve(
-        spec, address, data or _default_data(), lambda: typer.echo(f"Open http://{served}:{at} in a browser"),
+        spec, address, data or _default_data(), lambda: typer.echo(f"Open {base_url(served, at)} in a browser"),
         Watchdog(os.environ.get("NOTIFY_SOCKET")), plan, measure_scene, tuple(name or ()), (updates, wishes), uploader,
     )  # fmt: skip
 

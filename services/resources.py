@@ -17,6 +17,7 @@ CHANGELOG = ROOT / "CHANGELOG.md"
 SCENES = Path(__file__).parents[1] / "device" / "sim" / "scenes"
 
 
-def fft_plans() -> Path:
-    """Return the folder of cached FFT plans of this user; it may not exist yet."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "diffuscope"
+def fft_plans() -> Path | None:
+    """Return the folder of cached FFT plans of this user; it may not exist yet. None for a user without a home."""
+    place = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(place) / "diffuscope" if Path(place).is_absolute() else None

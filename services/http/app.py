@@ -31,7 +31,7 @@ from services.http.routes.updates import UPLOAD_PATH
 from services.http.routes.uploads import upload_router
 from services.http.routes.visits import visits_router
 from services.http.schemas.problems import ProblemResponse
-from services.http.security import BodyLimit, CrossOriginProtection, SecurityHeaders, own_host_names
+from services.http.security import BodyLimit, CrossOriginProtection, HeadRequests, SecurityHeaders, own_host_names
 from services.http.static_files import add_page_routes
 from services.instrument.checkpointing import Checkpoints
 from services.instrument.events import EventBus
@@ -119,6 +119,7 @@ def _http_application(lifespan: Lifespan, host_names: tuple[str, ...]) -> FastAP
         responses={"4XX": {"model": ProblemResponse}, "5XX": {"model": ProblemResponse}},
     )  # fmt: skip
     register_error_handlers(app)
+    app.add_middleware(HeadRequests)
     app.add_middleware(CrossOriginProtection, names=host_names, answer=problem_response)
     app.add_middleware(BodyLimit, exempt=frozenset({UPLOAD_PATH}), answer=problem_response)
     app.add_middleware(SecurityHeaders)

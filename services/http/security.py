@@ -5,6 +5,7 @@ it with an <img>: it needs a same-origin `Sec-Fetch-Site` (browsers set it over 
 that header, any `X-Controller`, which a foreign page cannot send without a CORS preflight.
 """
 
+import asyncio
 import ipaddress
 import socket
 from collections.abc import Callable
@@ -96,9 +97,10 @@ def _authority(origin: str) -> str:
 
 
 class BodyLimit:
-    """ASGI middleware: refuse bodies over `MAX_BODY_BYTES`, and chunked ones, with the answer for an InputError.
+    """ASGI middleware: refuse bodies over `MAX_BODY_BYTES` with the answer for an InputError.
 
-    `exempt` are the paths whose body is a file; their endpoints have their own limit.
+    A chunked body, which declares no length, is read up to the limit before the application gets it. `exempt` are the
+    paths whose body is a file; their endpoints have their own limit.
     """
 
     def __init__(self, app: ASGIApp, exempt: frozenset[str], answer: ErrorResponse) -> None:
@@ -107,15 +109,83 @@ class BodyLimit:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass one ASGI request to the application, or answer 422 for a body that is too large."""
-        limited = scope["type"] == "http" and scope["path"] not in self.exempt
-        app = self._too_large if limited and _is_too_large(Headers(scope=scope)) else self.app
-        await app(scope, receive, send)
+        if scope["type"] != "http" or scope["path"] in self.exempt:
+            await self.app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        body: bytes | None = b""
+        if is_chunked := headers.get("transfer-encoding", "").lower() == "chunked" and "content-length" not in headers:
+            body = await _read_body(receive)
+        if body is None or (not is_chunked and _is_too_large(headers)):
+            await self._too_large(scope, receive, send)
+        else:
+            await self.app(scope, _replayed(body, receive) if is_chunked else receive, send)
 
 
 def _is_too_large(headers: Headers) -> bool:
-    """Return True if the body is chunked, or its declared length exceeds `MAX_BODY_BYTES` or is no number."""
+    """Return True for another coding than chunked, and for a declared length over the limit or that is no number."""
     length = headers.get("content-length") or "0"
     return "transfer-encoding" in headers or not length.isdecimal() or int(length) > MAX_BODY_BYTES
+
+
+async def _read_body(receive: Receive) -> bytes | None:
+    """Return a body without a declared length; None if it is longer than `MAX_BODY_BYTES`, or if the client left."""
+    body = b""
+    while len(body) <= MAX_BODY_BYTES:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None
+        body += message.get("body", b"")
+        if not message.get("more_body", False):
+            return body if len(body) <= MAX_BODY_BYTES else None
+    return None
+
+
+def _replayed(body: bytes, receive: Receive) -> Receive:
+    """Return a `receive` that returns a body that was read, and then what follows it."""
+    pending: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def replay() -> Message:
+        return pending.pop() if pending else await receive()
+
+    return replay
+
+
+class HeadRequests:
+    """ASGI middleware: answer HEAD as GET, with the same headers and no body.
+
+    A stream ends with its headers. A path that lights is not called: its answer is that of no picture, 204.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass one ASGI request to the application, HEAD as a GET whose client leaves after the headers."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self.app(scope, receive, send)
+            return
+        if scope["path"] in LIGHT_EMITTING_PATHS:
+            await Response(status_code=204)(scope, receive, send)
+            return
+        answered, is_asked = asyncio.Event(), False
+
+        async def receive_nothing() -> Message:
+            nonlocal is_asked
+            if not is_asked:
+                is_asked = True
+                return {"type": "http.request", "body": b"", "more_body": False}
+            await answered.wait()
+            return {"type": "http.disconnect"}
+
+        async def send_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+                answered.set()
+
+        asgi = {**scope.get("asgi", {}), "spec_version": "2.3"}  # a stream then watches whether its client has left
+        await self.app({**scope, "method": "GET", "asgi": asgi}, receive_nothing, send_headers)
 
 
 class SecurityHeaders:

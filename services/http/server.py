@@ -75,9 +75,14 @@ def bind_socket(host: str, port: int) -> socket.socket:
             undo.pop_all()
     except OSError as error:
         raise InputError(
-            f"http://{host}:{port} cannot be served: {error.strerror or error}", _remedy(error, port)
+            f"{base_url(host, port)} cannot be served: {error.strerror or error}", _remedy(error, port)
         ) from error
     return listener
+
+
+def base_url(host: str, port: int) -> str:
+    """Return the URL of a page at a host name or an address; an IPv6 address stands in brackets (RFC 3986)."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def inherited_socket(environment: Mapping[str, str]) -> socket.socket | None:

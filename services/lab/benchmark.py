@@ -45,7 +45,7 @@ class BenchmarkRequest:
     methods: tuple[str, ...]
     repeats: int
     json: Path | None
-    plans: Path
+    plans: Path | None
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class FrontierRequest:
     plot: Path
     budget_s: float
     repeats: int
-    plans: Path
+    plans: Path | None
     methods: tuple[str, ...] = ()
 
 
@@ -123,7 +123,7 @@ def frontier(request: FrontierRequest, progress: ProgressCallback, peer: Lensles
 
 
 def measure_frontier(
-    case: Case, plans: Path, budget_s: float, repeats: int, progress: ProgressCallback,
+    case: Case, plans: Path | None, budget_s: float, repeats: int, progress: ProgressCallback,
     methods: Mapping[str, Method] = METHODS, peer: LenslessPeer | None = None,
 ) -> Frontier:  # fmt: skip
     """Measure every point of one case with each of `methods`, and the instrument's choice within `budget_s`.
@@ -482,7 +482,7 @@ def recorded_case(
     truth: Source,
     head: Path | InstrumentSpec | None,
     field_deg: float | None,
-    plans: Path,
+    plans: Path | None,
 ) -> Case:
     """Return a recorded frame with its truth, files or arrays; FrameError for a truth of another shape.
 

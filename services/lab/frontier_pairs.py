@@ -48,7 +48,7 @@ class DatasetFrontierRequest:
     plot: Path
     budget_s: float
     repeats: int
-    plans: Path
+    plans: Path | None
     methods: tuple[str, ...] = ()
 
 

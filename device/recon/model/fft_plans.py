@@ -75,8 +75,8 @@ class Planner:
             raise SettingError(f"{threads} threads cannot plan anything")
         self.threads, self.effort, self.folder = threads, effort, folder
         self.planned = 0
-        if folder is not None and (file := self._file(folder)).is_file():
-            self._import_wisdom(file)
+        if folder is not None:
+            self._import_wisdom(self._file(folder))
 
     @staticmethod
     def _file(folder: Path) -> Path:
@@ -87,8 +87,10 @@ class Planner:
     def _import_wisdom(file: Path) -> None:
         try:
             wisdom = [text.encode("ascii") for text in json.loads(file.read_text(encoding="ascii"))]
-        except (ValueError, AttributeError) as error:  # a damaged cache file costs seconds of planning only
-            log.warning("%s is damaged (%s): planning the FFTs again", file, error)
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, AttributeError) as error:  # a damaged cache file costs seconds of planning only
+            log.warning("%s cannot be used (%s): planning the FFTs again", file, error)
             return
         pyfftw.import_wisdom(tuple(wisdom))
 

@@ -1,16 +1,14 @@
 """Compiled kernels of the iterative solvers and the likelihood fits; each fuses dozens of numpy passes into one."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.model.compiled import compiled
 from device.recon.model.kernels import Series, Spectrum
 from device.values import Image
 
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
 
-
-@_jit
+@compiled
 def shrink(
     x: Image, ux: Image, uy: Image, uw: Image, mask: Image, threshold: float, px: Image, py: Image, out: Image
 ) -> None:
@@ -50,7 +48,7 @@ def shrink(
         out[0, j] += py[rows - 1, j]
 
 
-@_jit
+@compiled
 def solve_data_step(blurred: Image, a: Image, weighted: Image, inverse: Image, stiffness: float, out: Image) -> None:
     """Evaluate ADMM's data step: v = (W y + r (Hx + a)) / (W + r); update the multiplier a in place; out = v - a.
     `blurred` is Hx, `weighted` is W y, `inverse` is 1/(W + r), `stiffness` is r.
@@ -65,7 +63,7 @@ def solve_data_step(blurred: Image, a: Image, weighted: Image, inverse: Image, s
             out[i, j] = v + v - q
 
 
-@_jit
+@compiled
 def data_weights(
     blurred: Image, y: Image, good: Image, per_dn: float, floor: float, stiffness: float,
     at: tuple[int, int], weighted: Image, inverse: Image,
@@ -83,7 +81,7 @@ def data_weights(
             inverse[at[0] + i, at[1] + j] = np.float32(1) / (w + r)
 
 
-@_jit
+@compiled
 def solve_x_step(
     data: Spectrum, image: Spectrum, otf: Spectrum, row_g: Image, col_g: Image,
     stiffness: float, rho: float, scale: float, x: Spectrum, blurred: Spectrum,
@@ -106,7 +104,7 @@ def solve_x_step(
             blurred[i, j] = complex(real * h.real - imag * h.imag, real * h.imag + imag * h.real)
 
 
-@_jit
+@compiled
 def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> None:
     """Apply a Wiener filter in place: multiply a spectrum by scale conj(H) / (|H|^2 + reg)."""
     rows, cols = spectrum.shape
@@ -120,7 +118,7 @@ def wiener_with(spectrum: Spectrum, otf: Spectrum, reg: Image, scale: float) -> 
             )
 
 
-@_jit
+@compiled
 def ring_levels(
     seen: Series, power: Series, ring: NDArray[np.int64], noise_dn2: float, turns: int, levels: Series
 ) -> None:
@@ -138,7 +136,7 @@ def ring_levels(
             levels[b] = max(above[b] / max(below[b], 1e-300), 1e-6 * noise_dn2)
 
 
-@_jit
+@compiled
 def most_likely_power_law(
     seen: Series, power: Series, logs: Series, noise_dn2: float, a: float, k: float, steps: int
 ) -> tuple[float, float]:
@@ -165,7 +163,7 @@ def most_likely_power_law(
     return a, k
 
 
-@_jit
+@compiled
 def rms_residual(blurred: Image, y: Image, good: Image, per_dn: float, floor: float, at: tuple[int, int]) -> float:
     """Return the rms of y - Hx in units of its noise, weighted by `good`: 1 for noise alone, 0 if all are missing.
     `blurred` is Hx on the grid, whose window begins at `at`; the noise variance is per_dn max(Hx, 0) + floor.
@@ -185,7 +183,7 @@ def rms_residual(blurred: Image, y: Image, good: Image, per_dn: float, floor: fl
     return np.sqrt(total / weight) if weight > 0 else np.float64(0)
 
 
-@_jit
+@compiled
 def _read(table: Spectrum, row: float, col: float) -> complex:
     """Return the value of a table at (row, col) by bilinear interpolation; rows are -last to last, columns 0 to last.
 
@@ -206,7 +204,7 @@ def _read(table: Spectrum, row: float, col: float) -> complex:
     return complex(value.real, -value.imag) if left else value
 
 
-@_jit
+@compiled
 def stretched(
     table: Spectrum, matrix: Series, rows: Series, cols: Series, row_share: Image, col_share: Image, out: Spectrum
 ) -> None:
@@ -220,7 +218,7 @@ def stretched(
             out[i, j] = value * (share * col_share[j])
 
 
-@_jit
+@compiled
 def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, share: Image, out: Spectrum) -> None:
     """Write the table's values at matrix (col, row), for single frequencies `rows`, `cols`, to `out`, times `share`."""
     for i in range(rows.size):
@@ -228,7 +226,7 @@ def stretched_at(table: Spectrum, matrix: Series, rows: Series, cols: Series, sh
         out[i] = _read(table, down, matrix[0, 0] * cols[i] + matrix[0, 1] * rows[i]) * share[i]
 
 
-@_jit
+@compiled
 def negative_log_likelihood(
     seen: Spectrum, otf: Spectrum, where: NDArray[np.int64], ring: NDArray[np.int64], s2: float, smear: float,
     turns: int, levels: Series, energy: Image, power: Image,
@@ -265,7 +263,7 @@ def negative_log_likelihood(
     return total
 
 
-@_jit
+@compiled
 def filtered(spectrum: Spectrum, weight: Image, out: Spectrum) -> None:
     """Evaluate out = weight * spectrum, for real weights of the frequencies."""
     rows, cols = spectrum.shape
@@ -274,7 +272,7 @@ def filtered(spectrum: Spectrum, weight: Image, out: Spectrum) -> None:
             out[i, j] = weight[i, j] * spectrum[i, j]
 
 
-@_jit
+@compiled
 def multiply_conjugate(spectrum: Spectrum, otf: Spectrum) -> None:
     """Multiply a spectrum by the conjugate of an OTF, in place."""
     rows, cols = spectrum.shape
@@ -284,7 +282,7 @@ def multiply_conjugate(spectrum: Spectrum, otf: Spectrum) -> None:
             spectrum[i, j] = complex(a.real * h.real + a.imag * h.imag, a.imag * h.real - a.real * h.imag)
 
 
-@_jit
+@compiled
 def squared_length(spectrum: Spectrum, weight: Image, twice: Series) -> float:
     """Return the sum of weight * |spectrum|^2 over all frequencies; `twice` counts those that an rfft leaves out."""
     rows, cols = spectrum.shape
@@ -296,7 +294,7 @@ def squared_length(spectrum: Spectrum, weight: Image, twice: Series) -> float:
     return total
 
 
-@_jit
+@compiled
 def add_normal_part(spectrum: Spectrum, root: Image, direction: Spectrum, twice: Series, moved: Spectrum) -> float:
     """Evaluate moved = root * spectrum + direction, the normal operator of conjugate gradients on their direction.
 
@@ -313,7 +311,7 @@ def add_normal_part(spectrum: Spectrum, root: Image, direction: Spectrum, twice:
     return total
 
 
-@_jit
+@compiled
 def step_along(
     factor: float, direction: Spectrum, moved: Spectrum, weight: Image, twice: Series, x: Spectrum, rest: Spectrum
 ) -> float:
@@ -332,7 +330,7 @@ def step_along(
     return total
 
 
-@_jit
+@compiled
 def next_direction(ratio: float, rest: Spectrum, weight: Image, direction: Spectrum) -> None:
     """Evaluate direction = weight * rest + ratio * direction, in place."""
     rows, cols = rest.shape

@@ -4,10 +4,10 @@ At 1080 x 1920 a planned FFT pair takes about 15 ms on one core of a laptop; eac
 ms of memory traffic. Fusing them keeps counts-to-picture below 1.5 FFT pairs (`make bench`).
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from device.recon.model.compiled import compiled
 from device.values import Image, Mask
 
 Single = np.float32
@@ -19,10 +19,8 @@ Spectrum = NDArray[np.complex64]
 Pixels = NDArray[np.uint16] | NDArray[np.float32]
 Places = NDArray[np.int64]
 
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
 
-
-@_jit
+@compiled
 def linearise(
     counts: Pixels,
     dark: Pixels,
@@ -63,7 +61,7 @@ def linearise(
     return int(saturated), int(good_pixels), float(light)
 
 
-@_jit
+@compiled
 def _add_row(
     counts: Pixels, dark: Image, gain: Image, bend: Single, white_dn: Single, total: Image, used: Image
 ) -> Single:
@@ -80,7 +78,7 @@ def _add_row(
     return saturated
 
 
-@_jit
+@compiled
 def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tuple[Single, Single]:
     zero, one = np.float32(0), np.float32(1)
     good_pixels = light = zero
@@ -101,7 +99,7 @@ def _bin_row(total: Image, used: Image, n: int, out: Image, good: Image) -> tupl
     return good_pixels, light
 
 
-@_jit
+@compiled
 def exclude_pixels(
     counts: Pixels, dark: Image, bend_per_dn: float, gain: Image, white_dn: float, first: tuple[int, int], n: int,
     places: Places, out: Image, good: Image,
@@ -133,7 +131,7 @@ def exclude_pixels(
     return lost, light
 
 
-@_jit
+@compiled
 def flat_fit_sums(y: Image, flat: Image, good: Image) -> Sums:
     """Return the sums for the fit y = a flat + b: <y,f>, <y,1>, <f,f>, <f,1>, <1,1>, each weighted by `good`."""
     yf = y1 = ff = f1 = n = np.float64(0)
@@ -156,7 +154,7 @@ def flat_fit_sums(y: Image, flat: Image, good: Image) -> Sums:
     return yf, y1, ff, f1, n
 
 
-@_jit
+@compiled
 def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[int, int], out: Image) -> None:
     """Write (y - a flat - b) * good, the residual of the flat model, into `out` from sample `at` on."""
     a32, b32 = np.float32(a), np.float32(b)
@@ -169,7 +167,7 @@ def residual(y: Image, flat: Image, good: Image, a: float, b: float, at: tuple[i
 MIN_GRADIENT_POWER = 1e-6  # added to |D|^2 as a divisor; smaller than |D|^2 of one cycle across any frame
 
 
-@_jit
+@compiled
 def wiener(
     spectrum: Spectrum, otf: Spectrum, gradient: Axes, slope: float, floor: float, psf_term: float, scale: float
 ) -> None:
@@ -191,7 +189,7 @@ def wiener(
             )
 
 
-@_jit
+@compiled
 def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
     """Write (x + a) mask into `out` inside `box` (top, bottom, left, right): add the flat model again.
 
@@ -204,7 +202,7 @@ def add_flat(x: Image, mask: Image, a: float, box: Box, out: Image) -> None:
             out[i, j] = (x[i, j] + a32) * mask[i, j]
 
 
-@_jit
+@compiled
 def cross_validation(
     power: Series, prior: Series, delta: Series, energies: Series, candidates: Series, scores: Series
 ) -> None:
@@ -223,7 +221,7 @@ def cross_validation(
         scores[k] = power.size * misfit / (freedom * freedom)
 
 
-@_jit
+@compiled
 def interpolate_cubic(
     image: Image, first: NDArray[np.int64], weights: Image, offset: tuple[int, int], box: Box, out: Image
 ) -> None:
@@ -258,7 +256,7 @@ def interpolate_cubic(
                 )
 
 
-@_jit
+@compiled
 def subtract_scaled(light: Image, smooth: Image, scale: float, good: Image, out: Image) -> None:
     """Write (light - scale smooth) good into `out`."""
     scale32 = np.float32(scale)
@@ -268,7 +266,7 @@ def subtract_scaled(light: Image, smooth: Image, scale: float, good: Image, out:
             out[i, j] = (light[i, j] - scale32 * smooth[i, j]) * good[i, j]
 
 
-@_jit
+@compiled
 def add_moved(
     image: Image, good: Image, whole: tuple[int, int], taps: Axes, weight: float, gain: float, total: Image,
     weights: Image,
@@ -302,14 +300,14 @@ def add_moved(
             weights[i, low + j] += weight32 * share[j]
 
 
-@_jit
+@compiled
 def _add_line(source: Image, good: Image, weight: Single, total: Image, kept: Image) -> None:
     for j in range(total.size):
         total[j] += weight * source[j]
         kept[j] = min(kept[j], good[j])
 
 
-@_jit
+@compiled
 def finish_mean(total: Image, weights: Image, least: float, base: Image, scale: float) -> None:
     """Replace `total` by total / weights + scale base, and by NaN where `weights` is less than `least`."""
     scale32, least32, missing = np.float32(scale), np.float32(least), np.float32(np.nan)
@@ -321,7 +319,7 @@ def finish_mean(total: Image, weights: Image, least: float, base: Image, scale: 
             total[i, j] = mean if weight >= least32 else missing
 
 
-@_jit
+@compiled
 def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Image) -> None:
     """Write the mean light of the four neighbours of each pixel to `mean`, and its own light minus that mean to `off`.
 
@@ -338,7 +336,7 @@ def neighbours(counts: Pixels, dark: Image, places: Places, mean: Image, off: Im
         off[k] = light[0] - mean[k]
 
 
-@_jit
+@compiled
 def mark_suspects(
     counts: Pixels, dark: Image, slope_dn: float, floor_dn2: float, white_dn: float, least_dn: float, out: Mask
 ) -> int:
@@ -369,13 +367,13 @@ def mark_suspects(
     return total
 
 
-@_jit
+@compiled
 def _light(counts: Pixels, dark: Image, out: Image) -> None:
     for j in range(out.size):
         out[j] = np.float32(counts[j]) - dark[j]
 
 
-@_jit
+@compiled
 def _mark_row(
     counts: Pixels, above: Image, here: Image, below: Image, slope: Single, floor: Single, white: Single, least: Single,
     out: Mask,
@@ -391,7 +389,7 @@ def _mark_row(
         out[j] = (np.float32(counts[j]) >= white) | (here[j] < least)
 
 
-@_jit
+@compiled
 def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, out: Image) -> int:
     """Copy the light of the good pixels at Chebyshev distance `reach` from (i, j) to `out`; return their number."""
     rows, cols = counts.shape
@@ -404,7 +402,7 @@ def _ring(counts: Pixels, dark: Image, bad: Mask, i: int, j: int, reach: int, ou
     return n
 
 
-@_jit
+@compiled
 def outliers(
     counts: Pixels, dark: Image, known: Mask, places: Places, slope_dn: float, floor_dn2: float,
     ranges: tuple[float, float], is_outlier: Mask,
@@ -435,7 +433,7 @@ def outliers(
     return found
 
 
-@_jit
+@compiled
 def ring_excess(
     image: Image, zero_row: Image, no_mask: Mask, least: float, slope_dn: float, floor_dn2: float
 ) -> Series:  # fmt: skip
