@@ -31,7 +31,7 @@ from device.drivers.probe import ProbeFinding, probe_parts
 from device.drivers.ring import Apa102Ring, LedRing, Tlc5971Ring
 from device.drivers.v4l2_camera import V4l2Camera
 from device.errors import HeadMismatch, PowerLow, SettingError, SpecError, TooHot
-from device.light_safety.dose_ledger import Ledger
+from device.light_safety.dose_ledger import Ledger, MemoryLedger
 from device.light_safety.guard import GuardedLight
 from device.light_safety.hazard import NO_LIGHT, Hazard, light_limits, radiometry
 from device.optics.matrix import chain_of, lamps_of
@@ -178,7 +178,7 @@ def open_light(spec: InstrumentSpec, clock: Clock, ledger: Ledger) -> Iterator[G
     """
     refuse_without_lamp(spec)
     with HeadOpener(spec, clock) as opening:
-        light = GuardedLight(opening.lamp(), clock, spec.light.max_on_s, hazard_of(spec), ledger)
+        light = opening.light(ledger)
         try:
             yield light
         finally:
@@ -232,8 +232,15 @@ class HeadOpener:
         refuse_expired(kept.provenance, self.clock.wall())
         return kept
 
-    def lamp(self, chain: ChainSpec | None = None) -> Light:
-        """Return the lamp without light guard; a real one with `chain`, if given, instead of the head file's LEDs."""
+    def light(self, ledger: Ledger, chain: ChainSpec | None = None) -> GuardedLight:
+        """Return the guarded lamp, with limits by the head's radiometry and its dose in `ledger`; there is no other.
+
+        A real lamp lights the LEDs of `chain`, if given, instead of the head file's: some of the ring, no others.
+        """
+        return GuardedLight(self._lamp(chain), self.clock, self.spec.light.max_on_s, hazard_of(self.spec), ledger)
+
+    def _lamp(self, chain: ChainSpec | None) -> Light:
+        """Return the lamp that the guard gets."""
         if self.spec.light.backend == "sim":
             return SimLight(self.world)
         if self.spec.light.backend == "none":
@@ -400,9 +407,7 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
     """Open camera and chips of a head for a calibration, without loading a stored one; SpecError for a recording."""
     refuse_recording(spec)
     with HeadOpener(spec, clock, allocator) as opening:
-        lamp = opening.lamp()
-        lamp.off()
-        camera, chips = opening.camera(lamp), opening.chips()
+        camera, chips = opening.camera(opening.light(MemoryLedger(clock))), opening.chips()
         return Bench(
             camera, chips, opening.world if spec.camera.backend == "sim" else None, opening.resources.pop_all()
         )
@@ -411,10 +416,10 @@ def open_bench(spec: InstrumentSpec, clock: Clock, allocator: Any = None) -> Ben
 def probe(spec: InstrumentSpec, clock: Clock, allocator: Any = None, *, leds: bool = True) -> Iterator[ProbeFinding]:
     """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
 
-    Without `leds` the lamp stays dark. A HardwareError of a part becomes a finding and is not raised. The lamp is dark
-    at the end.
+    The light is guarded, and its dose is not stored: it reaches no eye. Without `leds` the lamp stays dark. A
+    HardwareError of a part becomes a finding and is not raised. The lamp is dark at the end.
     """
-    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator), leds=leds)
+    yield from probe_parts(spec, lambda: HeadOpener(spec, clock, allocator), clock, MemoryLedger(clock), leds=leds)
 
 
 @contextmanager
@@ -444,7 +449,7 @@ def _opened(opening: HeadOpener, ledger: Ledger) -> Head:
         facing, lens_placer = opening.world.present_eye, trial_lens_placer(opening.world)
         card_placer = white_card_placer(opening.world)
         facing("OD", None)  # traces the light now, not while a lamp is on
-    light = GuardedLight(opening.lamp(), opening.clock, spec.light.max_on_s, hazard_of(spec), ledger)
+    light = opening.light(ledger)
     camera = opening.camera(light)
     known = opening.archived_calibration.provenance if opening.archived_calibration is not None else None
     chips, button = opening.chips(), opening.button()

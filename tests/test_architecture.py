@@ -82,10 +82,35 @@ def test_device_imports_no_http_database_or_dicom() -> None:
     check_rule(web_imports, python_files("device"), {}, "these belong into services")
 
 
-# Size, units, errors, time
-
-
 Function = ast.FunctionDef | ast.AsyncFunctionDef
+RAW_LAMPS = {"LedRing", "Apa102Ring", "Tlc5971Ring", "SimLight", "MirroredLight", "ReplayLight", "SpiBus", "self._lamp"}
+
+
+def raw_lamps(source: str) -> Iterator[Violation]:
+    """Find calls of lamps without guard and of their bus, by the function that contains each."""
+    for function in nodes(source):
+        if isinstance(function, Function):
+            for node in ast.walk(function):
+                if isinstance(node, ast.Call) and (name := ast.unparse(node.func)) in RAW_LAMPS:
+                    yield node.lineno, f"{function.name}, {name}", "open the lamp with device/head.py: it is guarded"
+
+
+def test_every_lamp_is_opened_within_its_guard() -> None:
+    """No other code gets hold of a lamp; tests/ports/test_every_light_is_guarded.py runs the commands and endpoints."""
+    allowed = {
+        "device/head.py: light, self._lamp": "the argument of GuardedLight: the only way to a lamp",
+        "device/head.py: _lamp, SimLight": "the simulated lamp that the guard gets",
+        "device/head.py: _lamp, MirroredLight": "the ring with a simulated camera that the guard gets",
+        "device/head.py: _ring, Apa102Ring": "the ring that the guard gets",
+        "device/head.py: _ring, Tlc5971Ring": "the ring that the guard gets",
+        "device/head.py: _replayed, ReplayLight": "a recording emits no light; it is guarded in the next lines",
+        "device/drivers/ring.py: __init__, SpiBus": "the bus of a ring, in the ring's own constructor",
+        "device/sim/scene_files.py: lit_frames, SimLight": "renders a scene of its own: no head, no LED",
+    }
+    check_rule(raw_lamps, python_files("device", "services"), allowed, "no light without the guard")
+
+
+# Size, units, errors, time
 
 
 def size_reason(source: str, line: int) -> str | None:
@@ -631,6 +656,8 @@ BROKEN: list[tuple[Finder, str]] = [
     (folder_lists, "for path in folder.iterdir(): ..."),
     (folder_lists, "sorted(folder.glob('*.tiff'))"),
     (folder_lists, "import os\nos.walk('.')"),
+    (raw_lamps, "def f(self):\n    return self._lamp(None)"),
+    (raw_lamps, "def f(world):\n    with SimLight(world).on(glow): ..."),
     (leftovers, "# TO" "DO: later"),
     (leftovers, "see /wo" "rk/main"),
     (workplace_words, "from shared" "/knowledge"),

@@ -7,11 +7,15 @@ from typing import Protocol
 
 import numpy as np
 
+from device.clock import Clock
 from device.config.head_file import ChainSpec, InstrumentSpec
+from device.drivers.no_light import NoLight
 from device.errors import HardwareError
+from device.light_safety.dose_ledger import Ledger
+from device.light_safety.guard import GuardedLight
 from device.optics.matrix import chain_of, ring
-from device.ports import Camera, Chips, Light, LightContext
-from device.values import BatteryState, ExposureSettings, Frame, Illumination
+from device.ports import Camera, Chips, Light
+from device.values import BatteryState, Colour, ExposureSettings, Frame
 
 MOSAIC_WARNING = "counts of three colours; a third of green light, and reconstruct needs --bayer"
 DETECTION_SIGMAS = 6.0  # detection threshold of an LED above the dark frame's mean, in standard errors of that mean
@@ -30,8 +34,8 @@ class ProbeFinding:
 class PartOpener(Protocol):
     """Opener of the parts of one head; each method raises a HardwareError if its part cannot be opened."""
 
-    def lamp(self, chain: ChainSpec | None = None) -> Light:
-        """Return the lamp without light guard, with the LEDs of `chain` instead of the head file's if given."""
+    def light(self, ledger: Ledger, chain: ChainSpec | None = None) -> GuardedLight:
+        """Return the guarded lamp, with the LEDs of `chain` instead of the head file's if given."""
 
     def camera(self, light: Light) -> Camera:
         """Return the camera, which marks its frames with the state of `light`."""
@@ -43,23 +47,27 @@ class PartOpener(Protocol):
 OpenParts = Callable[[], AbstractContextManager[PartOpener]]
 
 
-def probe_parts(spec: InstrumentSpec, open_parts: OpenParts, *, leds: bool = True) -> Iterator[ProbeFinding]:
+def probe_parts(
+    spec: InstrumentSpec, open_parts: OpenParts, clock: Clock, ledger: Ledger, *, leds: bool = True
+) -> Iterator[ProbeFinding]:
     """Check every part that the head file names, one after the other; light each LED of the ring and detect it.
 
-    `open_parts` returns a context that closes the parts which were opened in it. A HardwareError of a part becomes a
-    finding and is not raised. The lamp is dark at the end, and without `leds` all the time. A colour mosaic is a
-    finding that does not fail where the head file expects it; the driver refuses one that it does not expect.
+    `open_parts` returns a context that closes the parts which were opened in it. The light is as bright as the guard
+    permits, its dose counts in `ledger`, and as long a darkness follows it: each LED has a guard of its own. A
+    HardwareError of a part becomes a finding and is not raised. The lamp is dark at the end, and without `leds` all the
+    time. A colour mosaic is a finding that does not fail where the head file expects it; the driver refuses one that it
+    does not expect.
     """
     with open_parts() as opening:
         light = camera = None
         try:
-            light = opening.lamp()
+            light = opening.light(ledger)
             if spec.light.backend != "none":
                 yield ProbeFinding("lamp", True, f"{spec.light.backend} answers")
         except HardwareError as error:
             yield _failure("lamp", error)
         try:
-            camera = opening.camera(light or _NoLamp())
+            camera = opening.camera(light or NoLight())
             reading = ", ".join([f"{camera.shape[1]} x {camera.shape[0]}", *camera.facts.values()])
             yield ProbeFinding("camera", True, reading)
         except HardwareError as error:
@@ -69,45 +77,58 @@ def probe_parts(spec: InstrumentSpec, open_parts: OpenParts, *, leds: bool = Tru
         if camera is not None and "mosaic" in camera.facts:
             yield ProbeFinding("mosaic", True, f"colour filters {camera.facts['mosaic']}: {MOSAIC_WARNING}")
         if leds and camera is not None and light is not None and spec.light.backend != "none":
-            yield from _leds(spec, open_parts, camera, light)
+            yield from _leds(spec, open_parts, _LitCamera(camera, clock, spec.camera.preview_exposure_s), light, ledger)
         yield from _chips(opening)
 
 
-def _leds(spec: InstrumentSpec, open_parts: OpenParts, camera: Camera, light: Light) -> Iterator[ProbeFinding]:
+@dataclass(frozen=True)
+class _LitCamera:
+    """Camera that measures a lamp: mean counts of a lit frame above those of a dark one."""
+
+    camera: Camera
+    clock: Clock
+    exposure_s: float
+
+    def finding(self, light: GuardedLight, colour: Colour) -> ProbeFinding:
+        """Return the finding on a lamp: passed if the lit frame's mean is significantly above that of the dark frame.
+
+        A lamp that is not seen is measured once more: on a busy computer its lease can end before the frame does.
+        """
+        first = self._measured(light, colour)
+        return first if first.ok else self._measured(light, colour)
+
+    def _measured(self, light: GuardedLight, colour: Colour) -> ProbeFinding:
+        glow, shot = light.hazard.brightest(colour), ExposureSettings(self.exposure_s)
+        dark = self.camera.expose(shot).counts.astype(np.float64)
+        begin_s = self.clock.now_s()
+        with light.on(glow):
+            lit = float(self.camera.expose(shot).counts.mean(dtype=np.float64))
+        self.clock.sleep(self.clock.now_s() - begin_s)  # as much darkness: no light is left to repay
+        error = float(dark.std() / np.sqrt(dark.size))
+        more = lit - float(dark.mean())
+        if more > max(DETECTION_SIGMAS * error, 0.05):
+            return ProbeFinding("ring", True, f"{more:.1f} counts above the dark, in {glow.colour}")
+        return ProbeFinding("ring", False, "lit, and not seen", "It may be dead, or covered. Call the technician.")
+
+
+def _leds(
+    spec: InstrumentSpec, open_parts: OpenParts, camera: _LitCamera, light: GuardedLight, ledger: Ledger
+) -> Iterator[ProbeFinding]:
     """Yield one finding per LED of the ring; a lamp without separate LEDs is checked as a whole."""
-    colour, shot = Illumination(spec.light.preview_colour), ExposureSettings(spec.camera.preview_exposure_s)
-    chain = chain_of(spec)
+    chain, colour = chain_of(spec), spec.light.preview_colour
     if chain is None:
-        yield _check_part("ring", lambda: _lamp_finding(camera, light, colour, shot))
+        yield _check_part("ring", lambda: camera.finding(light, colour))
         return
-    for led in ring(chain):
-        alone = chain.model_copy(update={"leds": (led,), "trims": None})
+    leds = ring(chain)
+    for place, led in enumerate(leds):
+        trims = None if chain.trims is None else (chain.trims[place],)
+        alone = chain.model_copy(update={"leds": (led,), "trims": trims})
 
         def check_led(alone: ChainSpec = alone) -> ProbeFinding:
             with open_parts() as another:
-                return _lamp_finding(camera, another.lamp(alone), colour, shot)
+                return camera.finding(another.light(ledger, alone), colour)
 
         yield _check_part(f"LED {led}", check_led)
-
-
-def _lamp_finding(camera: Camera, light: Light, glow: Illumination, shot: ExposureSettings) -> ProbeFinding:
-    """Return the finding on the lamp: passed if the mean of a lit frame is significantly above that of a dark frame.
-
-    A lamp that is not seen is measured once more: on a busy computer its lease can end before the frame does.
-    """
-    first = _measured_lamp(camera, light, glow, shot)
-    return first if first.ok else _measured_lamp(camera, light, glow, shot)
-
-
-def _measured_lamp(camera: Camera, light: Light, glow: Illumination, shot: ExposureSettings) -> ProbeFinding:
-    dark = camera.expose(shot).counts.astype(np.float64)
-    with light.on(glow):
-        lit = float(camera.expose(shot).counts.mean(dtype=np.float64))
-    error = float(dark.std() / np.sqrt(dark.size))
-    more = lit - float(dark.mean())
-    if more > max(DETECTION_SIGMAS * error, 0.05):
-        return ProbeFinding("ring", True, f"{more:.1f} counts above the dark, in {glow.colour}")
-    return ProbeFinding("ring", False, "lit, and not seen", "It may be dead, or covered. Call the technician.")
 
 
 def _black_level(spec: InstrumentSpec, camera: Camera) -> ProbeFinding:
@@ -150,19 +171,3 @@ def _check_part(part: str, ask: Callable[[], ProbeFinding]) -> ProbeFinding:
 def _failure(part: str, error: HardwareError) -> ProbeFinding:
     """Return the failed finding of a part, with message and remedy of the error."""
     return ProbeFinding(part, False, error.message, error.remedy)
-
-
-class _NoLamp:
-    """Null object for a lamp that cannot be opened: the camera marks its frames as dark."""
-
-    @property
-    def illumination(self) -> Illumination | None:
-        """None: always dark."""
-        return None
-
-    def on(self, illumination: Illumination) -> LightContext:
-        """Raise NotImplementedError: there is no lamp."""
-        raise NotImplementedError(illumination)
-
-    def off(self) -> None:
-        """Do nothing."""

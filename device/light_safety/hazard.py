@@ -27,6 +27,7 @@ from device.values import Colour, Illumination
 
 LIMITS = Path(__file__).with_name("limits.toml")
 MOST_UNCHECKED_SHARE = 0.5  # of a limit that was not compared with the purchased standard
+LEVELS = 1000  # steps of the level: a colour that is too bright at the lowest one has no permitted level
 LED_POWER_UNCERTAINTY = 2.0  # uncertainty factor of the LEDs' power (device/optics/illumination.py)
 
 
@@ -282,7 +283,13 @@ class Hazard:
 
     def highest_level(self, colour: Colour) -> float:
         """Return the highest level of a colour within the three irradiance limits, at most 1, in steps of 0.001."""
-        return min(1.0, floor(1000 / self._times(Illumination(colour))) / 1000)
+        return min(1.0, floor(LEVELS / self._times(Illumination(colour))) / LEVELS)
+
+    def brightest(self, colour: Colour) -> Illumination:
+        """Return the brightest permitted light of a colour; LightLimit if no level of this head is permitted."""
+        if (level := self.highest_level(colour)) <= 0:
+            self.refuse(Illumination(colour, 1 / LEVELS))
+        return Illumination(colour, level)
 
     def _times(self, glow: Illumination) -> float:
         """Return the largest irradiance over its limit."""

@@ -38,9 +38,7 @@ def simulate_exposure(spec: InstrumentSpec) -> SimulatedExposure:
     """Return a lit frame in the picture's colour with ground truth; SpecError for a spec without [optics] or [sim]."""
     world = World(spec, VirtualClock())
     colour = spec.light.colour
-    world.electrons_per_s(colour)  # now, not while the lamp is lit
-    with SimLight(world).on(Illumination(colour)):
-        counts = SimCamera(world).expose(ExposureSettings(spec.camera.exposure_s)).counts
+    (counts,) = lit_frames(world)
     mask = world.retina.vessels
     vessels = None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5
     return SimulatedExposure(counts, world.truth(colour), vessels, simulated_calibration(world))
@@ -62,9 +60,19 @@ def expose(spec: InstrumentSpec, choose: EffectSelector = decide) -> tuple[World
     SpecError for a spec without [optics] or [sim].
     """
     world = World(spec, VirtualClock(), choose=choose)
-    shot = ExposureSettings(spec.camera.exposure_s)
+    (counts,) = lit_frames(world)
+    return world, counts
+
+
+def lit_frames(world: World, count: int = 1) -> tuple[Counts, ...]:
+    """Return frames of a scene in one light of the picture's colour, (rows, cols) each: no head and no ring is opened.
+
+    The light is traced before it is lit.
+    """
+    spec, camera = world.spec, SimCamera(world)
+    world.electrons_per_s(spec.light.colour)
     with SimLight(world).on(Illumination(spec.light.colour)):
-        return world, SimCamera(world).expose(shot).counts
+        return tuple(camera.expose(ExposureSettings(spec.camera.exposure_s)).counts for _ in range(count))
 
 
 def write(world: World, counts: Counts, folder: Path) -> None:

@@ -495,7 +495,7 @@ class _Exposing:
             self._head.camera.prepare(whole)  # in the dark: a sensor may take some frames to change its exposure
         for colour in colours:
             try:
-                (taken[colour],) = self.lit(Illumination(colour, self._head.light.hazard.highest_level(colour)), whole)
+                (taken[colour],) = self.lit(self._head.light.hazard.brightest(colour), whole)
             except DiffuscopeError as error:
                 log.warning("no %s light: %s", colour, error, extra={"code": error.code})
                 missing[colour] = error.message

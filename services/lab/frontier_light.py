@@ -21,11 +21,10 @@ from device.recon.model.fft_plans import Planner
 from device.recon.model.field_of_view import field_radius_px
 from device.recon.model.grid import disc
 from device.recon.reconstructor import Reconstructor
-from device.sim.camera import SimCamera
-from device.sim.light import SimLight
 from device.sim.render import crop_or_pad
+from device.sim.scene_files import lit_frames
 from device.sim.world import World
-from device.values import Calibration, Counts, ExposureSettings, Illumination, Image, Reconstruction
+from device.values import Calibration, Counts, Illumination, Image, Reconstruction
 from services.lab.frontier_result import LightPoint
 
 NUMBERS = (1, 2, 4, 8)  # of frames
@@ -51,9 +50,7 @@ def light_case(spec: InstrumentSpec) -> LightCase:
     world, exposure_s = World(spec, VirtualClock()), spec.camera.exposure_s
     lamp = Illumination(spec.light.colour)
     world.present_eye("OD")
-    with SimLight(world).on(lamp):
-        camera = SimCamera(world)
-        frames = tuple(camera.expose(ExposureSettings(exposure_s)).counts for _ in range(max(NUMBERS)))
+    frames = lit_frames(world, max(NUMBERS))
     mean_dn = float(frames[0].mean(dtype=np.float64)) - spec.camera.black_dn
     return LightCase(frames, mean_dn, hazard_of(spec).dose_j_per_cm2(lamp, exposure_s))
 

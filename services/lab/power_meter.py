@@ -66,7 +66,7 @@ def run_of(spec: InstrumentSpec, level: float | None, seconds: float) -> MeterRu
     refuse_without_lamp(spec)
     spec = with_calibrated_light(spec)
     design, hazard, colour = design_of(spec), hazard_of(spec), spec.light.colour
-    glow = Illumination(colour, hazard.highest_level(colour) if level is None else level)
+    glow = hazard.brightest(colour) if level is None else Illumination(colour, level)
     hazard.refuse(glow)
     limits, beam = hazard.limits, hazard.beams[colour]
     spectrum = beam.wavelength_um, beam.fwhm_um or LED_FWHM_UM

@@ -76,7 +76,7 @@ def _colours(spec: InstrumentSpec) -> tuple[Colour, ...]:
 
 def _frames(head: Head, clock: Clock, colour: Colour) -> CardFrames:
     """Return a dark frame and FRAMES lit ones at an exposure that fills the brightest pixels."""
-    glow = Illumination(colour, head.light.hazard.highest_level(colour))
+    glow = head.light.hazard.brightest(colour)
     exposure_s = longest_s = head.spec.camera.exposure_s
     sensor = head.calibration.sensor
     for _ in range(SEARCHES):

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec, load_head
-from device.sim.camera import SimCamera
-from device.sim.light import SimLight
 from device.sim.optical_setup import Scene
 from device.sim.render import crop_or_pad
-from device.sim.scene_files import SimulatedExposure
+from device.sim.scene_files import SimulatedExposure, lit_frames
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
-from device.values import ExposureSettings, Illumination, Image, Mask
+from device.values import Image, Mask
 from services import resources
 from services.lab.paper.bench import HeadChanges, SimulatedFrame, with_changes, with_merged_pixels
 
@@ -127,9 +125,7 @@ def _exposed(spec: InstrumentSpec, shade: Shade | None) -> tuple[SimulatedExposu
         setup.object = setup.object * left
         on_sensor = crop_or_pad(left, world.shape)
         truth, seen = truth * on_sensor, on_sensor > 0.99
-    world.electrons_per_s(colour)
-    with SimLight(world).on(Illumination(colour)):
-        counts = SimCamera(world).expose(ExposureSettings(spec.camera.exposure_s)).counts
+    (counts,) = lit_frames(world)
     return SimulatedExposure(counts, truth, None, simulated_calibration(world)), seen
 
 
