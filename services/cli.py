@@ -92,12 +92,7 @@ def run(
 ) -> None:
     """Serve the page: one button, one true picture."""
     from services.delivery.uploader import HttpsUploader, load_settings
-    from services.http.server import (  # imports the web stack, which only this command needs
-        base_url,
-        bind_socket,
-        inherited_socket,
-        serve,
-    )
+    from services.http.server import base_url, bind_socket, inherited_socket, serve  # web stack: this command only
     from services.instrument.watchdog import Watchdog
     from services.lab.frontier import measure_scene
     from services.records.protocol import DEFAULT_PROTOCOL, load_protocol
