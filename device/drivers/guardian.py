@@ -1,5 +1,7 @@
 """Guardian: a child process that turns the ring off when a lease of light expires or this process ends."""
 
+import logging
+import os
 import select
 import subprocess
 import sys
@@ -9,6 +11,8 @@ from typing import Literal
 
 from device.drivers.blank import LEDS
 from device.errors import LightFault
+
+log = logging.getLogger(__name__)
 
 ANSWER_S = 0.5  # a guardian that answers later would also darken the ring too late
 DARKEN_S = 2.0
@@ -29,6 +33,13 @@ class Guardian:
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
         self.end_lease()
+        if not self.is_real_time:
+            log.info("the lamp's guardian has no real-time priority: on a busy computer the lamp may be dark later")
+
+    @property
+    def is_real_time(self) -> bool:
+        """Return whether the child runs before every ordinary process, which needs a permission (RLIMIT_RTPRIO)."""
+        return os.sched_getscheduler(self.pid) == os.SCHED_FIFO
 
     @property
     def pid(self) -> int:

@@ -13,11 +13,13 @@ from device.config.head_file import InstrumentSpec, load_head
 from device.light_safety.dose_ledger import MemoryLedger
 from services.lab.power_meter import pulse, run_of
 from tests.ports.conftest import HEAD
+from tests.ports.emulators.kills import DARK_S, Sleeper
 from tests.ports.emulators.wires import SINKS, emulated_buses
 
 ROOT = HEAD.parents[2]
 POWER = ROOT / "hardware" / "heads" / "imx296_power.toml"
-MAX_ON_S, DARK_S, LATE_S = 1.0, 0.1, 0.05  # LATE_S: the bus notes a message later than it was sent
+MAX_ON_S = 1.0
+LATE_S = 0.05  # the bus notes a message later than it was sent; on a busy machine by its delay more
 
 
 @pytest.fixture(autouse=True)
@@ -43,16 +45,19 @@ def spec(tmp_path) -> InstrumentSpec:
 def test_the_ring_shines_at_the_permitted_level_and_half_of_the_time(spec):
     before = len(emulated_buses().sinks.messages)
     run = run_of(spec, None, 3.2)
-    pulse(run, MemoryLedger(SystemClock()), SystemClock(), lambda _: None)
+    with Sleeper() as sleeper:
+        begun_s = time.monotonic()
+        pulse(run, MemoryLedger(SystemClock()), SystemClock(), lambda _: None)
+        late_s = LATE_S + sleeper.dark_limit_s(begun_s, time.monotonic()) - DARK_S
     changes = emulated_buses().sinks.messages[before:]
     lit = [(one["at_s"], after["at_s"], one["lit"]) for one, after in pairwise(changes) if one["lit"]]
     assert len(lit) == run.count == 2
     for begin_s, end_s, leds in lit:
-        assert end_s - begin_s >= run.on_s - LATE_S  # the end is the guard's: tests/unit/test_guard.py
+        assert end_s - begin_s >= run.on_s - late_s  # the end is the guard's: tests/unit/test_guard.py
         assert set(leds) == {"0", "1", "3", "4", "6", "7", "9", "10"}
         assert all(abs(level - run.glow.level) <= 1 / 0xFFFF for level in leds.values())  # a step of the grey scale
     pauses = [later[0] - sooner[1] for sooner, later in pairwise(lit)]
-    assert min(pauses) >= run.on_s - LATE_S
+    assert min(pauses) >= run.on_s - late_s
 
 
 def test_a_killed_command_leaves_no_light(spec, tmp_path):
@@ -67,9 +72,12 @@ def test_a_killed_command_leaves_no_light(spec, tmp_path):
         process.stdin.flush()
         process.stderr.readline()  # "pulse 1 of ...", printed while it is lit
         assert emulated_buses().sinks.lit
-        process.kill()
-        process.wait()
-        killed_s = time.monotonic()
-    while emulated_buses().sinks.lit and time.monotonic() - killed_s < 5:
-        time.sleep(0.005)
-    assert emulated_buses().sinks.messages[-1]["at_s"] - killed_s <= DARK_S
+        with Sleeper() as sleeper:
+            process.kill()
+            process.wait()
+            killed_s = time.monotonic()
+            while emulated_buses().sinks.lit and time.monotonic() - killed_s < 5:
+                time.sleep(0.005)
+            dark_s = emulated_buses().sinks.messages[-1]["at_s"]
+            limit_s = sleeper.dark_limit_s(killed_s, dark_s)
+    assert dark_s - killed_s <= limit_s
