@@ -146,7 +146,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     ] = None,
     budget_s: Annotated[float | None, typer.Option(help="Seconds from the loaded frame to the result.")] = None,
     bayer: Annotated[
-        str | None, typer.Option(metavar="RGGB", help="The raw is a mosaic: rggb, bggr, grbg or gbrg.")
+        str | None, typer.Option(metavar="RGGB", help="The raw is a mosaic: rggb, bggr, grbg or gbrg; or none.")
     ] = None,
     dark: Annotated[
         list[str] | None,

@@ -10,7 +10,7 @@ from device.config.image_files import (
     as_companion,
     as_psf,
     as_raw,
-    read_image,
+    read_counts,
     require_same_shape,
     saturated_share,
 )
@@ -66,10 +66,10 @@ def read_imported_psf(paths: tuple[Path, ...], info: ImportedPsfInfo) -> Importe
 
 def _read(path: Path, known: ImportedPsfInfo) -> tuple[Psf, float]:
     try:
-        array = read_image(path)
+        array = read_counts(path)
         psf = as_psf(array, path.name)
         raw = as_raw(array)
-        dark = None if known.dark is None else as_companion(read_image(known.dark), known.dark.name)
+        dark = None if known.dark is None else as_companion(read_counts(known.dark), known.dark.name)
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
     share = saturated_share(psf, raw, known.white_dn)

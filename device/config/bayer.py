@@ -15,9 +15,11 @@ from device.errors import FrameError
 from device.values import Image
 
 Bayer = Literal["rggb", "bggr", "grbg", "gbrg"]
+BayerOption = Literal["rggb", "bggr", "grbg", "gbrg", "none"]  # none: a monochrome frame, whatever its file says
 PATTERNS: tuple[Bayer, ...] = ("rggb", "bggr", "grbg", "gbrg")
 SITES = ((0, 0), (0, 1), (1, 0), (1, 1))  # row and column of the letters of a pattern
 TILES = 8  # per side, of the test for a mosaic
+MIN_SIZE = 4 * TILES  # rows and columns of the smallest frame that the test can judge
 LEAST_CONTRAST = 0.05  # of the four sites, over their mean; a monochrome frame has 0.01 and less
 
 
@@ -54,7 +56,7 @@ def looks_like_mosaic(frame: NDArray[Any]) -> bool:
 
     Two sites on a diagonal, the greens, must be nearly equal. False for a frame with less than 32 rows or columns.
     """
-    if frame.ndim != 2 or min(frame.shape) < 4 * TILES:
+    if frame.ndim != 2 or min(frame.shape) < MIN_SIZE:
         return False
     sites = np.stack(_sites(frame)).astype(np.float64)
     rows, cols = (size // TILES for size in sites.shape[1:])

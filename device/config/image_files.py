@@ -18,17 +18,19 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import UnidentifiedImageError
-from PIL.PngImagePlugin import PngImageFile
 
-from device.config.bayer import PATTERNS, Bayer
 from device.config.ceiling import CHANCE_PIXELS, ceiling_of
+from device.config.dng_levels import NOT_STATED, Levels
+from device.config.png_file import read_png
+from device.config.tiff_file import read_tiff
+from device.config.tiff_segments import MAX_COMPRESSION_RATIO, MAX_PIXELS
 from device.errors import FrameError, PsfError
 from device.values import Image, Mask, Psf
 
@@ -36,13 +38,9 @@ SUFFIXES = (".tif", ".tiff", ".png", ".npy")  # of the images of a recording's f
 MEASURE_PSF = "Give an image of one point of light in a dark room, neither saturated nor processed."
 READABLE = (*SUFFIXES, ".npz", ".dng")
 Pixels = NDArray[Any]
-MAX_PIXELS = 2**27  # a quarter of a gigabyte of counts: more is a mistake or an attack
-_DNG_RAW = (tifffile.PHOTOMETRIC.CFA, tifffile.PHOTOMETRIC.LINEAR_RAW)
-_RGB_16_BIT = b"\x10\x02"  # bytes 24 and 25 of a PNG: depth and colour type
-MAX_COMPRESSION_RATIO = 1100  # maximum compression ratio of a deflated black frame (zlib: 1032)
 _DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
     ValueError, EOFError, OSError, SyntaxError, LookupError, TypeError, ArithmeticError, MemoryError, AssertionError,
-    NotImplementedError,    UnidentifiedImageError, tifffile.TiffFileError,
+    RuntimeError, UnidentifiedImageError, tifffile.TiffFileError,
     Pillow.DecompressionBombError, struct.error, zlib.error, zipfile.BadZipFile, TokenError,
 )  # fmt: skip
 
@@ -51,25 +49,41 @@ _DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
 class ImageFile:
     """Content of an image file: its frames, each (rows, cols) or (rows, cols, 3), in the stored type.
 
-    `bayer` and `black_dn` are the colour filter pattern and the black level that a DNG states; None if not stated.
+    `levels` are those that a DNG states, `encoding` the chunk of a PNG with values that are not linear in the light.
     """
 
     frames: tuple[Pixels, ...]
-    bayer: Bayer | None = None
-    black_dn: float | None = None
+    levels: Levels = NOT_STATED
+    encoding: str | None = None
 
 
 def read_image(path: Path) -> Pixels:
     """Return the pixels of an image file, (rows, cols) or (rows, cols, 3), in the stored integer or float type.
 
-    An opaque alpha channel of a PNG is dropped. FrameError for a file that is missing, empty, truncated, too large, not
-    an image, or that holds several frames.
+    What the file says about its pixels is applied. FrameError for a property that is not applied, and for a file that
+    is missing, empty, truncated, too large, not an image, or that holds several frames.
     """
     return only_frame(read_image_file(path).frames, str(path))
 
 
+def read_counts(path: Path) -> Pixels:
+    """Return the pixels of a raw frame or PSF; FrameError as for `read_image`, and for encoded values."""
+    return only_frame(read_counts_file(path).frames, str(path))
+
+
+def read_counts_file(path: Path) -> ImageFile:
+    """Return all frames of a file of raw frames or PSFs; FrameError if it states values not linear in the light."""
+    file = read_image_file(path)
+    if file.encoding is not None:
+        raise FrameError(
+            f"{path} states that its values are not linear in the light ({file.encoding})",
+            "Give the linear counts of the sensor. If these are, save them as tiff or npy.",
+        )
+    return file
+
+
 def read_image_file(path: Path) -> ImageFile:
-    """Return all frames of an image file, and the colour filter pattern of a DNG; FrameError as for `read_image`.
+    """Return all frames of an image file, and the levels of a DNG; FrameError as for `read_image`.
 
     Of an npz with several arrays, `FILE.npz:NAME` selects one.
     """
@@ -82,9 +96,7 @@ def read_image_file(path: Path) -> ImageFile:
         ) from error
     if not data:
         raise FrameError(f"{path} is empty", "Copy the file again; the copy was interrupted.")
-    if path.suffix.lower() == ".dng":
-        return _read_dng(path, data)
-    return ImageFile(frames_of(_decode(path, data, name), str(path)))
+    return _decoded(path, data, name)
 
 
 def only_frame(frames: tuple[Pixels, ...], name: str) -> Pixels:
@@ -124,7 +136,7 @@ def frames_of(array: Pixels, name: str) -> tuple[Pixels, ...]:
             f"{name}: an image has rows and columns, and three channels or none; this has the shape {array.shape}",
             "Save it as (rows, cols) or (rows, cols, 3); a stack of PSFs as (n, rows, cols).",
         )
-    return tuple(shaped)
+    return tuple(np.ascontiguousarray(frame, frame.dtype.newbyteorder("=")) for frame in shaped)
 
 
 def _named_array(path: Path) -> tuple[Path, str | None]:
@@ -133,18 +145,25 @@ def _named_array(path: Path) -> tuple[Path, str | None]:
     return (Path(file + ".npz"), name) if mark else (path, None)
 
 
-def _decode(path: Path, data: bytes, name: str | None) -> Pixels:
-    """Return the pixels in the bytes of a file, decoded by its suffix; FrameError if damaged or of unknown suffix."""
+def _decoded(path: Path, data: bytes, name: str | None) -> ImageFile:
+    """Return the content of a file, decoded by its suffix; FrameError if damaged, or for what is not applied."""
+    suffix, levels, encoding = path.suffix.lower(), NOT_STATED, None
+    if suffix not in READABLE:
+        raise FrameError(
+            f"{path}: the ending '{path.suffix}' is not one of {', '.join(READABLE)}",
+            "Convert it without loss, for example to tiff or npy.",
+        )
     try:
-        match path.suffix.lower():
+        match suffix:
             case ".npy":
-                return np.asarray(np.load(BytesIO(data), allow_pickle=False))
+                pixels = _loaded(BytesIO(data), str(path))
             case ".npz":
-                return _decode_npz(path, data, name)
-            case ".tif" | ".tiff":
-                return _decode_tiff(data)
+                pixels = _decode_npz(path, data, name)
             case ".png":
-                return _decode_png(path, data)
+                pixels, encoding = read_png(data, str(path))
+            case _:
+                tiff = read_tiff(data, str(path), dng=suffix == ".dng")
+                pixels, levels = tiff.pixels, tiff.levels
     except FrameError:
         raise
     except _DECODER_ERRORS as error:
@@ -152,10 +171,18 @@ def _decode(path: Path, data: bytes, name: str | None) -> Pixels:
             f"{path} is not a whole {path.suffix[1:]} image: {_one_line(error)}",
             "Copy or export the file again; it is incomplete, or of another format than its ending.",
         ) from error
-    raise FrameError(
-        f"{path}: the ending '{path.suffix}' is not one of {', '.join(READABLE)}",
-        "Convert it without loss, for example to tiff or npy.",
-    )
+    return ImageFile(frames_of(pixels, str(path)), levels, encoding)
+
+
+def _loaded(stream: IO[bytes], name: str) -> Pixels:
+    """Return the array in the npy format of a stream; FrameError for Python objects, ValueError for another format."""
+    version = np.lib.format.read_magic(stream)
+    read_header = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+    _, _, dtype = read_header(stream)
+    if dtype.hasobject:
+        raise FrameError(f"{name} holds Python objects (type {dtype}), no counts", "Save an array of numbers.")
+    stream.seek(0)
+    return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
 
 
 def _one_line(error: BaseException) -> str:
@@ -170,111 +197,14 @@ def _decode_npz(path: Path, data: bytes, name: str | None) -> Pixels:
         claimed_bytes = sum(member.file_size for member in archive.infolist())
     if claimed_bytes > MAX_COMPRESSION_RATIO * len(data) or claimed_bytes > 24 * MAX_PIXELS:
         raise ValueError(f"{len(data)} bytes cannot hold the {claimed_bytes} that it promises")
-    with np.load(BytesIO(data), allow_pickle=False) as arrays:
-        names = list(arrays.files)
-        if name is None and len(names) == 1:
-            name = names[0]
-        if name not in names:
-            held, first = ", ".join(names) or "no array", names[0] if names else "NAME"
+    with zipfile.ZipFile(BytesIO(data)) as archive:
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        if name is None and len(members) == 1:
+            name = next(iter(members))
+        if name not in members:
+            held, first = ", ".join(members) or "no array", next(iter(members), "NAME")
             raise FrameError(f"{path} holds {held}", f"Name the array that is meant, as in {path.name}:{first}.")
-        return np.asarray(arrays[name])
-
-
-def _decode_tiff(data: bytes) -> Pixels:
-    """Return the pixels of a TIFF; ValueError for a header that claims more data than the file or MAX_PIXELS allow.
-
-    Decoding such a file would take minutes and all memory. Channels stored as planes are moved to the last axis.
-    """
-    with tifffile.TiffFile(BytesIO(data)) as tiff:
-        series = tiff.series[0]
-        claimed_bytes = series.nbytes
-        if claimed_bytes > MAX_COMPRESSION_RATIO * len(data) or series.size > 3 * MAX_PIXELS:
-            raise ValueError(f"{len(data)} bytes cannot hold the {claimed_bytes} that it promises")
-        pixels = np.asarray(tiff.asarray())
-        planes = series.axes.find("S")
-        return np.moveaxis(pixels, planes, -1) if 0 <= planes < pixels.ndim - 1 else pixels
-
-
-def _decode_png(path: Path, data: bytes) -> Pixels:
-    """Return the pixels of a PNG; FrameError for 16 bits with an alpha channel and for transparent pixels."""
-    _refuse_16_bit_alpha_png(path, data)
-    if data[24:26] == _RGB_16_BIT:
-        return _decode_16_bit_colour_png(data)
-    with Pillow.open(BytesIO(data)) as picture:
-        picture.load()
-        if picture.has_transparency_data and picture.convert("RGBA").getchannel("A").getextrema() != (255, 255):
-            raise FrameError(f"{path} has transparent pixels, which are no counts", "Save it without transparency.")
-        modes = {"P": "RGB", "LA": "L", "PA": "RGB", "RGBA": "RGB"}
-        return np.asarray(picture.convert(modes[picture.mode]) if picture.mode in modes else picture)
-
-
-def _read_dng(path: Path, data: bytes) -> ImageFile:
-    """Return the mosaic of an uncompressed DNG with its pattern and black level; FrameError for another DNG."""
-    try:
-        with tifffile.TiffFile(BytesIO(data)) as tiff:
-            pages = [inner for page in tiff.pages for inner in (page, *(page.pages or ()))]
-            raws = [page for page in pages if isinstance(page, tifffile.TiffPage) and page.photometric in _DNG_RAW]
-            if not raws:
-                raise FrameError(f"{path} holds no raw image", "Give the DNG as the camera wrote it, or a tiff or npy.")
-            page = max(raws, key=lambda page: page.size)
-            _refuse_packed_dng(path, page)
-            letters = "".join("rgb"[int(value)] for value in _dng_values(page, "CFAPattern") if value in (0, 1, 2))
-            black = _dng_values(page, "BlackLevel")
-            frames = frames_of(np.asarray(page.asarray()), str(path))
-            known = next((known for known in PATTERNS if known == letters), None)
-            return ImageFile(frames, known, sum(black) / len(black) if black else None)
-    except FrameError:
-        raise
-    except _DECODER_ERRORS as error:
-        raise FrameError(
-            f"{path} is not a whole dng image: {_one_line(error)}", "Copy the file again; its content is damaged."
-        ) from error
-
-
-def _refuse_packed_dng(path: Path, page: tifffile.TiffPage) -> None:
-    """Raise FrameError for a DNG that is compressed, or whose counts are not whole bytes: both need another decoder."""
-    plain = page.compression == tifffile.COMPRESSION.NONE
-    if not plain or page.bitspersample not in (8, 16):
-        kind = "packed" if plain else f"compressed (method {int(page.compression)})"
-        raise FrameError(
-            f"{path} is a {kind} DNG of {page.bitspersample} bits; only plain 8 and 16 bits are read",
-            "Convert it to an uncompressed 16-bit DNG, or save its mosaic as tiff or npy.",
-        )
-
-
-def _dng_values(page: tifffile.TiffPage, name: str) -> list[float]:
-    """Return the values of a tag, fractions divided; empty if the page has no such tag."""
-    tag = page.tags.get(name)
-    if tag is None:
-        return []
-    value = tag.value
-    values = [float(one) for one in (value if isinstance(value, tuple | bytes | list) else (value,))]
-    if tag.dtype in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
-        return [top / bottom for top, bottom in zip(values[::2], values[1::2], strict=True)]
-    return values
-
-
-def _decode_16_bit_colour_png(data: bytes) -> Pixels:
-    """Return the uint16 pixels of a 16-bit RGB PNG, (rows, cols, 3).
-
-    Pillow has no such image: its mode RGB takes the first byte of each value. The second byte is the result of a second
-    decoding with the byte order of the values exchanged.
-    """
-    halves = []
-    for order in ("RGB;16B", "RGB;16L"):
-        with Pillow.open(BytesIO(data)) as picture:
-            assert isinstance(picture, PngImageFile)
-            picture.tile = [tile._replace(args=order) for tile in picture.tile]
-            picture.load()
-            halves.append(np.asarray(picture).astype(np.uint16))
-    return (halves[0] << np.uint16(8)) | halves[1]
-
-
-def _refuse_16_bit_alpha_png(path: Path, data: bytes) -> None:
-    """Raise FrameError for a 16-bit PNG with an alpha channel: the decoder would silently keep 8 bits per channel."""
-    depth, colour = data[24:25], data[25:26]  # of the header, which the format fixes
-    if data[1:4] == b"PNG" and depth == b"\x10" and colour in b"\x04\x06":
-        raise FrameError(f"{path} holds 16-bit colour, which a png here cannot bring whole", "Save it as tiff or npy.")
+        return _loaded(BytesIO(archive.read(members[name])), f"{path}:{name}")
 
 
 @dataclass(frozen=True)
@@ -301,8 +231,11 @@ def as_raw(array: Pixels, name: str = "this image") -> Raw:
     """
     stored_bits = 8 * array.itemsize
     if array.dtype.kind == "f":
-        invalid = ~np.isfinite(array)
-        values, bad = np.where(invalid, 0, array).astype(np.float32), _any_channel(invalid)
+        with np.errstate(over="ignore"):
+            values = array.astype(np.float32)
+        invalid = ~np.isfinite(values)
+        values[invalid] = 0
+        bad = _any_channel(invalid)
         return Raw(*_ended(values, bad, float("inf")), bad, 0, stored_bits)
     if array.dtype.kind == "i" and array.size and array.min() < 0:
         raise FrameError(
@@ -360,6 +293,16 @@ def as_companion(array: Pixels, name: str) -> Image:
     raw = as_raw(array if is_counts else values, name)
     full = raw.pixels >= raw.white_dn
     return np.where(full, np.float32(np.nan), values) if np.count_nonzero(full) > CHANCE_PIXELS else values
+
+
+def with_levels(raw: Raw, levels: Levels) -> tuple[Raw, float | None]:
+    """Return a raw with the white level of its file, and the black level of its file, both in the counts of the raw.
+
+    A file states them for the stored values, which are shifted right by `raw.shift` bits.
+    """
+    scale = 2**raw.shift
+    white_dn = raw.white_dn if levels.white_dn is None else min(raw.white_dn, float(levels.white_dn // scale))
+    return replace(raw, white_dn=white_dn), None if levels.black_dn is None else levels.black_dn / scale
 
 
 def _any_channel(mask: Mask) -> Mask:
@@ -462,7 +405,7 @@ def require_raw_shape(name: str, psf: tuple[int, int], raw: tuple[int, int]) -> 
 def read_psf(path: Path) -> Psf:
     """Return the PSF in an image file, cleaned by `as_psf`; PsfError for a file that is no image or no PSF."""
     try:
-        array = read_image(path)
+        array = read_counts(path)
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
     return as_psf(array, path.name)

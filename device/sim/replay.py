@@ -19,7 +19,7 @@ from device.config.image_files import (
     as_companion,
     as_raw,
     common_white_dn,
-    read_image,
+    read_counts,
     read_psf,
     require_same_shape,
 )
@@ -51,11 +51,11 @@ def find_recording(folder: Path) -> ReplaySpec:
             f"{folder} holds {len(raws)} files that are raws and {len(psfs)} that are PSFs by their names",
             "Add a recording.toml that names them, or give them with --raw and --psf.",
         )
-    shape = read_image(raws[0]).shape[:2]
+    shape = read_counts(raws[0]).shape[:2]
     fitting, unreadable = [], []
     for path in psfs:
         try:
-            fitting += [path] if read_image(path).shape[:2] == shape else []
+            fitting += [path] if read_counts(path).shape[:2] == shape else []
         except FrameError as error:  # a figure, whose pixels are no counts
             unreadable.append(error.message)
     if not fitting:
@@ -66,7 +66,7 @@ def find_recording(folder: Path) -> ReplaySpec:
 
 def recorded_head(recording: ReplaySpec, name: str) -> InstrumentSpec:
     """Return the specification of a head for a recording without `recording.toml`; SpecError beyond 8192 px a side."""
-    rows, cols = read_image(recording.raws[0]).shape[:2]
+    rows, cols = read_counts(recording.raws[0]).shape[:2]
     if max(rows, cols) > MAX_SIDE_PX:
         raise SpecError(f"{recording.raws[0]} has {rows} x {cols} pixels; no more than {MAX_SIDE_PX} fit on a side")
     camera = CameraSpec(
@@ -100,7 +100,7 @@ class ReplayCamera:
 
     def __init__(self, recording: ReplaySpec, light: ReplayLight, clock: Clock) -> None:
         self._light, self._clock = light, clock
-        raws = [as_raw(read_image(path)) for path in recording.raws]
+        raws = [as_raw(read_counts(path)) for path in recording.raws]
         if len({raw.pixels.shape for raw in raws}) > 1:
             raise SpecError("the raws of one recording must all have the same rows and columns")
         self._simulated = any(is_marked_simulated(path) for path in recording.raws)
@@ -173,7 +173,7 @@ def _dark_in_raw_units(path: Path, raw: Raw) -> NDArray[Any]:
 
     It is shifted by the raw's bits, because dark counts do not reveal whether they are left-justified. NaN becomes 0.
     """
-    pixels = read_image(path) / 2**raw.shift
+    pixels = read_counts(path) / 2**raw.shift
     if pixels.ndim < raw.pixels.ndim:
         pixels = np.repeat(pixels[..., np.newaxis], 3, axis=2)
     if pixels.shape != raw.pixels.shape:
@@ -191,7 +191,7 @@ def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibrat
     require_same_shape(psfs, camera.shape)
     flat: Image | None = None
     if spec.replay.flat is not None:
-        flat = as_companion(read_image(spec.replay.flat), spec.replay.flat.name)
+        flat = as_companion(read_counts(spec.replay.flat), spec.replay.flat.name)
         flat = flat.mean(axis=2) if flat.ndim == 3 else flat
     geometry = spec.optics.geometry(spec.camera.pitch_um) if spec.optics else None
     return Calibration(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 
-from device.config.image_files import Raw, as_psf, as_raw, read_image
+from device.config.image_files import Raw, as_psf, as_raw, read_counts, read_image
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
 from device.values import Image, Psf, SimulatedCounts
@@ -142,7 +142,7 @@ class Dataset:
 
         FrameError or PsfError for a file that is missing or damaged, or whose size fits neither frame nor layout.
         """
-        raw = as_raw(_upright(read_image(entry.raw), self.layout.frames, self.layout.bgr))
+        raw = as_raw(_upright(read_counts(entry.raw), self.layout.frames, self.layout.bgr))
         shape = (raw.pixels.shape[0], raw.pixels.shape[1])
         psfs = _read_psfs(entry.psfs, self.layout.frames, self.layout.bgr, shape)
         truth = None if entry.truth is None else _read_truth(entry.truth, self.layout, shape)
@@ -189,7 +189,7 @@ def _psf_arrays(path: Path) -> list[tuple[str, Pixels]]:
         stack = _read_matlab(path)
         return [(f"{path.name}, depth {k}", stack[..., k]) for k in range(stack.shape[2])]
     try:
-        return [(path.name, read_image(path))]
+        return [(path.name, read_counts(path))]
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from device.config.image_files import SUFFIXES, read_image
+from device.config.image_files import SUFFIXES, read_counts
 from device.errors import FrameError, SettingError
 from device.user_files import files_in
 from services.lab.dataset_pairs import Dataset, Entry, Layout, Region, psf_factor
@@ -143,7 +143,7 @@ def _fitting(folder: Path, psfs: tuple[Path, ...], raw: Path, is_stack: bool) ->
 def _size(path: Path) -> tuple[int, int] | None:
     """Return (rows, cols) of an image file, None if it cannot be read; reading the pair then gives the reason."""
     try:
-        rows, cols = read_image(path).shape[:2]
+        rows, cols = read_counts(path).shape[:2]
     except FrameError:
         return None
     return rows, cols

@@ -499,4 +499,4 @@ def recorded_case(
     file = raw.pixels if isinstance(raw, Raw) else raw
     options = ReconstructOptions(file, (psf,), None, None, None, None, None, head, field_deg, False, plans)
     name = raw.name if isinstance(raw, Path) else frame.name
-    return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame.raw), True)
+    return Case(name, frame.raw.pixels, pixels, None, load_calibration(options, frame), True)

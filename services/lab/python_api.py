@@ -47,7 +47,8 @@ class ReconstructionOptions(TypedDict, total=False):
     illuminated disc in degrees, with `head`. `method`: name of `methods()`, or FILE.py:NAME. `bin`: bin x bin pixels
     per sample. `rounds`: largest number of rounds of an iterative method. `settings`: parameters of the method, such as
     {"tau": 0.1}. `budget_s`: time limit in seconds. `bayer`: the raw is a mosaic of this pattern, "rggb", "bggr",
-    "grbg" or "gbrg". `refraction`: False leaves out the eye's refraction, which is estimated with `head`.
+    "grbg" or "gbrg"; "none": it is monochrome, whatever a DNG says. `refraction`: False leaves out the eye's
+    refraction, which is estimated with `head`.
     """
 
     dark: ImageSource

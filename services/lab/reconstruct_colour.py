@@ -140,7 +140,7 @@ def _joined(
 def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -> Image:
     """Return the lit field on the picture's pixels, 0 to 1: of the head, else the lit area of the picture."""
     calibration = load_calibration(
-        replace(options, raw=source.raw, psfs=psf_stack([source.psf])), load_raw(source.raw).raw
+        replace(options, raw=source.raw, psfs=psf_stack([source.psf])), load_raw(source.raw, "none")
     )
     shape = picture.shape[0], picture.shape[1]
     if np.isfinite(field_radius_px(calibration)):

@@ -10,12 +10,13 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import cast, get_args
 
 import numpy as np
 
 from device.clock import Deadline, SystemClock
 from device.config import bayer
-from device.config.bayer import Bayer
+from device.config.bayer import BayerOption
 from device.config.marked_files import KEY, write_linear
 from device.errors import FrameError, SettingError, StoreError, StoreFull
 from device.recon.assessment.image_quality import MISMATCHES, NO_SIGNAL, Audience
@@ -438,12 +439,12 @@ def parse_settings(words: Iterable[str]) -> Settings:
     return settings
 
 
-def parse_bayer(word: str | None) -> Bayer | None:
-    """Return a colour filter pattern by its name, in letters of any case; SettingError lists the names."""
-    found = [pattern for pattern in bayer.PATTERNS if word is not None and pattern == word.lower()]
-    if word is not None and not found:
-        raise SettingError(f"'{word}' is no colour filter pattern", f"Choose one of: {', '.join(bayer.PATTERNS)}.")
-    return found[0] if found else None
+def parse_bayer(word: str | None) -> BayerOption | None:
+    """Return a colour filter pattern or "none", in letters of any case; SettingError lists the names."""
+    names = get_args(BayerOption)
+    if word is not None and word.lower() not in names:
+        raise SettingError(f"'{word}' is no colour filter pattern", f"Choose one of: {', '.join(names)}.")
+    return None if word is None else cast(BayerOption, word.lower())
 
 
 def _draw_sweep(place: Path, raw_name: str, calibration: Calibration, scores: list[float]) -> None:

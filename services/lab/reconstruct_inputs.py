@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from device.calibration.archive import Archive
 from device.calibration.import_psf import MAX_SATURATED_SHARE
 from device.config import bayer
-from device.config.bayer import Bayer
+from device.config.bayer import Bayer, BayerOption
 from device.config.ceiling import CHANCE_PIXELS
 from device.config.head_file import CameraSpec, InstrumentSpec, load_head
 from device.config.image_files import (
@@ -22,10 +22,11 @@ from device.config.image_files import (
     frames_of,
     only_frame,
     psf_counts,
-    read_image_file,
+    read_counts_file,
     require_raw_shape,
     require_same_shape,
     saturated_share,
+    with_levels,
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
@@ -48,9 +49,9 @@ class ReconstructOptions:
     Images are paths or arrays, `head` a file or what it holds. `output` None writes nothing. `even`: flat-field
     correction of the picture. `calibration`: DIR[:ID] of an archived one, instead of `psfs`. `bin`, `rounds` and
     `settings` (of the method, see device/recon/method_settings.py) replace what is chosen from PSF and frame. `bayer`:
-    the raw is a mosaic. `field_fixed`: the field is known exactly, and the refraction does not estimate its edge.
-    `refraction` False leaves the refraction out. `light`: colour of the raw, for which the PSFs of an archived
-    calibration are chosen (None: all are used).
+    the raw is a mosaic of this pattern, or "none". `field_fixed`: the field is known exactly, and the refraction does
+    not estimate its edge. `refraction` False leaves the refraction out. `light`: colour of the raw, for which the PSFs
+    of an archived calibration are chosen (None: all are used).
     """
 
     raw: Source
@@ -70,7 +71,7 @@ class ReconstructOptions:
     bin: int | None = None
     rounds: int | None = None
     settings: Settings = field(default_factory=dict)
-    bayer: Bayer | None = None
+    bayer: BayerOption | None = None
     field_fixed: bool = False
     refraction: bool = True
     light: Colour | None = None
@@ -124,34 +125,59 @@ def is_simulated(source: RawSource) -> bool:
     return isinstance(source.pixels if isinstance(source, Raw) else source, SimulatedCounts)
 
 
-def load_raw(source: RawSource, pattern: Bayer | None = None, checked: bool = True) -> LoadedRaw:
+def load_raw(source: RawSource, pattern: BayerOption | None = None, checked: bool = True) -> LoadedRaw:
     """Return the raw frame of a file or array; FrameError for one that cannot be read or, if `checked`, be solved.
 
-    `pattern` None: the pattern that a DNG states, else no mosaic.
+    `pattern` None: the pattern that a DNG states, if its pixels are those of a mosaic; else no mosaic.
     """
     name = name_of(source, "the raw")
     file = _read(source, name)
-    raw = source if isinstance(source, Raw) else as_raw(only_frame(file.frames, name), name)
+    read = source if isinstance(source, Raw) else as_raw(only_frame(file.frames, name), name)
+    raw, black_dn = with_levels(read, file.levels)
     if checked:
         refuse_without_signal(raw, name)
-    pattern = pattern or (file.bayer if raw.pixels.ndim == 2 else None)
     rows, cols = raw.pixels.shape[:2]
-    simulated = is_simulated(source)
-    notes: tuple[str, ...] = ()
-    if pattern is not None and raw.pixels.ndim == 3:
-        raise FrameError(f"{name} has three channels, so it is no mosaic", "Leave --bayer out.")
+    pattern, notes = _pattern(raw, pattern, file.levels.bayer, black_dn or 0.0, name)
     if pattern is not None:
         planes = bayer.split(raw.pixels, pattern, raw.white_dn)
         raw = replace(raw, pixels=planes, bad=bayer.any_site(raw.bad))
-    elif bayer.looks_like_mosaic(raw.pixels):
+    return LoadedRaw(raw, name, (rows, cols), pattern, black_dn, is_simulated(source), notes)
+
+
+def _pattern(
+    raw: Raw, given: BayerOption | None, stated: Bayer | None, black_dn: float, name: str
+) -> tuple[Bayer | None, tuple[str, ...]]:
+    """Return the pattern with which a raw is split, None for a monochrome one, and a note if that is not certain.
+
+    `given` by the user decides. The label of the file, `stated`, is no proof: picamera2 and rpicam-apps label the raw
+    of a monochrome sensor as a mosaic. Pixels that are too few to decide are taken as labelled.
+    """
+    if given == "none" or raw.pixels.ndim == 3:
+        if given not in (None, "none"):
+            raise FrameError(f"{name} has three channels, so it is no mosaic", "Leave --bayer out.")
+        return None, ()
+    if given is not None:
+        return given, ()
+    mosaic = bayer.looks_like_mosaic(raw.pixels.astype(np.float32) - black_dn)
+    if stated is not None and (mosaic or min(raw.pixels.shape) < bayer.MIN_SIZE):
+        return stated, ()
+    if stated is not None:
+        return None, (
+            f"{name} is labelled as a colour mosaic ({stated}), but its pixels are those of a monochrome sensor. "
+            f"It was solved as grey. Give --bayer {stated} if it is a mosaic; --bayer none leaves out this note.",
+        )
+    if mosaic:
         choice = ", ".join(bayer.PATTERNS)
-        notes = (f"{name} looks like a colour mosaic and was solved as grey. Give --bayer with one of {choice}.",)
-    return LoadedRaw(raw, name, (rows, cols), pattern, file.black_dn, simulated, notes)
+        return None, (
+            f"{name} looks like a colour mosaic and was solved as grey. Give --bayer with one of {choice}; "
+            "none leaves out this note.",
+        )
+    return None, ()
 
 
 def _read(source: RawSource, name: str) -> ImageFile:
     if isinstance(source, Path):
-        return read_image_file(source)
+        return read_counts_file(source)
     return ImageFile(frames_of(np.asarray(source.pixels if isinstance(source, Raw) else source), name))
 
 
@@ -238,11 +264,13 @@ def _psf_frames(source: Source, name: str) -> list[tuple[Raw, str]]:
     """Return counts and name of each PSF of a file or array; PsfError for one that is no PSF."""
     label = source.name if isinstance(source, Path) else name
     try:
-        frames = _read(source, name).frames
+        file = _read(source, name)
     except FrameError as error:
         raise PsfError(error.message, error.remedy) from error
-    names = [label] if len(frames) == 1 else [f"{label}[{index}]" for index in range(len(frames))]
-    return [(psf_counts(frame, one), one) for frame, one in zip(frames, names, strict=True)]
+    count = len(file.frames)
+    names = [label] if count == 1 else [f"{label}[{index}]" for index in range(count)]
+    counts = (psf_counts(frame, one) for frame, one in zip(file.frames, names, strict=True))
+    return [(with_levels(raw, file.levels)[0], one) for raw, one in zip(counts, names, strict=True)]
 
 
 def _split_psf(psf: Raw, name: str, loaded: LoadedRaw, pattern: Bayer) -> Raw:
@@ -277,15 +305,12 @@ def _saturation_notes(counts: list[tuple[Raw, str]], cleaned: list[tuple[Psf, ..
     return tuple(notes)
 
 
-def load_calibration(options: ReconstructOptions, raw: Raw) -> Calibration:
+def load_calibration(options: ReconstructOptions, loaded: LoadedRaw) -> Calibration:
     """Return one calibration for all channels of a raw: the archived one, or one from the files of the options.
 
     The channels of a colour PSF are averaged. Values that are not given stay unknown. SettingError for an invalid
     field, SpecError for a head without optics.
     """
-    rows, cols = raw.pixels.shape[:2]
-    simulated = is_simulated(options.raw)
-    loaded = LoadedRaw(raw, name_of(options.raw, "the raw"), (rows, cols), simulated=simulated)
     psfs = None if options.calibration is not None else load_psfs(options, loaded, per_channel=False)
     return load_calibrations(options, loaded, psfs)[0]
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from scipy import ndimage
 
 from device.config.bayer import mosaic_of
@@ -86,7 +87,7 @@ def test_an_overexposed_frame_gives_one_picture_whatever_its_ceiling() -> None:
         (["--bin", "9"], "Give --bin from 1 to 6."),
         (["--rounds", "0"], "0 rounds"),
         (["--rounds", "5", "--method", "gradient"], "closed form"),
-        (["--bayer", "rgbg"], "Choose one of: rggb, bggr, grbg, gbrg."),
+        (["--bayer", "rgbg"], "Choose one of: rggb, bggr, grbg, gbrg, none."),
         (["FOLDER/psf.npy"], "A stack of PSFs is --psf A --psf B"),
         (["--sweep", "FOLDER/s.svg"], "compares several PSFs"),
         (["-o", "FOLDER/raw.npy"], "would be overwritten"),
@@ -155,6 +156,33 @@ def test_mosaic_is_solved_in_planes() -> None:
     red, green, blue = made.picture.reshape(-1, 3).mean(axis=0)
     assert green / red == pytest.approx(0.6, abs=0.05)
     assert blue / red == pytest.approx(0.3, abs=0.05)
+
+
+def write_dng(path: Path, counts: Any, shift: int = 0) -> Path:
+    """Write counts as picamera2 does, labelled as a mosaic, with a black level of 64; `shift`: left-justified."""
+    levels = [(50714, "I", 1, 64 << shift, True), (50717, "I", 1, (4096 << shift) - 1, True)]
+    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\2\1\1\0", True), *levels]
+    tifffile.imwrite(path, (counts + 64) << shift, photometric="cfa", extratags=tags)
+    return path
+
+
+@pytest.mark.parametrize("shift", [0, 4])
+def test_label_of_a_mosaic_is_believed_only_with_the_pixels_of_one(tmp_path: Path, shift: int) -> None:
+    colours = np.dstack([ndimage.gaussian_filter(scene() * share, 2) for share in (1.0, 0.6, 0.3)])
+    mosaic = write_dng(tmp_path / "mosaic.dng", np.rint(mosaic_of(colours, "bggr")).astype(np.uint16), shift)
+    mono = write_dng(tmp_path / "mono.dng", scene(), shift)
+    assert reconstruct_file(options(mosaic, [caustic()])).report.bayer == "bggr"
+    for given, label in ((None, None), ("none", None), ("bggr", "bggr")):
+        made = reconstruct_file(options(mono, [caustic()], bayer=given))
+        assert made.report.bayer == label
+        noted = any("labelled as a colour mosaic (bggr)" in warning for warning in made.report.warnings)
+        assert noted == (given is None)
+    made = reconstruct_file(options(mono, [caustic()])).picture
+    expected = reconstruct_file(options(scene(), [caustic()])).picture
+    assert np.corrcoef(made.ravel(), expected.ravel())[0, 1] > 0.999
+    forced = reconstruct_file(options(mosaic, [caustic()], bayer="none"))
+    assert forced.picture.ndim == 2
+    assert not any("mosaic" in warning for warning in forced.report.warnings)
 
 
 def test_stack_in_one_file_is_a_choice_of_depths(folder: Path) -> None:

@@ -14,8 +14,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_there_are_37_wrong_inputs() -> None:
-    assert len({wrong.name for wrong in WRONG_INPUTS}) == 37
+def test_there_are_39_wrong_inputs() -> None:
+    assert len({wrong.name for wrong in WRONG_INPUTS}) == 39
 
 
 @pytest.mark.parametrize("wrong", WRONG_INPUTS, ids=lambda wrong: wrong.name)

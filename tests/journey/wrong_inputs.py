@@ -17,6 +17,7 @@ from PIL import Image
 from scipy import ndimage, signal
 
 from services.cli import main
+from services.imaging.picture_files import to_png
 
 SHAPE = (96, 128)
 Write = Callable[[Path], list[str]]
@@ -124,9 +125,15 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:5000])
 
 
+def labelled_dng(path: Path) -> None:
+    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\2\1\1\0", True)]
+    tifffile.imwrite(path, scene(), photometric="cfa", extratags=tags)
+
+
 def compressed_dng(path: Path) -> None:
-    tags = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\0\1\1\2", True)]
-    tifffile.imwrite(path, scene(), photometric="cfa", compression="zlib", extratags=tags)
+    labelled_dng(path)
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        file.pages.first.tags["Compression"].overwrite(7)
 
 
 def mosaic(path: Path) -> None:
@@ -157,7 +164,7 @@ WRONG_INPUTS = (
     WrongInput("fourth channel, npy", raw_of("four.npy", saved(four_channels())), "fourth channel"),
     WrongInput(
         "fourth channel, tiff", raw_of("four.tiff", lambda path: tifffile.imwrite(path, four_channels())),
-        "fourth channel",
+        "alpha channel",
     ),
     WrongInput("transparent png", raw_of("clear.png", transparent), "transparent"),
     WrongInput("three frames as raw", raw_of("stack.npy", saved(np.stack([scene()] * 3))), "holds 3 frames"),
@@ -176,7 +183,14 @@ WRONG_INPUTS = (
     WrongInput(
         "npz of two arrays", raw_of("two.npz", lambda path: np.savez(path, raw=scene(), psf=caustic())), "raw, psf"
     ),
-    WrongInput("compressed dng", raw_of("raw.dng", compressed_dng), "compressed"),
+    WrongInput("compressed dng", raw_of("raw.dng", compressed_dng), "compressed by JPEG"),
+    WrongInput(
+        "frame of a monochrome sensor labelled as a mosaic", raw_of("mono.dng", labelled_dng),
+        "labelled as a colour mosaic (bggr)", noted=True,
+    ),
+    WrongInput(
+        "picture as raw", raw_of("eye.png", lambda path: path.write_bytes(to_png(scene(), simulated=False))), "sRGB"
+    ),
     WrongInput("mosaic without --bayer", raw_of("mosaic.npy", mosaic), "looks like a colour mosaic", noted=True),
     WrongInput("no PSF", lambda folder: reconstruct(folder, psf=None), "either PSFs or a calibration"),
     WrongInput("text as PSF", psf_of("words.npy", np.array([["a", "b"]])), "no raw image"),

@@ -13,20 +13,23 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from PIL import Image
+from PIL import Image, ImageOps
 
+from device.config.dng_levels import Levels
 from device.config.image_files import (
     as_psf,
     as_raw,
+    read_counts,
     read_image,
     read_image_file,
     read_psf,
     require_same_shape,
+    with_levels,
 )
 from device.config.marked_files import is_marked_simulated, write_linear
 from device.errors import FrameError, PsfError, SettingError
 from device.values import Psf
-from services.imaging.picture_files import raw_tiff
+from services.imaging.picture_files import raw_tiff, to_png
 from services.imaging.raw_metadata import RawMetadata
 
 SHAPE = (200, 300)
@@ -258,13 +261,47 @@ def test_plain_dng_is_read_with_pattern_and_black_level(tmp_path: Path) -> None:
         file.write(GOOD["grey.tiff"], photometric="cfa", extratags=DNG_TAGS)
     read = read_image_file(tmp_path / "a.dng")
     assert np.array_equal(read.frames[0], GOOD["grey.tiff"])
-    assert read.bayer == "grbg"
-    assert read.black_dn == 64
+    assert read.levels == Levels("grbg", 64, None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("size", [(6, 8), (7, 9), (6, 9)])
+def test_pattern_of_a_dng_follows_its_areas_and_its_orientation(
+    tmp_path: Path, orientation: int, size: tuple[int, int]
+) -> None:
+    """The counts of a mosaic are the places of its filters in rgb, so that the pixels read tell their own pattern."""
+    filters = np.tile(np.array([[1, 2], [0, 1]], np.uint16), (9, 9))
+    for top, left, row, col in ((0, 0, 0, 0), (1, 2, 0, 1), (3, 0, 1, 1), (2, 1, 3, 2)):
+        pattern = bytes(filters[top : top + 2, left : left + 2].ravel().astype(np.uint8))
+        tags = [
+            (33421, "H", 2, (2, 2), True), (33422, "B", 4, pattern, True), (274, "H", 1, orientation, True),
+            (50829, "I", 4, (top, left, 18, 18), True),
+            (50719, "I", 2, (col, row), True), (50720, "I", 2, size[::-1], True),
+        ]  # fmt: skip
+        tifffile.imwrite(tmp_path / "a.dng", filters, photometric="cfa", extratags=tags)
+        read = read_image_file(tmp_path / "a.dng")
+        (pixels,) = read.frames
+        assert pixels.shape == (size if orientation < 5 else size[::-1])
+        assert read.levels.bayer == "".join("rgb"[int(one)] for one in pixels[:2, :2].ravel())
+
+
+def test_levels_of_a_dng_are_those_of_the_counts_after_their_shift(tmp_path: Path) -> None:
+    """A Raspberry Pi 5 stores the counts of any sensor left-justified in 16 bits, and the levels with them."""
+    counts = twelve_bit()
+    tags = [(50714, "I", 1, 256 * 16, True), (50717, "I", 1, 3900 * 16 + 15, True)]
+    tifffile.imwrite(tmp_path / "a.dng", counts << np.uint16(4), photometric="cfa", extratags=tags)
+    file = read_image_file(tmp_path / "a.dng")
+    raw, black_dn = with_levels(as_raw(file.frames[0]), file.levels)
+    assert np.array_equal(raw.pixels, counts)
+    assert (raw.shift, black_dn, raw.white_dn) == (4, 256, 3900)
 
 
 def test_dng_that_needs_another_decoder_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.dng", GOOD["grey.tiff"], photometric="cfa", compression="zlib", extratags=DNG_TAGS)
-    refused_file(tmp_path / "a.dng", "compressed")
+    assert np.array_equal(read_image(tmp_path / "a.dng"), GOOD["grey.tiff"])
+    with tifffile.TiffFile(tmp_path / "a.dng", mode="r+b") as file:
+        file.pages.first.tags["Compression"].overwrite(7)
+    refused_file(tmp_path / "a.dng", "compressed by JPEG")
     tifffile.imwrite(tmp_path / "b.dng", GOOD["grey.tiff"])
     refused_file(tmp_path / "b.dng", "no raw image")
     (tmp_path / "c.dng").write_bytes((tmp_path / "b.dng").read_bytes()[:90])
@@ -309,8 +346,46 @@ def test_an_alpha_channel_is_dropped_and_a_palette_resolved(tmp_path: Path) -> N
     alpha = np.dstack([GOOD["colour.png"], np.full((4, 6), 255, np.uint8)])
     write(tmp_path / "a.png", alpha)
     assert np.array_equal(read_image(tmp_path / "a.png"), GOOD["colour.png"])
-    Image.fromarray(GOOD["colour.png"]).convert("P").save(tmp_path / "p.png")
-    assert read_image(tmp_path / "p.png").shape == (4, 6, 3)
+    indices = Image.fromarray(GOOD["grey.png"], "P")
+    indices.putpalette(np.roll(np.arange(768, dtype=np.uint8), 1).tobytes())
+    for name in ("p.png", "p.tiff"):
+        indices.save(tmp_path / name)
+        assert np.array_equal(read_image(tmp_path / name), np.asarray(indices.convert("RGB")))
+
+
+def test_picture_with_an_srgb_chunk_is_no_raw_frame(tmp_path: Path) -> None:
+    path = tmp_path / "picture.png"
+    path.write_bytes(to_png(spot(), simulated=False))
+    assert read_image(path).shape == (60, 80)
+    with pytest.raises(FrameError, match=r"picture\.png states that its values are not linear in the light \(sRGB\)"):
+        read_counts(path)
+    with pytest.raises(PsfError, match="sRGB"):
+        read_psf(path)
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "packbits", "tiff_adobe_deflate", "zstd", "lzma"])
+def test_tiff_that_pillow_compressed_is_read(tmp_path: Path, compression: str) -> None:
+    for name, pixels in (("a.tiff", twelve_bit(3)), ("b.tiff", np.stack([GOOD["grey.png"]] * 3, axis=2))):
+        Image.fromarray(pixels).save(tmp_path / name, compression=compression)
+        assert np.array_equal(read_image(tmp_path / name), pixels)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_file_is_as_upright_as_pillow_turns_it(tmp_path: Path, orientation: int) -> None:
+    tags, pixels = Image.Exif(), GOOD["grey.png"]
+    tags[274] = orientation
+    Image.fromarray(pixels).save(tmp_path / "a.png", exif=tags)
+    tifffile.imwrite(tmp_path / "a.tiff", pixels, extratags=[(274, "H", 1, orientation, True)])
+    with Image.open(tmp_path / "a.png") as shown:
+        upright = np.asarray(ImageOps.exif_transpose(shown))
+    assert np.array_equal(read_image(tmp_path / "a.png"), upright)
+    assert np.array_equal(read_image(tmp_path / "a.tiff"), upright)
+
+
+def test_frames_that_only_their_program_knows_are_refused(tmp_path: Path) -> None:
+    stack = np.zeros((3, 40, 60), np.uint16)
+    tifffile.imwrite(tmp_path / "a.tiff", stack, truncate=True, photometric="minisblack")
+    refused_file(tmp_path / "a.tiff", "several frames in one page")
 
 
 @pytest.mark.parametrize("line_filter", [0, 2])
@@ -338,7 +413,7 @@ def test_png_of_16_bit_colour_is_read_whole(tmp_path: Path, line_filter: int) ->
 def test_png_of_16_bit_colour_with_alpha_is_refused(tmp_path: Path) -> None:
     file = bytearray(b"\x89PNG\r\n\x1a\n" + b"\0\0\0\rIHDR" + b"\0\0\0\x01\0\0\0\x01" + b"\x10\x06\0\0\0")
     (tmp_path / "deep.png").write_bytes(file)
-    with pytest.raises(FrameError, match="16-bit colour") as refused:
+    with pytest.raises(FrameError, match="16 bits with an alpha channel") as refused:
         read_image(tmp_path / "deep.png")
     assert "tiff" in refused.value.remedy
 
@@ -371,7 +446,7 @@ def test_arrays_that_are_no_images_are_refused(tmp_path: Path) -> None:
         np.save(tmp_path / f"{name}.npy", array)
         refused_file(tmp_path / f"{name}.npy", "shape|type")
     np.save(tmp_path / "object.npy", np.array([[{}]]), allow_pickle=True)
-    refused_file(tmp_path / "object.npy", "is not a whole")
+    refused_file(tmp_path / "object.npy", "Python objects")
 
 
 def test_header_that_claims_too_much_memory_is_refused(tmp_path: Path) -> None:

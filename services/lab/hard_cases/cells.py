@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from device.config.image_files import Raw, as_raw, read_image
 from device.errors import DiffuscopeError
 from device.recon.assessment.metrics import pcc
 from device.recon.methods import METHODS
@@ -21,7 +20,7 @@ from device.values import Image, Mask, Reconstruction
 from services.lab.hard_cases.cases import CLEAN, Case
 from services.lab.hard_cases.frames import Eye, HardFrame, head_toml
 from services.lab.reconstruct_file import plan_reconstructor
-from services.lab.reconstruct_inputs import ReconstructOptions, load_calibration
+from services.lab.reconstruct_inputs import LoadedRaw, ReconstructOptions, load_calibration, load_raw
 
 DEFAULT_SCHEDULE = "ladder"  # the default schedule: quick look, refraction, iterations
 COLUMNS = (DEFAULT_SCHEDULE, *METHODS)
@@ -74,21 +73,22 @@ class SolverCache:
 
         `files` identifies the content of all files but the raw.
         """
-        raw = as_raw(read_image(order.raw) if isinstance(order.raw, Path) else order.raw)
+        loaded = load_raw(order.raw, checked=False)
+        raw = loaded.raw
         known = raw.stored_bits, raw.white_dn, raw.bad.tobytes() if raw.bad.any() else b""
         key = (*files, order.method, order.budget_s, *known)
         if key not in self._kept:
-            self._kept[key] = self._planned(order, raw)
+            self._kept[key] = self._planned(order, loaded)
         self._kept.move_to_end(key)
         while len(self._kept) > CACHE_SIZE:
             self._kept.popitem(last=False)
         return self._kept[key](raw.pixels, simulated=True)
 
-    def _planned(self, order: ReconstructOptions, raw: Raw) -> Reconstructor:
+    def _planned(self, order: ReconstructOptions, loaded: LoadedRaw) -> Reconstructor:
         """Plan without a deadline: the durations of the steps, measured three times on noise, would not be used."""
-        shape, untimed = (raw.pixels.shape[0], raw.pixels.shape[1]), replace(order, budget_s=None)
+        shape, untimed = loaded.solved_shape, replace(order, budget_s=None)
         quick = order.budget_s is not None
-        return plan_reconstructor(untimed, load_calibration(order, raw), shape, self._planner, 0, quick=quick)
+        return plan_reconstructor(untimed, load_calibration(order, loaded), shape, self._planner, 0, quick=quick)
 
 
 class CaseRunner:
