@@ -26,6 +26,7 @@ DiffuscopeError                       base class in device/errors.py
 │   ├── VersionRefused                later picture of other frames
 │   ├── UsbDriveFull                  no space on the USB drive
 │   ├── UsbDriveUnavailable           USB drive removed or not writable
+│   │   └── UsbDriveReadOnly          USB drive write-protected
 │   ├── RecordRemoved                 file removed to make room
 │   └── RecordNotFound (LookupError)  no such capture
 ├── UploadError                       upload of a visit failed
@@ -218,6 +219,15 @@ class UsbDriveUnavailable(StoreError):
 
     code = "stick.gone"
     default_remedy = "The USB stick cannot be written. Nothing was lost. Put it in again, and copy once more."
+
+
+class UsbDriveReadOnly(UsbDriveUnavailable):
+    """The USB drive is mounted read-only: it is write-protected, or damaged."""
+
+    code = "stick.readonly"
+    default_remedy = (
+        "The USB stick is write-protected, or damaged. Nothing was lost. Move its switch if it has one, or use another."
+    )
 
 
 class RecordRemoved(StoreError):

@@ -1,5 +1,7 @@
 """USB drives: detection of mounted, writable drives, and the atomic copy of files into a new folder of one drive."""
 
+import errno
+import hashlib
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -8,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from device import atomic_io
-from services.errors import UsbDriveFull, UsbDriveUnavailable
+from device.errors import StoreError
+from services.errors import UsbDriveFull, UsbDriveReadOnly, UsbDriveUnavailable
 
 ROOTS = (Path("/media"), Path("/run/media"))
 MOUNTS = Path("/proc/self/mounts")
@@ -17,35 +20,45 @@ MOUNT_ESCAPES = {r"\040": " ", r"\011": "\t", r"\012": "\n", r"\134": "\\"}  # e
 
 @dataclass(frozen=True)
 class UsbDrive:
-    """A mounted drive: mount point (`folder`), and free space in bytes."""
+    """A mounted drive: mount point (`folder`), free space in bytes, and whether it can be written."""
 
     folder: Path
     free_bytes: int
+    is_writable: bool
+
+    @property
+    def id(self) -> str:
+        """Identifier of the mount point, which does not tell the folder."""
+        return hashlib.sha256(os.fsencode(self.folder)).hexdigest()[:16]
 
 
 class UsbDrives:
-    """Writable drives mounted below `roots`; the kernel's mount table (`mounts`) is read at each call."""
+    """Drives mounted below `roots`; the kernel's mount table (`mounts`) is read at each call."""
 
     def __init__(self, roots: tuple[Path, ...] = ROOTS, mounts: Path = MOUNTS) -> None:
         self._roots, self._mounts = roots, mounts
 
     def present(self) -> list[UsbDrive]:
-        """Return the drives that are mounted and writable now."""
+        """Return the drives that are mounted now, also those that cannot be written."""
         found = []
         for folder in self._mounted():
             try:
-                if os.access(folder, os.W_OK):
-                    found.append(UsbDrive(folder, atomic_io.free_bytes(folder)))
+                found.append(UsbDrive(folder, atomic_io.free_bytes(folder), os.access(folder, os.W_OK)))
             except OSError:  # removed since the mount table was read
                 continue
         return found
 
-    def mounted_folder(self, folder: str) -> Path:
-        """Return the mount point with that path; UsbDriveUnavailable if no writable drive is mounted there now."""
+    def mounted_folder(self, id: str) -> Path:
+        """Return the mount point of the drive with that id.
+
+        UsbDriveUnavailable if it is not mounted now, UsbDriveReadOnly if it cannot be written.
+        """
         for drive in self.present():
-            if str(drive.folder) == folder:
+            if drive.id == id:
+                if not drive.is_writable:
+                    raise UsbDriveReadOnly(f"{drive.folder.name} can only be read")
                 return drive.folder
-        raise UsbDriveUnavailable(f"{folder[:80]!r} is no USB stick that is there now")
+        raise UsbDriveUnavailable(f"{id[:80]!r} is no USB stick that is there now")
 
     def _mounted(self) -> list[Path]:
         lines = self._mounts.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
@@ -82,15 +95,22 @@ def copy_to_drive(drive: Path, name: str, files: Mapping[str, bytes]) -> Path:
         atomic_io.fsync_folder(target)  # on FAT, fsync of a folder writes its own entry, fsync of its parent does not
         changed = [name for name, content in files.items() if atomic_io.read_from_disk(target / name) != content]
     if changed:
-        raise UsbDriveUnavailable(f"{drive} does not return what was written: {changed[0]}", "Use another USB stick.")
+        raise UsbDriveUnavailable(
+            f"{drive.name} does not return what was written: {changed[0]}", "Use another USB stick."
+        )
     return target
 
 
 @contextmanager
 def drive_errors(drive: Path) -> Iterator[None]:
-    """Convert OSError to UsbDriveFull (no space) or UsbDriveUnavailable (other errors); a context manager."""
+    """Convert OSError to UsbDriveFull, UsbDriveReadOnly or UsbDriveUnavailable; a context manager."""
     try:
         yield
     except OSError as error:
-        kind = UsbDriveFull if atomic_io.is_full(error) else UsbDriveUnavailable
-        raise kind(f"{drive} refused: {error.strerror or error}") from error
+        raise _kind_of(error)(f"{drive.name} refused: {error.strerror or error}") from error
+
+
+def _kind_of(error: OSError) -> type[StoreError]:
+    if atomic_io.is_full(error):
+        return UsbDriveFull
+    return UsbDriveReadOnly if error.errno == errno.EROFS else UsbDriveUnavailable

@@ -158,7 +158,7 @@ def test_event_log_lists_events(technician_page: Page) -> None:
 
 
 def test_event_log_is_filtered_and_exported(technician_page: Page) -> None:
-    stick = {"id": "/media/BLUE", "name": "BLUE", "free_bytes": 10**9}
+    stick = {"id": "0123456789abcdef", "name": "BLUE", "free_bytes": 10**9, "is_writable": True}
     technician_page.route("**/api/exports", lambda route: route.fulfill(json={"folders": [stick]}))
     technician_page.route("**/diary/export", lambda route: route.fulfill(json={"folder": "diary-2026-11-22"}))
     open_section(technician_page, "diary")
@@ -168,7 +168,7 @@ def test_event_log_is_filtered_and_exported(technician_page: Page) -> None:
     technician_page.get_by_role("button", name="Copy to USB").tap()
     with technician_page.expect_request("**/diary/export") as asked:
         technician_page.get_by_role("button", name="BLUE").tap()
-    assert asked.value.post_data_json == {"folder": "/media/BLUE"}
+    assert asked.value.post_data_json == {"folder": stick["id"]}
     expect(technician_page.get_by_role("note")).to_have_text("Copied to BLUE/diary-2026-11-22.")
     entry = technician_page.locator(".diary li", has_text="a picture was kept after")
     entry.get_by_text("More").tap()

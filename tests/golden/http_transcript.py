@@ -171,12 +171,12 @@ def exports() -> list[dict[str, Any]]:
         log.ask("GET /api/visits/{id}/export.zip", f"/api/visits/{visit}/export.zip")
         log.ask("GET /api/visits/{id}/export.zip", f"/api/visits/{UNKNOWN_VISIT}/export.zip")
         copy, at = "POST /api/visits/{id}/export", f"/api/visits/{visit}/export"
-        order = log.key(folder=str(device.stick))
+        order = log.key(folder=device.stick_id)
         log.ask(copy, at, json=order)
         log.ask(copy, at, json=order, note="the same key again: no second copy")
-        log.ask(copy, at, json=log.key(folder=str(device.stick)), note="a second copy")
+        log.ask(copy, at, json=log.key(folder=device.stick_id), note="a second copy")
         log.ask(copy, at, json=log.key(folder="/etc"))
-        log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=str(device.stick)))
+        log.ask(copy, f"/api/visits/{UNKNOWN_VISIT}/export", json=log.key(folder=device.stick_id))
         _diary(log)
         _backups(log)
         _montages(log)
@@ -207,7 +207,7 @@ def _backups(log: Transcript) -> None:
     log.ask(passphrase, json={"passphrase": "short"})
     log.ask(passphrase, json={"passphrase": "four plain words here"})
     log.ask(f"POST {at}", json={"folder": "/etc"})
-    log.ask(f"POST {at}", json={"folder": str(log.instrument.stick)})
+    log.ask(f"POST {at}", json={"folder": log.instrument.stick_id})
     removal = "/api/technician/removal"
     for operation in (f"GET {removal}", f"POST {removal}", f"POST {removal}/undo"):
         log.ask(operation)
@@ -222,12 +222,12 @@ def _diary(log: Transcript) -> None:
     for path in paths:
         log.ask(f"GET {path}", note="no technician is logged in")
     export = "POST /api/technician/diary/export"
-    log.ask(export, json={"folder": str(log.instrument.stick)}, note="no technician is logged in")
+    log.ask(export, json={"folder": log.instrument.stick_id}, note="no technician is logged in")
     log.ask("POST /api/technician/pin", json=PIN)
     for path in paths:
         log.ask(f"GET {path}")
     log.ask("GET /api/technician/diary", "/api/technician/diary?limit=0")
-    log.ask(export, json={"folder": str(log.instrument.stick)})
+    log.ask(export, json={"folder": log.instrument.stick_id})
     log.ask(export, json={"folder": "/etc"})
 
 

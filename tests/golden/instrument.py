@@ -27,7 +27,7 @@ from device.ports import Camera
 from device.values import ExposureSettings, Frame
 from services.backup.backup_runner import BackupRunner
 from services.delivery.uploader import Uploader, VisitArchive
-from services.delivery.usb_drives import UsbDrives
+from services.delivery.usb_drives import UsbDrive, UsbDrives
 from services.errors import UploadRejected
 from services.health.event_log import EventLog
 from services.http.app import Application, create_app
@@ -149,6 +149,11 @@ class Instrument:
     def stick(self) -> Path:
         """The one USB drive present."""
         return self.folder / "media" / "STICK"
+
+    @property
+    def stick_id(self) -> str:
+        """Identifier of the USB drive in the list of the drives."""
+        return UsbDrive(self.stick, 0, True).id
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send one request to the application in this process; keep its cookies."""

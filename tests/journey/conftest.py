@@ -32,7 +32,7 @@ from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Colour, Psf
 from services.delivery.uploader import Uploader
-from services.delivery.usb_drives import UsbDrives
+from services.delivery.usb_drives import UsbDrive, UsbDrives
 from services.http.app import Application, create_app
 from services.http.authentication import PinAuthenticator
 from services.instrument.events import EventBus
@@ -260,6 +260,11 @@ def stick(tmp_path: Path) -> Path:
     escaped = str(folder).replace(" ", "\\040")  # as the kernel writes a blank
     (tmp_path / "mounts").write_text(f"proc /proc proc rw 0 0\n/dev/sda1 {escaped} vfat rw 0 0\n")
     return folder
+
+
+def drive_id(folder: Path) -> str:
+    """Return the identifier of the USB drive that is mounted at a folder."""
+    return UsbDrive(folder, 0, True).id
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from services.delivery.usb_drives import UsbDrives
 from services.http.app import create_app
 from services.http.routes.backup import backup_routes
 from services.records.capture_store import CaptureStore
-from tests.journey.conftest import Rig, technician_requests, until
+from tests.journey.conftest import Rig, drive_id, technician_requests, until
 from tests.journey.faults import post_capture
 
 PASSPHRASE = "four plain words here"
@@ -55,7 +55,7 @@ def test_a_backup_beside_the_exam_restores_its_captures(ask: Ask, rig: Rig, stic
         "has_key": False, "last": None, "is_due": False, "done": None, "total": None, "error": None,
     }  # fmt: skip
     assert ask("POST", "/passphrase", json={"passphrase": PASSPHRASE}).json()["has_key"]
-    assert ask("POST", json={"folder": str(stick)}).status_code == 200
+    assert ask("POST", json={"folder": drive_id(stick)}).status_code == 200
     done = ended(ask)
     assert (done["error"], done["last"]["number"], done["last"]["units"]) == (None, 1, 1)
     folder = find_folder(stick)
@@ -74,7 +74,7 @@ def test_a_backup_is_due_a_week_after_the_first_picture_that_is_in_none(ask: Ask
     health = {one["name"]: one for one in rig.request("GET", "/api/health").json()["checks"]}
     assert (health["backup"]["ok"], health["backup"]["value"]) == (False, "none yet")
     ask("POST", "/passphrase", json={"passphrase": PASSPHRASE})
-    ask("POST", json={"folder": str(stick)})
+    ask("POST", json={"folder": drive_id(stick)})
     assert not ended(ask)["is_due"]
     rig.clock.elapsed_s += 30 * DAY_S
     assert not ask("GET").json()["is_due"], "nothing new is on the device"
@@ -82,19 +82,19 @@ def test_a_backup_is_due_a_week_after_the_first_picture_that_is_in_none(ask: Ask
 
 def test_what_prevents_a_backup_is_in_the_state(ask: Ask, rig: Rig, stick: Path, tmp_path: Path) -> None:
     post_capture(rig)
-    ask("POST", json={"folder": str(stick)})
+    ask("POST", json={"folder": drive_id(stick)})
     assert ended(ask)["error"]["code"] == "backup.key"
     refused = ask("POST", "/passphrase", json={"passphrase": "short"})
     assert (refused.status_code, refused.json()["code"]) == (403, "backup.key")
     refused = ask("POST", json={"folder": str(tmp_path)})
     assert (refused.status_code, refused.json()["code"]) == (503, "stick.gone")
     ask("POST", "/passphrase", json={"passphrase": PASSPHRASE})
-    ask("POST", json={"folder": str(stick)})
+    ask("POST", json={"folder": drive_id(stick)})
     assert ended(ask)["error"] is None
     objects = find_folder(stick) / "objects"
     shutil.rmtree(objects)
     objects.write_text("a file where a folder was")
-    ask("POST", json={"folder": str(stick)})
+    ask("POST", json={"folder": drive_id(stick)})
     assert ended(ask)["error"]["code"] == "stick.gone"
 
 

@@ -13,7 +13,7 @@ from services.delivery.usb_drives import UsbDrives
 from services.health.event_log import EventLog
 from services.http.app import create_app
 from services.http.routes.event_log import event_log_routes
-from tests.journey.conftest import Rig, technician_requests
+from tests.journey.conftest import Rig, drive_id, technician_requests
 
 log = logging.getLogger("services.instrument.test")
 
@@ -44,7 +44,7 @@ def test_event_log_is_downloaded_as_text(ask: Callable[..., Any]) -> None:
 
 def test_second_copy_to_a_usb_drive_keeps_the_first(ask: Callable[..., Any], stick: Path) -> None:
     log.info("a picture was kept")
-    first, second = (ask("POST", "/export", json={"folder": str(stick)}).json()["folder"] for _ in range(2))
+    first, second = (ask("POST", "/export", json={"folder": drive_id(stick)}).json()["folder"] for _ in range(2))
     assert second == f"{first}-2"
     assert "a picture was kept" in (stick / first / "diary.txt").read_text()
     lines = (stick / second / "diary.jsonl").read_text().splitlines()

@@ -11,7 +11,7 @@ import pytest
 
 from services.delivery.usb_drives import UsbDrives
 from services.http.app import create_app
-from tests.journey.conftest import Rig, technician_requests
+from tests.journey.conftest import Rig, drive_id, technician_requests
 
 KEYS = (f"{number:016x}" for number in count(1))
 
@@ -45,7 +45,7 @@ def test_an_exported_visit_is_removed_and_brought_back(rig: Rig, ask: Callable[.
     picture = f"/api/captures/{capture}/picture.png"
     before = rig.request("GET", picture).content
     assert ask("GET").json()["visits"] == 0
-    copied = rig.request("POST", f"/api/visits/{visit}/export", json={"key": next(KEYS), "folder": str(stick)})
+    copied = rig.request("POST", f"/api/visits/{visit}/export", json={"key": next(KEYS), "folder": drive_id(stick)})
     assert copied.status_code == 200
     may = ask("GET").json()
     assert (may["visits"], may["captures"], may["undoable_captures"]) == (1, 1, 0)

@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
@@ -16,8 +18,9 @@ import pytest
 
 from services.delivery.usb_drives import UsbDrives, copy_to_drive
 from services.delivery.visit_export import zip_archive
-from services.errors import UsbDriveFull, UsbDriveUnavailable
+from services.errors import UsbDriveFull, UsbDriveReadOnly, UsbDriveUnavailable
 from services.http.app import create_app
+from tests.journey.conftest import drive_id
 
 keys = (f"{number:016x}" for number in count(1))
 FILES = {"R-centre-1.png": b"p" * 5000, "visit.json": b"{}"}
@@ -76,15 +79,15 @@ def test_a_date_before_1980_does_not_fail_the_zip() -> None:
 
 def test_a_copy_on_a_usb_drive_is_complete_and_an_earlier_one_stays(rig: Any, visit: Any, stick: Path) -> None:
     listed = rig.request("GET", "/api/exports").json()["folders"]
-    assert [(one["id"], one["name"]) for one in listed] == [(str(stick), "USB STICK")]
+    assert [(one["id"], one["name"]) for one in listed] == [(drive_id(stick), "USB STICK")]
     assert listed[0]["free_bytes"] > 0
-    order = {"key": next(keys), "folder": str(stick)}
+    order = {"key": next(keys), "folder": drive_id(stick)}
     at = f"/api/visits/{visit['id']}/export"
     made = rig.request("POST", at, json=order).json()
     assert rig.request("POST", at, json=order).json() == made
-    check(Path(made["folder"]))
+    check(stick.parent / made["folder"])
     other = rig.request("POST", at, json={**order, "key": next(keys)}).json()
-    check(Path(other["folder"]))
+    check(stick.parent / other["folder"])
     assert {path.name for path in stick.iterdir()} == {Path(one["folder"]).name for one in (made, other)}
     assert len(list(stick.iterdir())) == 2
 
@@ -104,7 +107,7 @@ def test_only_a_mounted_usb_drive_is_written(rig: Any, visit: Any, stick: Path, 
 def test_a_removed_usb_drive_is_an_error_and_the_same_request_succeeds_later(
     rig: Any, visit: Any, stick: Path, tmp_path: Path
 ) -> None:
-    order, at = {"key": next(keys), "folder": str(stick)}, f"/api/visits/{visit['id']}/export"
+    order, at = {"key": next(keys), "folder": drive_id(stick)}, f"/api/visits/{visit['id']}/export"
     shutil.rmtree(stick)  # the mount table still lists it
     assert rig.request("GET", "/api/exports").json() == {"folders": []}
     gone = rig.request("POST", at, json=order)
@@ -147,3 +150,37 @@ if __name__ == "__main__":
         copy_to_drive(Path(sys.argv[1]), "A", FILES)
     except UsbDriveFull as full:
         print(type(full).__name__, [path.name for path in Path(sys.argv[1]).iterdir()])  # noqa: T201
+
+
+def test_a_drive_that_can_only_be_read_is_listed_as_such_and_refused(rig: Any, visit: Any, stick: Path) -> None:
+    """As a stick whose switch is on, or one that the kernel has mounted read-only after an error."""
+    with read_only(stick):
+        listed = rig.request("GET", "/api/exports").json()["folders"]
+        assert [(one["name"], one["is_writable"]) for one in listed] == [("USB STICK", False)]
+        order = {"key": next(keys), "folder": drive_id(stick)}
+        refused = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order)
+        assert (refused.status_code, refused.json()["code"]) == (503, "stick.readonly")
+        assert "write-protected" in refused.json()["remedy"]
+        with pytest.raises(UsbDriveReadOnly, match=r"^USB STICK refused: Read-only"):
+            copy_to_drive(stick, "A", FILES)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """Mount a read-only file system at a folder; only root can."""
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "ro", "none", folder], capture_output=True)
+    if mounted.returncode != 0:
+        pytest.skip("only root can mount")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_no_answer_about_drives_has_a_folder(rig: Any, visit: Any, stick: Path) -> None:
+    listed = rig.request("GET", "/api/exports").text
+    order = {"key": next(keys), "folder": drive_id(stick)}
+    copied = rig.request("POST", f"/api/visits/{visit['id']}/export", json=order).text
+    shutil.rmtree(stick)
+    gone = rig.request("POST", f"/api/visits/{visit['id']}/export", json={**order, "key": next(keys)}).text
+    assert str(stick.parent) not in listed + copied + gone

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from device.clock import VirtualClock
-from device.errors import InputError
+from device.errors import InputError, StoreError
 from services.errors import StoreDamaged
 from services.health.alerts import Alert
-from services.http.problem_responses import problem_body
+from services.http.problem_responses import problem_body, problem_response
 from services.http.routes.visits import visit_answer
 from services.http.schemas.captures import capture_answer, report_answer
 from services.http.schemas.status import AlertAnswer
@@ -65,3 +65,18 @@ def test_a_visit_with_an_impossible_answer_is_damaged(tmp_path: Path) -> None:
     visit = Visit("v1", "A1", "2026-03-01", datetime(2026, 3, 1, tzinfo=UTC), {"age": {"years": 1}}, slots)
     with CaptureStore(tmp_path, reserve_bytes=0) as store, pytest.raises(StoreDamaged, match="v1"):
         visit_answer(visit, VisitRepository(store.engine, load_protocol(), VirtualClock()))
+
+
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("the disk refused: [Errno 28] No space left on device: '/data/store/captures/.a.part/b.json'",
+         "the disk refused: [Errno 28] No space left on device: 'b.json'"),
+        ("/boot/chooser/diffuscope.toml, line 3: no", "diffuscope.toml, line 3: no"),
+        ("'/media/me/USB STICK/a b.tiff' and /srv/x/y.npy", "'a b.tiff' and y.npy"),
+        ("GET /api/nothing/x: Not Found", "GET /api/nothing/x: Not Found"),
+        ("https://reader.org/inbox/a answers 5 / 6 of 1/2", "https://reader.org/inbox/a answers 5 / 6 of 1/2"),
+    ],
+)  # fmt: skip
+def test_a_message_names_files_without_their_folders(message: str, shown: str) -> None:
+    assert json.loads(problem_response(StoreError(message)).body)["message"] == shown

@@ -257,6 +257,7 @@ export const ENGLISH = {
   "film.zip": "Save as a file (ZIP)",
   "film.copy": "Copy to USB",
   "film.copied": "Copied to {folder}.",
+  "film.readonly": "{name} (read-only)",
   "film.nofolder": "No USB stick found. Put one in.",
   "film.zipped": "Saved by this tablet. Look in its downloads.",
   "compare.title": "Compare",

@@ -207,6 +207,7 @@ export const WORDS = {
   "film.zip": "फ़ाइल में सहेजें (ZIP)",
   "film.copy": "USB पर कॉपी",
   "film.copied": "{folder} में कॉपी हो गया।",
+  "film.readonly": "{name} (केवल पढ़ने के लिए)",
   "film.nofolder": "USB स्टिक नहीं मिली। एक लगाएँ।",
   "compare.title": "तुलना",
   "compare.side": "साथ-साथ",

@@ -217,6 +217,7 @@ export const WORDS = {
   "film.zip": "கோப்பாகச் சேமி (ZIP)",
   "film.copy": "USB-க்கு நகலெடு",
   "film.copied": "{folder} இல் நகலெடுக்கப்பட்டது.",
+  "film.readonly": "{name} (படிக்க மட்டும்)",
   "film.nofolder": "USB இல்லை. ஒன்றைச் செருகவும்.",
   "compare.title": "ஒப்பிடு",
   "compare.side": "அருகருகே",

@@ -207,6 +207,7 @@ export const WORDS = {
   "film.zip": "ఫైల్‌గా భద్రపరచు (ZIP)",
   "film.copy": "USB కి కాపీ",
   "film.copied": "{folder} లోకి కాపీ అయింది.",
+  "film.readonly": "{name} (చదవడానికి మాత్రమే)",
   "film.nofolder": "USB దొరకలేదు. ఒకటి పెట్టండి.",
   "compare.title": "పోలిక",
   "compare.side": "పక్కపక్కన",

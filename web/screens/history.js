@@ -147,8 +147,13 @@ function exportControls(visit, { folders, copied, zipped }, actions) {
       <a class="button" href=${visitZipUrl(visit.id)} download @click=${actions.zipped}>${t("film.zip")}</a>
       <button type="button" id="copy" @click=${actions.listFolders}>${t("film.copy")}</button>
       ${(folders ?? []).map(
-        (stick) => html`<button type="button" data-folder=${stick.id} @click=${() => actions.copyTo(stick)}>
-          ${stick.name}
+        (stick) => html`<button
+          type="button"
+          data-folder=${stick.id}
+          ?disabled=${!stick.is_writable}
+          @click=${() => actions.copyTo(stick)}
+        >
+          ${stick.is_writable ? stick.name : t("film.readonly", stick)}
         </button>`,
       )}
     </div>

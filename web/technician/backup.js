@@ -111,8 +111,8 @@ const progressBar = ({ done, total }) => html`<label class="progress">${t("backu
 
 const driveButtons = (sticks, actions) => html`<div class="row">
   ${sticks?.length
-    ? sticks.map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} @click=${() => actions.begin(stick)}>
-        ${t("backup.to", { name: stick.name })}
+    ? sticks.map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} ?disabled=${!stick.is_writable} @click=${() => actions.begin(stick)}>
+        ${stick.is_writable ? t("backup.to", { name: stick.name }) : t("film.readonly", stick)}
       </button>`)
     : html`<button class="primary" type="button" id="back-up" @click=${actions.listDrives}>${t("backup.begin")}</button>`}
   <button type="button" id="new-passphrase" @click=${actions.choose}>${t("backup.choose")}</button>

@@ -66,8 +66,8 @@ function view({ entries, warningsOnly, about, folders, message, error }, actions
       <button type="button" aria-pressed=${warningsOnly} @click=${actions.warningsOnly}>${t("diary.worst")}</button>
       <a class="button" href="/api/technician/diary.txt" download @click=${actions.saved}>${t("diary.save")}</a>
       <button type="button" id="to-usb" @click=${actions.listDrives}>${t("film.copy")}</button>
-      ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} @click=${() => actions.copy(stick)}>
-        ${stick.name}
+      ${(folders ?? []).map((stick) => html`<button class="primary" type="button" data-folder=${stick.id} ?disabled=${!stick.is_writable} @click=${() => actions.copy(stick)}>
+        ${stick.is_writable ? stick.name : t("film.readonly", stick)}
       </button>`)}
     </div>
     ${error ? html`<p class="bad" role="alert">${error}</p>` : nothing}

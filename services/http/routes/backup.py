@@ -44,10 +44,10 @@ def backup_routes(runner: BackupRunner, store: CaptureStore, drives: UsbDrives, 
     def begin(order: BackupRequest) -> FolderName:
         """Begin a backup to a USB drive; its progress, and later its error, are in the state.
 
-        Answers with the path of the drive; 503 if it was removed, 409 during another backup.
+        Answers with the name of the drive; 503 if it was removed, 409 during another backup.
         """
         place = drives.mounted_folder(order.folder)
         runner.begin(place)
-        return FolderName(folder=str(place))
+        return FolderName(folder=place.name)
 
     return router

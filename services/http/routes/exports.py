@@ -4,11 +4,11 @@ from pathlib import Path
 
 from fastapi import APIRouter
 
-from services.delivery.usb_drives import UsbDrives, copy_to_drive
+from services.delivery.usb_drives import UsbDrive, UsbDrives, copy_to_drive
 from services.delivery.visit_export import export_files, folder_name, zip_archive
 from services.http.media import ZipResponse, file_responses
 from services.http.schemas.common import FolderName
-from services.http.schemas.exports import UsbDrive, UsbDriveList, VisitExport
+from services.http.schemas.exports import UsbDriveAnswer, UsbDriveList, VisitExport
 from services.records.capture_store import CaptureStore
 from services.records.export_records import ExportRecords
 from services.records.visit import Visit
@@ -21,13 +21,8 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
 
     @router.get("/api/exports")
     def exports() -> UsbDriveList:
-        """List the USB drives that are present, with their free space in bytes."""
-        return UsbDriveList(
-            folders=[
-                UsbDrive(id=str(drive.folder), name=drive.folder.name, free_bytes=drive.free_bytes)
-                for drive in drives.present()
-            ]
-        )
+        """List the USB drives that are present, with their free space in bytes, and whether they can be written."""
+        return UsbDriveList(folders=[_listed(drive) for drive in drives.present()])
 
     @router.get("/api/visits/{id}/export.zip", response_class=ZipResponse, responses=file_responses("application/zip"))
     def download(id: str) -> ZipResponse:
@@ -41,8 +36,8 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
     def copy_visit(id: str, order: VisitExport) -> FolderName:
         """Copy a visit to a USB drive.
 
-        Answers with the path of the new folder; 404 for an unknown visit, 503 if the drive was removed, 507 if it is
-        full.
+        Answers with the drive's name and the new folder on it; 404 for an unknown visit, 503 if the drive was removed
+        or can only be read, 507 if it is full.
         """
         visit = repository.get(id)
         key, request = order.key, f"export {id} {order.folder}"
@@ -54,9 +49,15 @@ def exports_router(repository: VisitRepository, store: CaptureStore, drives: Usb
     return router
 
 
+def _listed(drive: UsbDrive) -> UsbDriveAnswer:
+    return UsbDriveAnswer(
+        id=drive.id, name=drive.folder.name, free_bytes=drive.free_bytes, is_writable=drive.is_writable
+    )  # fmt: skip
+
+
 def _copied(store: CaptureStore, repository: VisitRepository, visit: Visit, drive: Path) -> str:
-    """Copy a visit to a drive and record the export of a finished one; return the path of the new folder."""
+    """Copy a visit to a drive and record the export of a finished one; return the drive's name and the folder on it."""
     folder = copy_to_drive(drive, folder_name(visit), export_files(store, visit, repository.undo_until(visit)))
     if visit.finished_at is not None and store.refusal is None:
         ExportRecords(store.folder).write(visit.id, visit.finished_at, repository.clock.wall())
-    return str(folder)
+    return f"{drive.name}/{folder.name}"

@@ -1,5 +1,6 @@
 """Bases and shared types of all request and response bodies."""
 
+import re
 from datetime import datetime
 from typing import Annotated, TypeVar
 
@@ -20,6 +21,18 @@ Value = TypeVar("Value")
 OmittedIfNone = Annotated[
     Value | None, Field(exclude_if=lambda value: value is None)
 ]  # the key is absent without a value
+
+
+# Absolute paths, in quotation marks or without spaces, down to their last part; no URL, and no endpoint.
+_FOLDERS = re.compile(r"""(?<=['"])/(?:[^'"/]+/)+(?=[^'"/]*['"])|(?<![\w.:/\]])/(?!api/|web/)(?:[^\s'"/:;,]+/)+""")
+
+
+def without_folders(text: str) -> str:
+    """Return a text in which the name of a file stands for its path: who has no login learns nothing of the disk."""
+    return _FOLDERS.sub("", text)
+
+
+PublicText = Annotated[str, PlainSerializer(without_folders, return_type=str)]
 
 
 class RequestBody(BaseModel):

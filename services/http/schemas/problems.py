@@ -1,14 +1,14 @@
 """Problem responses: the JSON body of every 4xx and 5xx answer, and errors inside other bodies."""
 
-from services.http.schemas.common import OmittedIfNone, ResponseBody
+from services.http.schemas.common import OmittedIfNone, PublicText, ResponseBody
 
 
 class ErrorText(ResponseBody):
     """An error: stable error code, description, and the action for the user."""
 
     code: str
-    message: str
-    remedy: str
+    message: PublicText
+    remedy: PublicText
 
 
 class ProblemResponse(ErrorText):

@@ -6,7 +6,7 @@ from pydantic import PlainSerializer
 
 from device.values import Eye
 from services.health.alerts import AlertCode
-from services.http.schemas.common import OmittedIfNone, ResponseBody
+from services.http.schemas.common import OmittedIfNone, PublicText, ResponseBody
 from services.http.schemas.problems import ProblemResponse
 
 SignificantDigits = Annotated[float, PlainSerializer(lambda number: float(f"{number:.4g}"), return_type=float)]
@@ -78,9 +78,9 @@ class CheckAnswer(ResponseBody):
 
     name: str
     ok: bool
-    value: str
+    value: PublicText
     limit: str
-    remedy: str
+    remedy: PublicText
     of_release: bool
     known: bool
 
