@@ -52,6 +52,8 @@ def with_dng_levels(page: tifffile.TiffPage, stored: Pixels, orientation: int, n
     pixels = _cut(pixels, (top, left, bottom - top, right - left), "ActiveArea", name)
     white = _white(page, name)
     pixels, black = _without_black_pattern(page, pixels, white, name)
+    if white is not None and black is not None and white <= black:
+        raise FrameError(f"{name} has the WhiteLevel {white:g} below the BlackLevel {black:g}", SAVE_MOSAIC)
     filters = _filters(page, name)
     origin = _whole(page, "DefaultCropOrigin", (0, 0), name)
     crop = _whole(page, "DefaultCropSize", (pixels.shape[1], pixels.shape[0]), name)

@@ -25,7 +25,7 @@ _ALPHA = (1, 2)  # ExtraSamples: associated and unassociated alpha; 0 is unspeci
 # Tags that change the meaning of values or their places, with the value that changes nothing (None: there is none).
 _NOT_APPLIED: dict[int, tuple[str, tuple[float, ...] | None]] = {
     291: ("GrayResponseCurve", None), 301: ("TransferFunction", None), 433: ("Decode", None),
-    346: ("Indexed", (0,)), 32997: ("ImageDepth", (1,)),
+    346: ("Indexed", (0,)), 532: ("ReferenceBlackWhite", (0, 255, 0, 255, 0, 255)), 32997: ("ImageDepth", (1,)),
     50711: ("CFALayout", (1,)), 50718: ("DefaultScale", (1, 1)), 50974: ("SubTileBlockSize", (1, 1)),
     50975: ("RowInterleaveFactor", (1,)), 52547: ("ColumnInterleaveFactor", (1,)),
     51125: ("DefaultUserCrop", (0, 0, 1, 1)),
@@ -76,11 +76,13 @@ def _meant_pages(tiff: tifffile.TiffFile, name: str, dng: bool) -> list[tifffile
             f"{name} holds only a copy of reduced resolution (NewSubfileType {pages[0].subfiletype})",
             "Give the file with the image of full resolution.",
         )
-    shapes = sorted({(page.imagelength, page.imagewidth, page.samplesperpixel) for page in meant})
+    shapes = {
+        f"{page.imagelength} x {page.imagewidth} x {page.samplesperpixel}, {page.bitspersample} bits" for page in meant
+    }
     if len(shapes) > 1:
-        sizes = ", ".join(f"{rows} x {cols} x {samples}" for rows, cols, samples in shapes)
         raise FrameError(
-            f"{name} holds {len(meant)} images of different sizes ({sizes}), and none is marked as a reduced copy",
+            f"{name} holds {len(meant)} images of different sizes or types ({'; '.join(sorted(shapes))}), and none is "
+            "marked as a reduced copy",
             "Save the image that is meant as a file of its own.",
         )
     return meant
@@ -101,9 +103,10 @@ def _refuse_frames_beyond_pages(tiff: tifffile.TiffFile, pages: int, name: str) 
 def _content(page: tifffile.TiffPage, first: tifffile.TiffPage, name: str) -> TiffContent:
     """Return the pixels of a page as its tags say; a DNG states the orientation in its first page."""
     _refuse_tags(page, name)
-    values = _without_alpha(page, stored_values(page, name), name)
+    kind = _meaning(page, name)
+    values = _without_alpha(page, kind, stored_values(page, name), name)
     _refuse_missing(page, values, name)
-    pixels = _interpreted(page, values, name)
+    pixels = _interpreted(page, kind, values, name)
     turned = page.tags.get("Orientation") or first.tags.get("Orientation")
     orientation = 1 if turned is None else int(turned.value)
     if page.photometric in _RAW:
@@ -138,52 +141,57 @@ def _refuse_missing(page: tifffile.TiffPage, values: Pixels, name: str) -> None:
         )
 
 
-def _without_alpha(page: tifffile.TiffPage, values: Pixels, name: str) -> Pixels:
+def _without_alpha(page: tifffile.TiffPage, kind: int, values: Pixels, name: str) -> Pixels:
     """Return values without an opaque alpha channel; FrameError for transparent pixels and for unspecified channels.
 
     Three channels of which none is alpha stay, whether they are stated as colours or not.
     """
-    if values.ndim == 2 or page.photometric == tifffile.PHOTOMETRIC.LINEAR_RAW:
+    if values.ndim == 2 or kind == tifffile.PHOTOMETRIC.LINEAR_RAW:
         return values
-    colours = 3 if page.photometric == _RGB else 1
-    kinds = (*(int(kind) for kind in page.extrasamples), *(0,) * values.shape[2])[: values.shape[2] - colours]
-    if values.shape[2] < colours or (any(kind not in _ALPHA for kind in kinds) and values.shape[2] != 3):
+    colours = 3 if kind == _RGB else 1
+    extras = (*(int(extra) for extra in page.extrasamples), *(0,) * values.shape[2])[: values.shape[2] - colours]
+    if values.shape[2] < colours or (any(extra not in _ALPHA for extra in extras) and values.shape[2] != 3):
         raise FrameError(
             f"{name} has {values.shape[2]} channels (SamplesPerPixel), of which its tags describe {colours}",
             "Save it with one channel or three.",
         )
     opaque = 1 if values.dtype.kind == "f" else 2 ** int(page.bitspersample) - 1
-    for extra, kind in enumerate(kinds, colours):
-        if kind in _ALPHA and bool((values[..., extra] != opaque).any()):
+    for place, extra in enumerate(extras, colours):
+        if extra in _ALPHA and bool((values[..., place] != opaque).any()):
             raise FrameError(
                 f"{name} has transparent pixels (alpha channel), which are no counts",
                 "Save it without transparency.",
             )
-    kept = [*range(colours), *(extra for extra, kind in enumerate(kinds, colours) if kind not in _ALPHA)]
+    kept = [*range(colours), *(place for place, extra in enumerate(extras, colours) if extra not in _ALPHA)]
     return values[..., 0] if len(kept) == 1 else values[..., kept]
 
 
-def _interpreted(page: tifffile.TiffPage, values: Pixels, name: str) -> Pixels:
-    """Return counts of which more is brighter: min-is-white inverted, a palette looked up; FrameError for the others.
-
-    A missing PhotometricInterpretation is grey or red, green, blue, as in libtiff.
-    """
-    stated = page.tags.get("PhotometricInterpretation")
-    kind = _BLACK_IS_ZERO if stated is None else int(stated.value)
-    if kind in (_BLACK_IS_ZERO, _RGB, *_RAW):
-        return values
-    if kind == _WHITE_IS_ZERO and values.dtype.kind == "u":
-        return np.asarray(values.dtype.type(2 ** int(page.bitspersample) - 1) - values)
-    if kind == _PALETTE and values.dtype.kind == "u" and values.ndim == 2 and page.colormap is not None:
-        return looked_up(values, np.asarray(page.colormap).T)
+def _meaning(page: tifffile.TiffPage, name: str) -> int:
+    """Return the PhotometricInterpretation of a page, grey if not stated; FrameError for one that is not read."""
+    tag = page.tags.get("PhotometricInterpretation")
+    kind = _BLACK_IS_ZERO if tag is None else int(tag.value)
+    signed = page.sampleformat not in (1, 4)
+    if kind in (_BLACK_IS_ZERO, _RGB, *_RAW) or (kind in (_WHITE_IS_ZERO, _PALETTE) and not signed):
+        return kind
     try:
         word = tifffile.PHOTOMETRIC(kind).name
     except ValueError:
         word = "unknown"
     raise FrameError(
-        f"{name} has values of type {values.dtype} that mean {word} (PhotometricInterpretation {kind})",
+        f"{name} has values of SampleFormat {page.sampleformat} that mean {word} (PhotometricInterpretation {kind})",
         "Save it as grey (min-is-black) or as red, green and blue.",
     )
+
+
+def _interpreted(page: tifffile.TiffPage, kind: int, values: Pixels, name: str) -> Pixels:
+    """Return counts of which more is brighter: min-is-white inverted, a palette looked up."""
+    if kind == _WHITE_IS_ZERO:
+        return np.asarray(values.dtype.type(2 ** int(page.bitspersample) - 1) - values)
+    if kind == _PALETTE:
+        if page.colormap is None or values.ndim > 2:
+            raise FrameError(f"{name} has no whole palette (PhotometricInterpretation 3)", "Save it as grey.")
+        return looked_up(values, np.asarray(page.colormap).T)
+    return values
 
 
 def looked_up(indices: Pixels, table: NDArray[np.uint16]) -> Pixels:

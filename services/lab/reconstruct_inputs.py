@@ -331,7 +331,7 @@ def load_calibrations(
     black_dn = loaded.black_dn or 0.0
     sensor = Sensor(black_dn, white_dn=raw.white_dn) if spec is None else _sensor(spec.camera, raw)
     dark = None if options.dark is None else companion(options.dark, "the dark frame", loaded)
-    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded)
+    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded, above_black=True)
     simulated = loaded.simulated or (spec is not None and spec.camera.backend == "sim")
     return tuple(
         Calibration(
@@ -404,7 +404,7 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     known = "white_dn" not in kept.provenance.unknown
     white_dn = min(found.sensor.white_dn, raw.white_dn) if known else raw.white_dn
     dark = None if options.dark is None else companion(options.dark, "the dark frame", loaded)
-    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded)
+    flat = None if options.flat is None else companion(options.flat, "the flat frame", loaded, above_black=True)
     return replace(
         found,
         sensor=replace(found.sensor, white_dn=white_dn),
@@ -415,14 +415,19 @@ def _archived(place: str, options: ReconstructOptions, loaded: LoadedRaw) -> Cal
     )
 
 
-def companion(source: Source, what: str, loaded: LoadedRaw) -> Image:
+def companion(source: Source, what: str, loaded: LoadedRaw, above_black: bool = False) -> Image:
     """Return a dark or flat frame in the counts of its raw frame, divided by `2**raw.shift`; NaN where it is saturated.
 
-    (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3). FrameError for one that is saturated
-    in more than MOST_BAD of its pixels, or has another shape.
+    (rows, cols), with colours averaged; of a mosaic the planes, (rows, cols, 3). `above_black`: the black level that
+    its file states is subtracted. FrameError for one that is saturated in more than MOST_BAD of its pixels, or has
+    another shape.
     """
     name = name_of(source, what)
-    pixels = as_companion(only_frame(_read(source, name).frames, name), name) / np.float32(2**loaded.raw.shift)
+    file = _read(source, name)
+    pixels = as_companion(only_frame(file.frames, name), name)
+    if above_black:
+        pixels = pixels - np.float32(file.levels.black_dn or 0)
+    pixels = pixels / np.float32(2**loaded.raw.shift)
     pixels = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
     if pixels.shape != loaded.shape:
         raise FrameError(

@@ -185,6 +185,15 @@ def test_label_of_a_mosaic_is_believed_only_with_the_pixels_of_one(tmp_path: Pat
     assert not any("mosaic" in warning for warning in forced.report.warnings)
 
 
+def test_black_level_of_a_dng_is_no_light_of_its_flat_frame(tmp_path: Path) -> None:
+    falloff = np.linspace(400, 2400, SHAPE[1])[None] + np.zeros(SHAPE)
+    raw = write_dng(tmp_path / "raw.dng", np.rint(scene() * falloff / 2400).astype(np.uint16))
+    flat = write_dng(tmp_path / "flat.dng", np.rint(falloff).astype(np.uint16))
+    made = reconstruct_file(options(raw, [caustic()], flat=flat, bayer="none")).picture
+    expected = reconstruct_file(options(scene(), [caustic()])).picture
+    assert np.corrcoef(made.ravel(), expected.ravel())[0, 1] > 0.999
+
+
 def test_stack_in_one_file_is_a_choice_of_depths(folder: Path) -> None:
     stack = np.stack([caustic()[::-1], caustic(), caustic()[:, ::-1]])
     np.save(folder / "stack.npy", stack)

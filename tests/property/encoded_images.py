@@ -319,6 +319,10 @@ def second_page(**tags: float) -> Callable[[Draft], None]:
     return lambda draft: draft.after.append((draft.stored[:20], {254: ("I", (tags.get("kind", 0),))}))
 
 
+def inks(draft: Draft) -> None:
+    draft.stored, draft.tags[262] = np.concatenate([draft.stored] * 4, axis=2), ("H", (5,))
+
+
 def without_codec(draft: Draft) -> None:
     draft.writer.predictor = 2
 
@@ -333,7 +337,7 @@ REFUSED: dict[str, tuple[str, Callable[[Draft], None]]] = {
     "one bit": ("one bit", tagged(258, "H", 1)), "signed min-is-white": ("MINISWHITE", signed_white_is_zero),
     "transfer function": ("TransferFunction", tagged(301, "H", *range(256))),
     "grey response": ("GrayResponseCurve", tagged(291, "H", *range(256))),
-    "cmyk": ("SEPARATED", tagged(262, "H", 5)), "lab": ("CIELAB", tagged(262, "H", 8)),
+    "cmyk": ("SEPARATED", inks), "lab": ("CIELAB", tagged(262, "H", 8)),
     "ycbcr": ("YCBCR", tagged(262, "H", 6)), "orientation 9": ("orientation 9", tagged(274, "H", 9)),
     "depth": ("ImageDepth", tagged(32997, "I", 3)), "missing value": ("GDAL_NODATA", tagged(42113, "s", *b"20\0")),
     "only a preview": ("reduced resolution", tagged(254, "I", 1)), "mask": ("transparency mask", second_page(kind=4)),
@@ -432,6 +436,8 @@ REFUSED_DNG: dict[str, tuple[str, Callable[[Draft], None]]] = {
     "layout": ("CFALayout", tagged(50711, "H", 2)), "scale": ("DefaultScale", tagged(50718, "2I", 2, 1, 1, 1)),
     "opcodes": ("OpcodeList2", tagged(51009, "B", 0, 0, 0, 1, 0, 0, 0, 9)),
     "zero white": ("WhiteLevel", tagged(50717, "I", 0)),
+    "white below black": ("below the BlackLevel", lambda draft: draft.tags.update(
+        {50714: ("I", (900,)), 50717: ("I", (800,))})),
     "area outside": ("ActiveArea", tagged(50829, "I", 0, 0, 900, 900)),
     "half a pixel": ("DefaultCropOrigin", tagged(50719, "2I", 1, 2, 3, 1)),
     "blacks that do not fit": ("BlackLevel", tagged(50714, "I", 1, 2, 3)),
