@@ -523,8 +523,11 @@ def simulate(
     everything: Annotated[bool, typer.Option("--all", help="Simulate all effects, seen or not.")] = False,
     only: Annotated[list[str] | None, typer.Option(help="Simulate just this effect; may be repeated.")] = None,
     without: Annotated[list[str] | None, typer.Option(help="Leave this effect out; may be repeated.")] = None,
+    frames: Annotated[
+        int, typer.Option(help="Frames of one burst: the same diffuser and eye, new noise and motion.")
+    ] = 1,
 ) -> None:
-    """Write what the camera would give for a scene: raw.tiff, truth.npy, psf.tiff, plan.json.
+    """Write what the camera would give for a scene: raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, plan.json.
 
     Only the effects that the scene calls for are simulated; the plan says for each which number decided.
     """
@@ -537,8 +540,9 @@ def simulate(
         return
     if output is None:
         raise typer.BadParameter("give -o FOLDER to write into, or --explain to see the plan only")
-    typer.echo(simulate_scene.write_scene(spec, output, selected))
-    typer.echo(f"{output}: raw.tiff, truth.npy, psf.tiff, plan.json")
+    typer.echo(simulate_scene.write_scene(spec, output, selected, frames))
+    more = "" if frames == 1 else f", ..., raw-{frames}.tiff"
+    typer.echo(f"{output}: raw.tiff{more}, truth.npy, psf.tiff, plan.json")
 
 
 @app.command()
@@ -757,6 +761,6 @@ def main(words: list[str] | None = None) -> None:
         missing = [extra for extra, packages in extras.items() if package in packages]
         if not missing:
             raise
-        remedy = f'Install it with: pip install "diffuscope[{missing[0]}]"'
+        remedy = f'Install it with: pip install "diffuscope[{missing[0]}]", in a clone: pip install ".[{missing[0]}]"'
         typer.echo(f"error: this command needs {error.name}, which is not installed\n{remedy}", err=True)
         sys.exit(2)

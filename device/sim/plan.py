@@ -44,8 +44,11 @@ def decide(
 
     By default the effects with eta >= 0.05 are simulated. `everything` selects all effects, `only` just those named;
     `without` excludes those named in every case. `effects`: those to decide; None: the built-in ones, then those of
-    plug-ins that the scene names. SettingError for a name that no effect has, or for a plug-in that fails.
+    plug-ins that the scene names. SettingError for `everything` with `only`, for a name that no effect has, or for a
+    plug-in that fails.
     """
+    if everything and only:
+        raise SettingError("all effects and single ones cannot both be selected", "Give --all or --only, not both.")
     effects = effects_of(scene) if effects is None else effects
     _refuse_unknown_names([*only, *without], [effect.name for effect in effects])
     decisions = []
@@ -74,6 +77,10 @@ def format_plan(decisions: Sequence[Decision], spent_ms: dict[str, float] | None
         cost = "" if spent_ms is None or not one.simulated else f"{spent_ms.get(one.name, 0.0):.0f}"
         eta = "0" if one.eta == 0 else f"{one.eta:.3g}"
         lines.append(f"{one.name:<14} {'simulated' if one.simulated else 'skipped':<9} {eta:>8} {cost:>7}  {one.why}")
+    lines.append(
+        f"eta: change of the picture over its noise; without --all, --only and --without, effects from "
+        f"{ETA_THRESHOLD:g} (1/20) on are simulated"
+    )
     return "\n".join(lines)
 
 

@@ -1,6 +1,7 @@
 """One simulated exposure with its ground truth, in memory or as files with the plan of its effects."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from device.clock import VirtualClock
 from device.config.head_file import InstrumentSpec
 from device.config.marked_files import png_bytes, tiff_bytes, write_npy
-from device.errors import StoreError
+from device.errors import SettingError, StoreError
 from device.sim.camera import SimCamera
 from device.sim.eyes import EffectSelector
 from device.sim.light import SimLight
@@ -19,6 +20,8 @@ from device.sim.render import crop_or_pad
 from device.sim.simulated_calibration import simulated_calibration
 from device.sim.world import World
 from device.values import Calibration, Counts, ExposureSettings, Illumination, Image, Mask
+
+MOST_FRAMES = 64  # of one burst
 
 
 @dataclass(frozen=True)
@@ -44,24 +47,26 @@ def simulate_exposure(spec: InstrumentSpec) -> SimulatedExposure:
     return SimulatedExposure(counts, world.truth(colour), vessels, simulated_calibration(world))
 
 
-def simulate(spec: InstrumentSpec, folder: Path, choose: EffectSelector = decide) -> World:
-    """Expose one lit frame in the picture's colour, write it with its ground truth, and return its simulated world.
+def simulate(spec: InstrumentSpec, folder: Path, choose: EffectSelector = decide, count: int = 1) -> World:
+    """Expose `count` lit frames in the picture's colour, write them with their truth, and return their simulated world.
 
     Files and StoreError as in `write`. SpecError for a spec without [optics] or [sim].
     """
-    world, counts = expose(spec, choose)
-    write(world, counts, folder)
+    world, frames = expose(spec, choose, count)
+    write(world, frames, folder)
     return world
 
 
-def expose(spec: InstrumentSpec, choose: EffectSelector = decide) -> tuple[World, Counts]:
-    """Return the simulated world of a scene, and one lit frame in the picture's colour: counts, (rows, cols).
+def expose(spec: InstrumentSpec, choose: EffectSelector = decide, count: int = 1) -> tuple[World, tuple[Counts, ...]]:
+    """Return the simulated world of a scene, and `count` lit frames in the picture's colour: counts, (rows, cols).
 
-    SpecError for a spec without [optics] or [sim].
+    The frames are one burst: one diffuser and one eye, which moves as the scene says, each with noise of its own.
+    SpecError for a spec without [optics] or [sim], SettingError for a count outside 1 to MOST_FRAMES.
     """
+    if not 1 <= count <= MOST_FRAMES:
+        raise SettingError(f"{count} frames cannot be simulated at once", f"Give 1 to {MOST_FRAMES} frames.")
     world = World(spec, VirtualClock(), choose=choose)
-    (counts,) = lit_frames(world)
-    return world, counts
+    return world, lit_frames(world, count)
 
 
 def lit_frames(world: World, count: int = 1) -> tuple[Counts, ...]:
@@ -75,18 +80,20 @@ def lit_frames(world: World, count: int = 1) -> tuple[Counts, ...]:
         return tuple(camera.expose(ExposureSettings(spec.camera.exposure_s)).counts for _ in range(count))
 
 
-def write(world: World, counts: Counts, folder: Path) -> None:
-    """Write a frame of a simulated world with its ground truth.
+def write(world: World, frames: Sequence[Counts], folder: Path) -> None:
+    """Write the frames of a simulated world with their ground truth, which is that of the first frame.
 
-    Files: raw.tiff, uint16; truth.npy (reflectance) and psf.tiff (noise-free PSF of this eye), float32 on the sensor
-    grid (rows, cols); vessels.png if the vessels are known; plan.json. The pictures are marked as simulated.
-    StoreError if the folder cannot be written.
+    Files: raw.tiff and, of further frames, raw-2.tiff and so on, uint16; truth.npy (reflectance) and psf.tiff
+    (noise-free PSF of this eye), float32 on the sensor grid (rows, cols); vessels.png if the vessels are known;
+    plan.json. The pictures are marked as simulated. StoreError if the folder cannot be written.
     """
     colour = world.spec.light.colour
     plan = plan_as_json(world.plan, world.setup(colour).spent_ms)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "raw.tiff").write_bytes(tiff_bytes(counts, True))
+        for number, counts in enumerate(frames, 1):
+            name = "raw.tiff" if number == 1 else f"raw-{number}.tiff"
+            (folder / name).write_bytes(tiff_bytes(counts, True))
         write_npy(folder / "truth.npy", world.truth(colour), True)
         (folder / "psf.tiff").write_bytes(tiff_bytes(crop_or_pad(world.psf(colour), world.shape), True))
         _write_vessels(world, folder / "vessels.png")

@@ -172,9 +172,10 @@ class ForwardModel:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """One simulated exposure with its ground truth, all (rows, cols) of the sensor.
+    """Simulated exposures with their ground truth, all (rows, cols) of the sensor.
 
-    `raw`: counts, uint16, of a type that marks pictures made of it as simulated. `truth`: reflectance of the object,
+    `raw`: counts, uint16, of a type that marks pictures made of it as simulated. `frames`: the frames of the burst, of
+    which `raw` is the first. `truth`: reflectance of the object,
     float32. `psf`: noise-free PSF of the present eye, float32. `vessels`: mask of the vessels, None if not known.
     `plan`: decision on every effect, by its name. `write` keeps all of it in files.
     """
@@ -185,6 +186,7 @@ class SimulatedScene:
     psf: Image
     vessels: Mask | None
     plan: Mapping[str, Decision]
+    frames: tuple[SimulatedCounts, ...]
     world: World = field(repr=False)
 
     def explain(self) -> str:
@@ -192,30 +194,33 @@ class SimulatedScene:
         return format_plan(tuple(self.plan.values()))
 
     def write(self, folder: str | Path) -> None:
-        """Write raw.tiff, truth.npy, psf.tiff, vessels.png and plan.json into a folder; StoreError on failure."""
-        scene_files.write(self.world, np.asarray(self.raw), Path(folder))
+        """Write raw.tiff (raw-2.tiff, ...), truth.npy, psf.tiff, vessels.png and plan.json; StoreError on failure."""
+        scene_files.write(self.world, [np.asarray(one) for one in self.frames], Path(folder))
 
 
 def simulate(
-    scene: str | Path, *, everything: bool = False, only: Sequence[str] = (), without: Sequence[str] = ()
-) -> SimulatedScene:
-    """Return one simulated exposure of a scene, with its ground truth.
+    scene: str | Path, *, everything: bool = False, only: Sequence[str] = (), without: Sequence[str] = (),
+    frames: int = 1,
+) -> SimulatedScene:  # fmt: skip
+    """Return simulated exposures of a scene, with their ground truth.
 
     `scene`: a scene file, or the name of one of device/sim/scenes/, such as "healthy". Only the effects that could be
-    seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. SettingError for an
-    unknown scene or effect, SpecError for an invalid scene file.
+    seen are simulated; `everything`, `only` and `without` (names of effects) overrule the plan. `frames`: number
+    of exposures of one burst, with the same diffuser and eye, and new noise and motion. SettingError for an unknown
+    scene or effect, or for `everything` with `only`; SpecError for an invalid scene file.
     """
     spec = load_head(scene_file(scene))
-    world, counts = scene_files.expose(
-        spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without))
+    world, taken = scene_files.expose(
+        spec, lambda setting: decide(setting, everything=everything, only=tuple(only), without=tuple(without)), frames
     )
+    counts = tuple(one.view(SimulatedCounts) for one in taken)
     colour = spec.light.colour
     mask = world.retina.vessels
     return SimulatedScene(
-        name=spec.name, raw=counts.view(SimulatedCounts), truth=world.truth(colour),
+        name=spec.name, raw=counts[0], truth=world.truth(colour),
         psf=crop_or_pad(world.psf(colour), world.shape),
         vessels=None if mask is None else crop_or_pad(mask.astype(np.float32), world.shape) > 0.5,
-        plan={one.name: one for one in world.plan}, world=world,
+        plan={one.name: one for one in world.plan}, frames=counts, world=world,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""`diffuscope simulate`: plan of the effects of a scene, and one simulated exposure written as files."""
+"""`diffuscope simulate`: plan of the effects of a scene, and its simulated exposures written as files."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +27,10 @@ def explain_plan(spec: InstrumentSpec, selected: SelectedEffects) -> str:
     return format_plan(selected(Scene(spec, spec.light.colour)))
 
 
-def write_scene(spec: InstrumentSpec, folder: Path, selected: SelectedEffects) -> str:
-    """Write one exposure of a scene with its ground truth, and return its plan with the computing times as text.
+def write_scene(spec: InstrumentSpec, folder: Path, selected: SelectedEffects, count: int = 1) -> str:
+    """Write `count` exposures of a scene with their truth, and return its plan with the computing times as text.
 
     Files and errors as in `scene_files.simulate`.
     """
-    world = scene_files.simulate(spec, folder, selected)
+    world = scene_files.simulate(spec, folder, selected, count)
     return format_plan(world.plan, world.setup(spec.light.colour).spent_ms)

@@ -549,6 +549,8 @@ def test_plan_follows_threshold_and_options() -> None:
     assert all(one.simulated for one in decide(here, everything=True))
     assert [one.name for one in decide(here, only=["stray", "leds"]) if one.simulated] == ["leds", "stray"]
     assert not {one.name: one for one in decide(here, everything=True, without=["stray"])}["stray"].simulated
+    with pytest.raises(SettingError, match="cannot both be selected"):
+        decide(here, everything=True, only=["stray"])
     assert [one.name for one in decide(here)] == [effect.name for effect in EFFECTS]
     assert all(isinstance(one, Decision) for one in decide(here))
 

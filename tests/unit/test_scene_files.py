@@ -10,7 +10,8 @@ import tifffile
 from PIL import Image
 
 from device.config.head_file import load_head
-from device.errors import StoreError
+from device.config.marked_files import is_marked_simulated
+from device.errors import SettingError, StoreError
 from device.sim.effects import EFFECTS
 from device.sim.scene_files import simulate
 from tests import simulated
@@ -43,6 +44,30 @@ def test_every_scene_can_be_simulated(path, tmp_path):
         assert vessels.shape == shape
         assert set(np.unique(vessels)) == {0, 255}
         assert truth[vessels > 0].mean() < truth[(vessels == 0) & (truth > 0)].mean()
+
+
+def test_frames_of_a_burst_have_one_diffuser_and_noise_and_motion_of_their_own(tmp_path):
+    """The eye of the scene drifts; that of the other stands still, so that its frames differ by their noise only."""
+    for name, moves in (("drifting_eye.toml", True), ("healthy.toml", False)):
+        folder = tmp_path / name
+        simulate(coarse(name), folder, count=3)
+        frames = [tifffile.imread(folder / raw).astype(float) for raw in ("raw.tiff", "raw-2.tiff", "raw-3.tiff")]
+        simulate(coarse(name), tmp_path / "one")
+        assert np.array_equal(frames[0], tifffile.imread(tmp_path / "one" / "raw.tiff"))
+        for frame in frames[1:]:
+            noise_dn, blocks_dn = (frame - frames[0]).std(), blocks_of_8(frame - frames[0]).std()
+            assert noise_dn > 1
+            assert (blocks_dn > 2 * noise_dn / 8) == moves  # the mean of 64 pixels has an eighth of white noise
+    assert is_marked_simulated(folder / "raw-3.tiff")
+    for count in (0, 65):
+        with pytest.raises(SettingError, match="cannot be simulated at once"):
+            simulate(coarse("healthy.toml"), tmp_path, count=count)
+
+
+def blocks_of_8(image):
+    """Return the means of 8 x 8 pixels."""
+    rows, cols = (size // 8 for size in image.shape)
+    return image[: rows * 8, : cols * 8].reshape(rows, 8, cols, 8).mean(axis=(1, 3))
 
 
 def test_plan_json_lists_every_effect(tmp_path):
