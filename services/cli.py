@@ -24,6 +24,7 @@ from services.lab import calibration_archive
 from services.lab.archive import command as archive_command
 from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
+from services.lab.heartbeat import working
 from services.lab.montage_files import montage_files, placed_lines
 from services.lab.named_files import head_file, scene_file
 from services.lab.peers import ENVIRONMENT, installed_peer
@@ -186,16 +187,17 @@ def reconstruct(  # size: each option of the command is one declared parameter
         calibration, bin, rounds, parse_settings(setting or ()), parse_bayer(bayer), field_fixed, not no_refraction,
     )  # fmt: skip
     refuse_mixed(raws, channels, darks, each)
-    if each:
-        failed = reconstruct_each(raws, options, output, report, typer.echo, _progress)
-        raise typer.Exit(1 if failed else 0)
-    if channels:
-        made = reconstruct_colours(channels, options, darks)
-    else:
-        made = reconstruct_file(options) if len(raws) == 1 else reconstruct_burst(raws, options)
+    with working("reconstructing", _progress, SystemClock()) as beat:
+        if each:
+            failed = reconstruct_each(raws, options, output, report, typer.echo, _progress)
+            raise typer.Exit(1 if failed else 0)
+        if channels:
+            made = reconstruct_colours(channels, options, darks)
+        else:
+            made = reconstruct_file(options) if len(raws) == 1 else reconstruct_burst(raws, options)
     if report is not None:
         write_or_raise(report, lambda: report.write_text(made.report_json(), encoding="utf-8"))
-    typer.echo(f"{output}: {made.summary}")
+    typer.echo(f"{output}: {made.summary}; {beat.spent}")
     for warning in made.report.warnings:
         typer.echo(f"note: {warning}", err=True)
 
@@ -535,12 +537,14 @@ def simulate(
 
     spec = load_head(scene_file(scene))
     selected = simulate_scene.SelectedEffects(everything, tuple(only or ()), tuple(without or ()))
-    if explain:
-        typer.echo(simulate_scene.explain_plan(spec, selected))
-        return
-    if output is None:
+    if output is None and not explain:
         raise typer.BadParameter("give -o FOLDER to write into, or --explain to see the plan only")
-    typer.echo(simulate_scene.write_scene(spec, output, selected, frames))
+    with working(f"simulating {spec.name}", _progress, SystemClock()):
+        if output is None or explain:
+            typer.echo(simulate_scene.explain_plan(spec, selected))
+            return
+        plan = simulate_scene.write_scene(spec, output, selected, frames)
+    typer.echo(plan)
     more = "" if frames == 1 else f", ..., raw-{frames}.tiff"
     typer.echo(f"{output}: raw.tiff{more}, truth.npy, psf.tiff, plan.json")
 
@@ -702,7 +706,9 @@ def optics(
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
     if search:
-        typer.echo(head_search.table(chosen))
+        with working("searching", _progress, SystemClock()):
+            found = head_search.table(chosen)
+        typer.echo(found)
     else:
         typer.echo(light_report.table(chosen, frames) if light else budget.table(chosen))
     if light_svg is not None:

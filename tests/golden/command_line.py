@@ -19,6 +19,7 @@ from services.cli import app, main
 from tests.golden import compare
 from tests.golden.instrument import HEAD
 from tests.golden.normalise import Normaliser
+from tests.progress_lines import without_progress
 from tests.project_files import ROOT
 
 WIDTH = "100"
@@ -130,7 +131,10 @@ def _plain(value: Any, normaliser: Normaliser, key: str = "") -> Any:
         return value
     if key == "call":
         return normaliser.text(value)
-    lines = [normaliser.text(line.rstrip().replace(version("diffuscope"), "<version>")) for line in value.splitlines()]
+    lines = [
+        normaliser.text(line.rstrip().replace(version("diffuscope"), "<version>"))
+        for line in without_progress(value).splitlines()
+    ]
     if key == "out":
         lines = [re.sub(r"(?<![\w.])-?\d+\.\d+(e-?\d+)?(?![\w.])", "<number>", line) for line in lines]
         lines = [re.sub(r"((?:simulated|skipped) +\S+ +)\d+ ", r"\1<ms> ", line) for line in lines]

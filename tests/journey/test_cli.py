@@ -16,6 +16,7 @@ from services.http.server import bind_socket
 from services.lab.reconstruct_file import reconstruct_file
 from services.lab.reconstruct_inputs import ReconstructOptions
 from tests.journey.conftest import Diffuscope
+from tests.progress_lines import without_progress
 
 REPORT_KEYS = {  # the public interface
     "method", "bin", "rounds", "stopped", "seconds", "psf_index", "psf_scale", "psf_cylinder", "refraction_dpt",
@@ -46,7 +47,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
         printed = capsys.readouterr()
         assert ended.value.code == 2
         assert printed.out == ""
-        lines = printed.err.strip().splitlines()
+        lines = without_progress(printed.err).strip().splitlines()
         assert lines[0].startswith("error: "), printed.err
         assert len(lines) == 2, printed.err
         return printed.err
@@ -258,7 +259,8 @@ def test_refusal_of_a_process_is_two_lines_and_exit_code_2(diffuscope: Diffuscop
     done = diffuscope(*reconstruct(scene, tmp_path), "--method", "magic")
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == "error: there is no method 'magic'\nChoose one of: " + done.stderr.split(": ", 2)[2]
+    said = without_progress(done.stderr)
+    assert said == "error: there is no method 'magic'\nChoose one of: " + said.split(": ", 2)[2]
 
 
 def test_occupied_port_is_reported_before_the_head_is_opened(head_file: Path, refused: Refused, tmp_path: Path) -> None:

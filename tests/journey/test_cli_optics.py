@@ -7,6 +7,7 @@ import pytest
 
 from services import resources
 from services.cli import main
+from tests.progress_lines import without_progress
 from tests.project_files import ROOT
 
 HEADS = ROOT / "hardware" / "heads"
@@ -17,7 +18,7 @@ def printed(capsys: pytest.CaptureFixture[str], *words: object) -> str:
         main(["optics", *(str(word) for word in words)])
     output = capsys.readouterr()
     assert ended.value.code == 0, output.err
-    assert output.err == ""
+    assert without_progress(output.err) == ""
     return output.out
 
 

@@ -18,6 +18,7 @@ from scipy import ndimage, signal
 
 from services.cli import main
 from services.imaging.picture_files import to_png
+from tests.progress_lines import without_progress
 
 SHAPE = (96, 128)
 Write = Callable[[Path], list[str]]
@@ -230,7 +231,7 @@ def call(words: list[str]) -> Answer:
             main(words)
         except SystemExit as ended:
             code = ended.code
-    return Answer(code, out.getvalue(), err.getvalue())
+    return Answer(code, out.getvalue(), without_progress(err.getvalue()))
 
 
 def row(wrong: WrongInput, folder: Path, words: list[str], answer: Answer) -> str:
