@@ -24,7 +24,6 @@ from services.lab import calibration_archive
 from services.lab.archive import command as archive_command
 from services.lab.channel_options import ReconstructCommand, parse_channels, parse_darks, refuse_mixed
 from services.lab.datasets import open_dataset
-from services.lab.heartbeat import working
 from services.lab.montage_files import montage_files, placed_lines
 from services.lab.named_files import head_file, scene_file
 from services.lab.peers import ENVIRONMENT, installed_peer
@@ -34,6 +33,7 @@ from services.lab.reconstruct_colour import reconstruct_colours
 from services.lab.reconstruct_each import reconstruct_each
 from services.lab.reconstruct_file import parse_bayer, parse_settings, reconstruct_file, write_or_raise
 from services.lab.reconstruct_inputs import ReconstructOptions
+from services.lab.running_time import working
 from services.records.command import app as snapshots
 from services.records.store_command import app as store
 from services.update.command import app as update_app
@@ -75,9 +75,7 @@ def run(
     head: Annotated[Path | None, typer.Option(help="Head file; the simulated head if nothing is given.")] = None,
     replay: Annotated[Path | None, typer.Option(help="Folder with a recording, played instead of a head.")] = None,
     raw: Annotated[list[Path] | None, typer.Option(help="Raw frames of a recording, with --psf.")] = None,
-    psf: Annotated[
-        list[Path] | None, typer.Option(help="PSF of a recording, or a stack of them, or their folder.")
-    ] = None,
+    psf: Annotated[list[Path] | None, typer.Option(help="PSF of a recording; several, or a folder: a stack.")] = None,
     host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 for the whole network.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
     data: Annotated[Path | None, typer.Option(help="Where captures are kept.")] = None,
@@ -705,12 +703,10 @@ def optics(
         typer.echo(budget.comparison())
         return
     chosen = budget.design(head, sensor, eye_mm, pupil_mm)
-    if search:
-        with working("searching", _progress, SystemClock()):
-            found = head_search.table(chosen)
-        typer.echo(found)
-    else:
-        typer.echo(light_report.table(chosen, frames) if light else budget.table(chosen))
+    with working("searching" if search else "computing", _progress, SystemClock()):
+        report = head_search.table if search else budget.table
+        found = light_report.table(chosen, frames) if light and not search else report(chosen)
+    typer.echo(found)
     if light_svg is not None:
         write_or_raise(
             light_svg, lambda: light_svg.write_text(light_report.gains_svg(chosen, frames), encoding="utf-8")

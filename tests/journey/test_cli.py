@@ -259,8 +259,8 @@ def test_refusal_of_a_process_is_two_lines_and_exit_code_2(diffuscope: Diffuscop
     done = diffuscope(*reconstruct(scene, tmp_path), "--method", "magic")
     assert done.returncode == 2
     assert done.stdout == ""
-    said = without_progress(done.stderr)
-    assert said == "error: there is no method 'magic'\nChoose one of: " + said.split(": ", 2)[2]
+    printed = without_progress(done.stderr)
+    assert printed == "error: there is no method 'magic'\nChoose one of: " + printed.split(": ", 2)[2]
 
 
 def test_occupied_port_is_reported_before_the_head_is_opened(head_file: Path, refused: Refused, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numba
 import pytest
 
 from device.clock import SystemClock
-from services.lab.heartbeat import working
+from services.lab.running_time import working
 
 
 def test_a_short_computation_says_nothing() -> None:
@@ -28,6 +28,6 @@ def test_a_computation_of_a_second_is_said_and_compiled_kernels_are_counted() ->
     assert "s of them to compile kernels" in beat.spent
 
 
-def test_the_heartbeat_ends_with_an_error() -> None:
+def test_the_lines_end_with_an_error() -> None:
     with pytest.raises(ValueError, match="wrong"), working("adding", print, SystemClock()):
         raise ValueError("wrong")

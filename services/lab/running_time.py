@@ -12,7 +12,7 @@ FIRST_S, NEXT_S, LATER_S = 1.0, 3.0, 10.0  # after the start; then every LATER_S
 COMPILING = "compiling kernels, which this computer then keeps"
 
 
-class Heartbeat(event.Listener):
+class RunningTime(event.Listener):
     """Durations of a computation in seconds: of all of it, and of the compilation of kernels within it."""
 
     def __init__(self, clock: Clock) -> None:
@@ -45,10 +45,10 @@ class Heartbeat(event.Listener):
 
 
 @contextmanager
-def working(doing: str, progress: Callable[[str], None], clock: Clock) -> Iterator[Heartbeat]:
+def working(doing: str, progress: Callable[[str], None], clock: Clock) -> Iterator[RunningTime]:
     """Call `progress` with `doing` and its duration, from FIRST_S on, until the end of the computation."""
-    beat, ended = Heartbeat(clock), Event()
-    thread = Thread(target=_report, args=(doing, progress, beat, ended), name="heartbeat", daemon=True)
+    beat, ended = RunningTime(clock), Event()
+    thread = Thread(target=_report, args=(doing, progress, beat, ended), name="progress", daemon=True)
     with event.install_listener("numba:compile", beat):
         thread.start()
         try:
@@ -58,7 +58,7 @@ def working(doing: str, progress: Callable[[str], None], clock: Clock) -> Iterat
             thread.join()
 
 
-def _report(doing: str, progress: Callable[[str], None], beat: Heartbeat, ended: Event) -> None:
+def _report(doing: str, progress: Callable[[str], None], beat: RunningTime, ended: Event) -> None:
     wait_s = FIRST_S
     while not ended.wait(wait_s):
         reason = f" ({COMPILING})" if beat.compiles else ""
