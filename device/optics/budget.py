@@ -19,8 +19,8 @@ from device.optics.illumination import (
     photon_budget,
     within_simulated_range,
 )
-from device.optics.led_cap import LedCap, axis_mw_per_sr, cap_height_mm, highest_mw_per_cm2
-from device.optics.light_path import LightPath, relay_of
+from device.optics.led_cap import LedCap, axis_mw_per_sr, highest_mw_per_cm2
+from device.optics.light_path import LightPath, led_cap, relay_of
 from device.optics.matrix import (
     EMITTER_MM,
     Lamp,
@@ -70,8 +70,7 @@ class Design:
     @property
     def cap(self) -> LedCap:
         """Hole before each LED, as long as makes the cone of the field."""
-        hole_mm, half_deg = self.path.cap.hole_mm, self.relay.led_cone_deg(self.optics.field_deg) / 2
-        return LedCap(hole_mm, cap_height_mm(hole_mm, half_deg), self.emitter_mm)
+        return led_cap(self.path, self.optics, self.emitter_mm)
 
     @property
     def axis_mw_per_sr(self) -> float:

@@ -66,8 +66,13 @@ def relative_irradiance(cap: LedCap, magnification: float, angle_deg: ArrayLike)
 
 def half_maximum_deg(cap: LedCap, magnification: float) -> float:
     """Return the field, a full angle, at whose edge a flat retina has half of the irradiance on the axis, degrees."""
+    return field_to_share_deg(cap, magnification, 0.5)
+
+
+def field_to_share_deg(cap: LedCap, magnification: float, share: float) -> float:
+    """Return the field, a full angle, at whose edge a flat retina has this share of the axis's irradiance, degrees."""
     half_deg = np.arange(0.0, 60.0, 0.05)
-    return float(2 * np.interp(-0.5, -relative_irradiance(cap, magnification, half_deg), half_deg))
+    return float(2 * np.interp(-share, -relative_irradiance(cap, magnification, half_deg), half_deg))
 
 
 def dark_deg(cap: LedCap, magnification: float) -> float:

@@ -9,6 +9,7 @@ from device.config.head_file import ChainSpec, OpticsSpec
 from device.config.toml_file import Table, load_toml
 from device.optics.eye import Relay
 from device.optics.glass import Glass
+from device.optics.led_cap import LedCap, cap_height_mm
 from device.optics.lens_data import LayoutSpec, LensSpec
 
 Place = tuple[float, float]
@@ -77,6 +78,12 @@ def relay_of(path: LightPath, optics: OpticsSpec) -> Relay:
         iris_mm=optics.iris_um / 1000,
         diffuser_to_sensor_mm=optics.diffuser_to_sensor_um / 1000,
     )
+
+
+def led_cap(path: LightPath, optics: OpticsSpec, emitter_mm: float) -> LedCap:
+    """Return the hole before an LED with a die of that width, as long as makes the cone of the head's field."""
+    hole_mm, half_deg = path.cap.hole_mm, relay_of(path, optics).led_cone_deg(optics.field_deg) / 2
+    return LedCap(hole_mm, cap_height_mm(hole_mm, half_deg), emitter_mm)
 
 
 def planes_mm(relay: Relay) -> tuple[float, float, float, float]:

@@ -1,6 +1,6 @@
 """Eyes in front of a simulated head: object, optical setup and light of each eye and colour, computed once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property
 
@@ -9,6 +9,7 @@ import numpy as np
 from device.config.head_file import InstrumentSpec
 from device.optics.retina_chart import PAPER_REFLECTANCE
 from device.optics.trial_lens import PowerVector, TrialLens, correction_behind
+from device.sim.effects.illumination import Penumbra
 from device.sim.fundus import FIELD_CENTRE_DEG, Fundus
 from device.sim.objects import draw_object, moved_behind_field
 from device.sim.optical_setup import OpticalSetup, Scene
@@ -79,16 +80,17 @@ class RenderedEyes:
     def retina(self, eye: Eye) -> Fundus:
         """Return the object of the scene for an eye (retina, photograph or drawing), drawn once per eye and turn.
 
-        It covers the whole field and may be larger than the sensor. Its rows and columns have the parity of the
+        It covers the whole lit field and may be larger than the sensor. Its rows and columns have the parity of the
         sensor's, so that the centres coincide.
         """
         key = eye, self.turn_deg
         if key not in self._retinas:
             scene, camera = self.scene, self.scene.spec.camera
             px_per_deg = scene.geometry.px_per_deg
-            wide = int(np.ceil(px_per_deg * scene.optics.field_deg)) + 4
+            light_deg = lit_deg(scene, self.plan)
+            wide = int(np.ceil(px_per_deg * light_deg)) + 4
             shape = (wide + (wide - camera.rows) % 2, wide + (wide - camera.cols) % 2)
-            self._retinas[key] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg, self.turn_deg)
+            self._retinas[key] = draw_object(scene.sim, scene.optics, eye, shape, px_per_deg, self.turn_deg, light_deg)
         return self._retinas[key]
 
     def setup(self, eye: Eye, colour: Colour) -> OpticalSetup:
@@ -156,7 +158,7 @@ class RenderedEyes:
             setup = self.setup(eye, colour)
             if step > 0 or parts > 1:
                 scene, exposures = setup.scene, (step + 0.5) / parts - 0.5  # of the middle of the frame, like the blur
-                radius_px = scene.geometry.px_per_deg * scene.half_field_deg
+                radius_px = scene.geometry.px_per_deg * lit_deg(scene, self.plan) / 2
                 away_px, turn_deg = (0.0, exposures * self.drift_px), exposures * self.torsion_deg
                 moved = moved_behind_field(self.retina(eye), away_px, radius_px, turn_deg)
                 setup = build_setup(scene, moved, self._chosen(scene))
@@ -167,6 +169,12 @@ class RenderedEyes:
     def _chosen(self, scene: Scene) -> tuple[Decision, ...]:
         planned = scene.colour == self.scene.spec.light.colour and scene.turn_deg == STRAIGHT
         return self.plan if planned else self._choose(scene)
+
+
+def lit_deg(scene: Scene, plan: Sequence[Decision]) -> float:
+    """Return the full angle beyond which no light arrives, degrees: the field's, wider if the penumbra is simulated."""
+    soft = any(one.simulated and one.name == Penumbra.name for one in plan)
+    return scene.lit_deg if soft else scene.optics.field_deg
 
 
 def _of_card(reflectance: Image, light: Image) -> Image:

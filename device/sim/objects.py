@@ -40,29 +40,32 @@ TOLERANCE_DEG = 0.05  # tolerance for an object that ends on the field's edge
 
 
 def draw_object(
-    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, turn_deg: Pair = (0.0, 0.0)
-) -> Fundus:
-    """Return the object of a scene in the middle of `shape` (rows, cols): reflectances in 0..1, zero outside the field.
+    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float,
+    turn_deg: Pair = (0.0, 0.0), lit_deg: float | None = None,
+) -> Fundus:  # fmt: skip
+    """Return the object of a scene in the middle of `shape` (rows, cols): reflectances in 0..1, zero outside the light.
+
+    `lit_deg` is the full angle to which light arrives, at least that of the field; None: the field has a sharp edge.
 
     The object is shifted by `at_deg` of the scene plus the eye's gaze and `turn_deg`; a retina is shifted by `at_deg`
     and turns with the eye as a sphere (OPTICS.md 3.9). SpecError for a drawing that does not fit into the field, or a
     photograph that cannot be read.
     """
-    what, gaze = scene.object, scene.eye.gaze_deg
+    what, gaze, lit_deg = scene.object, scene.eye.gaze_deg, lit_deg or optics.field_deg
     gaze_deg = (gaze[0] + turn_deg[0], gaze[1] + turn_deg[1])
     at_deg = (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
     if what.kind in ("retina", "image"):
-        found = _moved_picture(scene, optics, eye, shape, px_per_deg, gaze_deg)
+        found = _moved_picture(scene, optics, eye, shape, px_per_deg, gaze_deg, lit_deg)
         return found if what.cut_deg is None else _cut(found, what.cut_deg, px_per_deg)
     if what.kind == "chart":
-        return _chart(scene.eye.focal_length_um, optics.field_deg, shape, px_per_deg, at_deg)
+        return _chart(scene.eye.focal_length_um, lit_deg, shape, px_per_deg, at_deg)
     _refuse_drawing_beyond_field(what, scene.eye.focal_length_um, optics.field_deg, at_deg)
     outside = {"dots": _dots, "ruler": _ruler, "point": _disc}[what.kind](what)
     plane = _coverage(outside, scene.eye.focal_length_um, shape, px_per_deg, at_deg)
     if what.kind == "ruler" and what.polarity == "negative":
         plane = 1 - plane
-    plane *= _soft_field(shape, px_per_deg * optics.field_deg / 2)
-    return Fundus(dict.fromkeys(COLOURS, plane), field_mask(shape, px_per_deg * optics.field_deg / 2))
+    plane *= _soft_field(shape, px_per_deg * lit_deg / 2)
+    return Fundus(dict.fromkeys(COLOURS, plane), field_mask(shape, px_per_deg * lit_deg / 2))
 
 
 def _chart(focal_length_um: float, field_deg: float, shape: tuple[int, int], px_per_deg: float, at_deg: Pair) -> Fundus:
@@ -87,20 +90,24 @@ def height_um(angle_off_deg: float, focal_length_um: float) -> float:
 
 
 def _moved_picture(
-    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, gaze_deg: Pair
-) -> Fundus:
-    """Return a retina or photograph, shifted and turned (right, down), cropped by the field, which stays centred."""
+    scene: SimSpec, optics: OpticsSpec, eye: Eye, shape: tuple[int, int], px_per_deg: float, gaze_deg: Pair,
+    lit_deg: float,
+) -> Fundus:  # fmt: skip
+    """Return a retina or photograph, shifted and turned (right, down), cropped by the light, which stays centred."""
     what, is_retina = scene.object, scene.object.kind == "retina"
+    more_deg = (lit_deg - optics.field_deg) / 2
     if what.at_deg == gaze_deg == (0.0, 0.0) and what.size_deg is None:
-        return _picture(scene, eye, shape, px_per_deg, optics.field_deg)
+        return _picture(scene, eye, shape, px_per_deg, optics.field_deg, more_deg)
     turn_deg = gaze_deg if is_retina else (0.0, 0.0)
     at_deg = what.at_deg if is_retina else (what.at_deg[0] + gaze_deg[0], what.at_deg[1] + gaze_deg[1])
-    wide_deg, beyond_deg = what.size_deg or optics.field_deg, hypot(*at_deg) + hypot(*turn_deg) if is_retina else 0.0
-    wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * beyond_deg)) + 4
+    wide_deg, beyond_deg = what.size_deg or optics.field_deg, 0.0
+    if is_retina:
+        beyond_deg = more_deg + hypot(*at_deg) + hypot(*turn_deg)
+    wide = ceil(px_per_deg * (max(wide_deg, optics.field_deg) + 2 * max(beyond_deg, more_deg))) + 4
     rows, cols = (max(wide + (wide - n) % 2, n) for n in shape)
     found = _picture(scene, eye, (rows, cols), px_per_deg, wide_deg, beyond_deg)
     move_px, turn_px = ((one[1] * px_per_deg, one[0] * px_per_deg) for one in (at_deg, turn_deg))
-    return _crop_to_field(found, shape, px_per_deg, optics.field_deg / 2, move_px, turn_px)
+    return _crop_to_field(found, shape, px_per_deg, lit_deg / 2, move_px, turn_px)
 
 
 def moved_behind_field(found: Fundus, move_px: Pair, radius_px: float, turn_deg: float = 0.0) -> Fundus:

@@ -20,6 +20,8 @@ from device.config.scene import SimSpec
 from device.errors import SpecError
 from device.optics.diffuser import EMMETROPIA, Refraction
 from device.optics.illumination import MEAN_OVER_PEAK, PEAK_UM
+from device.optics.led_cap import LedCap, dark_deg
+from device.optics.lit_field import cap_of
 from device.sim.fundus import Fundus
 from device.sim.head_light import HeadLight, head_light
 from device.sim.sensor import SensorModel
@@ -79,6 +81,18 @@ class Scene:
     def half_field_deg(self) -> float:
         """Angle from the axis to the edge of the illuminated field, degrees."""
         return self.optics.field_deg / 2
+
+    @cached_property
+    def cap(self) -> LedCap | None:
+        """Hole before each LED of a ring whose dies have a width; else None."""
+        return cap_of(self.spec, self.colour)
+
+    @property
+    def lit_deg(self) -> float:
+        """Full angle beyond which no light arrives, degrees: the field's, wider with the penumbra of the dies."""
+        if self.cap is None:
+            return self.optics.field_deg
+        return max(self.optics.field_deg, dark_deg(self.cap, self.optics.angular_magnification))
 
     @cached_property
     def budget(self) -> HeadLight | None:
@@ -156,11 +170,11 @@ class AddedLight:
 class OpticalSetup:
     """Light path, ideal when built: a green object, one wavelength, a sensor without noise or flaws.
 
-    `object` is the radiance on a square as wide as the field. `aberrations` and `beams` map a place in the field to the
+    `object` is the radiance on a square as wide as the light. `aberrations` and `beams` map a place in the field to the
     additional refraction, and to the shift of the beam's centre against the iris's, um. `lines` is the number of
     wavelengths. `drift_px` is the movement of the image in one exposure (right, down), `lag_px` that to the right
     between two rows. `response` multiplies each pixel's light. `source_um` is the diameter of the calibration's point
-    source, `spent_ms` the computing time. Keys of the dicts are effect names.
+    source, `spent_ms` the computing time. Keys of the dicts are names of effects.
     """
 
     scene: Scene

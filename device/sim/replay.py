@@ -25,6 +25,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import CameraMissing, FrameError, SpecError
+from device.optics.lit_field import picture_field_deg
 from device.sim.light import LampContext
 from device.user_files import files_in
 from device.values import Calibration, Counts, ExposureSettings, Frame, Illumination, Image, Mask, Psf, Sensor
@@ -196,5 +197,5 @@ def recorded_calibration(camera: ReplayCamera, spec: InstrumentSpec) -> Calibrat
     geometry = spec.optics.geometry(spec.camera.pitch_um) if spec.optics else None
     return Calibration(
         psfs=psfs, sensor=Sensor(black_dn=camera.black_dn, white_dn=camera.white_dn), geometry=geometry,
-        field_deg=spec.optics.field_deg if spec.optics else None, flat=flat, bad=camera.bad,
+        field_deg=picture_field_deg(spec), flat=flat, bad=camera.bad,
     )  # fmt: skip

@@ -4,6 +4,7 @@ import numpy as np
 
 from device.optics.diffuser import Refraction, steepest_rad
 from device.optics.eye import correction_dpt
+from device.optics.lit_field import picture_field_deg
 from device.sim.effects.sensor import hot_pixels
 from device.sim.optical_setup import OpticalSetup
 from device.sim.render import convolved_with_disc, crop_or_pad, psf
@@ -37,7 +38,7 @@ def simulated_calibration(world: World) -> Calibration:
         geometry=world.geometry,
         flat=flat_frame(world),
         bad=hot_pixels(world.scene) if world.scene.sim.sensor.hot_pixels else None,
-        field_deg=world.scene.optics.field_deg,
+        field_deg=picture_field_deg(world.spec),
         simulated=True,
     )
 

@@ -9,7 +9,8 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import SettingError
 from device.sim.blinks import lid_share
-from device.sim.eyes import EffectSelector, RenderedEyes
+from device.sim.effects.illumination import light_of_cap
+from device.sim.eyes import EffectSelector, RenderedEyes, lit_deg
 from device.sim.fundus import Fundus
 from device.sim.optical_setup import OpticalSetup, Scene
 from device.sim.plan import Decision, decide
@@ -119,8 +120,11 @@ class World:
         return self.eyes.setup(self.eye, colour)
 
     def truth(self, colour: Colour) -> Image:
-        """Return the ground truth on the sensor grid: reflectance, float32 (rows, cols), zero outside the field."""
-        return crop_or_pad(self.retina.plane(colour), self.shape)
+        """Return the ground truth on the sensor grid, float32 (rows, cols): reflectance, ending as the light does."""
+        plane = self.retina.plane(colour)
+        if lit_deg(self.scene, self.plan) > self.scene.optics.field_deg:
+            plane = plane * light_of_cap(self.scene, plane.shape)
+        return crop_or_pad(plane, self.shape)
 
     def psf(self, colour: Colour) -> Image:
         """Return the noise-free PSF of a colour on the axis, with the eye's refraction, (n, n) at sensor pitch."""

@@ -25,7 +25,9 @@ from device.light_safety.dose_ledger import MemoryLedger
 from device.optics import retina_chart
 from device.optics.budget import optical_budget
 from device.optics.illumination import MEAN_OVER_PEAK, half_period_deg
+from device.optics.led_cap import LedCap, dark_deg, relative_intensity
 from device.optics.light_budget import chain, log_sd
+from device.optics.lit_field import cap_of
 from device.recon.assessment.image_quality import MISMATCHES
 from device.values import ExposureSettings, Illumination, Image
 from services import resources
@@ -35,6 +37,7 @@ from services.lab.reconstruct_file import reconstruct_file
 from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_raw
 
 FILL_SHARE = 0.5  # of the full well, that the brightest pixel is to reach
+SEEN_PX_PER_DEG = 8.0  # of the expected light of the field
 WIDER = 1.2  # of the promised field: room for a field that is larger than promised
 RESOLVED = 0.2  # least modulation of resolved bars; 0.15 is Rayleigh's dip of 26 %, as contrast
 LEAST_AGREEMENT = 0.5  # 0.95 in a good picture, 0.78 at 170 electrons per pixel of 5.04 um, 0.06 in noise
@@ -46,7 +49,7 @@ MOST_SATURATED = 0.01
 REASONS = {
     "resolution": "one step of the chart; OPTICS.md 4.3 for this light, and bars of full contrast (simulated)",
     "scale": "lens 25.0 or 25.2 mm (0.8 %), print (0.5 %), diffuser to sensor 6.0 +- 0.05 mm (0.8 %)",
-    "field": "the holes of the LED cap, printed to 0.1 mm of 2.2 mm",
+    "field": "the holes of the LED cap, printed to 0.1 mm of 2.2 mm; the penumbra of the dies is expected",
     "light": "95 % by the chain of OPTICS.md 4.6: polarisers, pupil, paper, and the LEDs' power until it is measured",
     "grey": "tone of a print: a laser printer's dots grow by up to 15 %",
 }
@@ -63,11 +66,16 @@ REMEDIES = {
 class Promise:
     """What a head file promises of the chart; `lit_e` is the mean charge per pixel of the lit disc in one exposure.
 
+    `field_deg` is that of the head file, `seen_field_deg` what `lit_diameter_px` finds of it with the penumbra of the
+    dies, `dark_deg` the full angle beyond which no light arrives.
+
     `light_factor` is the factor within which 95 % of such heads are, by the light's chain: less for a measured ring.
     """
 
     px_per_deg: float
     field_deg: float
+    seen_field_deg: float
+    dark_deg: float
     extent_px: float
     lit_e: float
     pitch_um: float
@@ -139,18 +147,42 @@ def promise_of(spec: InstrumentSpec, exposure_s: float) -> Promise:
         for factor in chain(white)
     ]
     factor = exp(TWO_SIDED_95 * log_sd(factors))
-    return Promise(budget.px_per_deg, field_deg, extent_px, budget.electrons_per_px, design.pitch_um, factor)
+    cap, magnification = cap_of(spec), design.relay.angular_magnification
+    seen_deg = field_deg if cap is None else seen_field_deg(cap, magnification)
+    most_deg = field_deg if cap is None else dark_deg(cap, magnification)
+    return Promise(
+        budget.px_per_deg, field_deg, seen_deg, most_deg, extent_px, budget.electrons_per_px, design.pitch_um, factor
+    )
+
+
+def seen_field_deg(cap: LedCap, magnification: float) -> float:
+    """Return the diameter of the lit field that `lit_diameter_px` finds of the chart behind such a cap, degrees.
+
+    It depends on the chart: half of the lit level is reached in the penumbra, where the rings are.
+    """
+    half_deg = dark_deg(cap, magnification) / 2
+    steps = np.arange(-half_deg - 2, half_deg + 2, 1 / SEEN_PX_PER_DEG)
+    off = np.radians(np.hypot(steps[:, None], steps[None, :]))
+    per_deg = 1000 * retina_chart.EYE_MM * np.tan(off) / np.maximum(np.degrees(off), 1e-9)
+    chart = _tones((steps[None, :] * per_deg).astype(np.float32), (steps[:, None] * per_deg).astype(np.float32))
+    light = np.vstack([relative_intensity(cap, magnification, steps, down) for down in steps])
+    return lit_diameter_px((chart * light * np.cos(off) ** 3).astype(np.float32), SEEN_PX_PER_DEG) / SEEN_PX_PER_DEG
 
 
 def mean_tone(field_deg: float) -> float:
     """Return the mean tone of the chart within a field, paper 1."""
     half_um = 1000 * retina_chart.EYE_MM * np.tan(radians(field_deg / 2))
     steps = np.linspace(-half_um, half_um, 301, dtype=np.float32)
-    x, y = steps[None, :], steps[:, None]
-    plane = np.ones((steps.size, steps.size))
+    x, y = np.meshgrid(steps, steps)
+    return float(_tones(x, y)[np.hypot(x, y) <= half_um].mean())
+
+
+def _tones(right_um: Image, down_um: Image) -> Image:
+    """Return the tones of the chart at places on it, paper 1."""
+    plane = np.ones(right_um.shape, np.float32)
     for tone in (retina_chart.INK, retina_chart.GREY):
-        plane[retina_chart.signed_distance_um(retina_chart.of_tone(tone), x, y) < 0] = tone
-    return float(plane[np.hypot(x, y) <= half_um].mean())
+        plane[retina_chart.signed_distance_um(retina_chart.of_tone(tone), right_um, down_um) < 0] = tone
+    return plane
 
 
 def usual_exposure_s(spec: InstrumentSpec) -> float:
@@ -193,7 +225,8 @@ def check_model_eye(head: Path, frame: ModelEyeFrame) -> ModelEyeResult:
     made = reconstruct_file(options)
     if found := [warning for warning in made.report.warnings if warning in MISMATCHES.values()]:
         raise PsfError(found[0], "Calibrate the head, or give the PSF that was measured with this head and this mode.")
-    wide = reconstruct_file(replace(options, field_deg=min(WIDER * promise.field_deg, 120.0))).picture
+    wide_deg = min(max(WIDER * promise.field_deg, promise.dark_deg), 120.0)
+    wide = reconstruct_file(replace(options, field_deg=wide_deg)).picture
     fit = fit_chart(wide, promise.px_per_deg, promise.field_deg)
     if fit.agreement < LEAST_AGREEMENT:
         raise FrameError(
@@ -298,7 +331,7 @@ def _scale(fit: ChartFit, promise: Promise) -> Row:
 
 
 def _field(wide: Image, fit: ChartFit, promise: Promise) -> Row:
-    measured, field = lit_diameter_px(wide, fit.px_per_deg) / fit.px_per_deg, promise.field_deg
+    measured, field = lit_diameter_px(wide, fit.px_per_deg) / fit.px_per_deg, promise.seen_field_deg
     return _row("field", measured, field, field * (1 - FIELD_TOLERANCE), field * (1 + FIELD_TOLERANCE), "deg")
 
 

@@ -30,6 +30,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
+from device.optics.lit_field import picture_field_deg
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import MOST_BAD
@@ -366,7 +367,7 @@ def _geometry(
         if spec.optics is None:
             raise SpecError(f"{spec.name} has no [optics], so it gives no geometry")
         geometry = spec.optics.geometry(spec.camera.pitch_um * (2 if is_mosaic else 1))
-        field_deg = field_deg if field_deg is not None else spec.optics.field_deg
+        field_deg = field_deg if field_deg is not None else picture_field_deg(spec)
     elif field_deg is not None:
         raise SettingError(
             "a field in degrees needs a head to become pixels", "Give --head HEAD.toml with --field-deg."

@@ -1,7 +1,7 @@
 """Effects one by one: no change at their defaults, growth with their keys, and correct physics at large values."""
 
 import re
-from math import asin, degrees, pi
+from math import asin, cos, degrees, pi, sin
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ import pytest
 from device.config.head_file import ChainSpec, InstrumentSpec, load_head
 from device.errors import SettingError, SpecError
 from device.optics.diffuser import Refraction
+from device.optics.led_cap import relative_intensity
 from device.recon.model.grid import Grid
 from device.recon.model.preprocessing import Preprocessor
 from device.sim.effects import EFFECTS
@@ -335,6 +336,27 @@ def test_light_falls_off_with_the_fourth_power_of_the_cosine() -> None:
     edge = middle + round(16 * scene(spec).geometry.px_per_deg)
     assert fallen[middle, edge] / even[middle, edge] == pytest.approx(np.cos(np.radians(16)) ** 4, abs=0.005)
     assert fallen[middle, middle] == pytest.approx(even[middle, middle], rel=1e-4)
+
+
+def test_wide_dies_light_beyond_the_field_and_less_at_its_edge() -> None:
+    """The high-power ring's 1 mm dies, as OPTICS.md 4.9 has them; without the effect the field ends sharply."""
+    spec = coarse(load_head(SCENES / "human_eye_imx296_power.toml"), 8)
+    sharp, soft = (alone(spec, name).setup("green").object for name in ("shot", "penumbra"))
+    here = scene(spec)
+    assert effect_named("penumbra").size(here).eta > 1
+
+    def seen(plane: np.ndarray, right_px: int, down_px: int) -> float:
+        middle = plane.shape[0] // 2
+        return float(plane[middle + down_px, middle + right_px])
+
+    for angle_deg, turn in ((10, 0.0), (14, 0.7), (16, pi / 2)):
+        at = [round(angle_deg * way * here.geometry.px_per_deg) for way in (cos(turn), sin(turn))]
+        left = seen(soft, *at) / seen(sharp, *at) / (seen(soft, 0, 0) / seen(sharp, 0, 0))
+        off_deg = np.array(at) / here.geometry.px_per_deg
+        assert left == pytest.approx(relative_intensity(here.cap, 0.75, *off_deg), abs=0.03)  # a pixel is 0.35 degrees
+    assert sharp.shape[0] < 40 * here.geometry.px_per_deg < soft.shape[0]
+    assert seen(soft, round(20 * here.geometry.px_per_deg), 0) > 0
+    assert effect_named("penumbra").size(scene(PLAIN)).eta == 0, "nothing is known of its dies"
 
 
 def prepared_frame(of: World, flat: bool) -> np.ndarray:

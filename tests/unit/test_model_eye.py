@@ -184,6 +184,22 @@ def test_promised_light_is_the_budget_of_white_paper_and_half_of_it_fails_a_meas
     assert measured.light_factor < right.light_factor == pytest.approx(2.57, abs=0.01)
 
 
+def test_right_head_with_wide_dies_passes_and_its_field_is_not_that_of_points(tmp_path: Path) -> None:
+    """Dies of 1 mm light a penumbra; a rule of 5 % about the 33.4 degrees of points would refuse this head."""
+    tables = SCENE + "\n[sim.light]\nfalloff = true\n"
+    text = small_head_toml("Small head", tables, exposure_s=EXPOSURE_S / 5)
+    lit = text.replace('[light]\nbackend = "sim"', '[light]\nbackend = "sim"\nhead = "imx296_power"')
+    (tmp_path / "head.toml").write_text(lit, encoding="utf-8")
+    scene_files.simulate(load_head(tmp_path / "head.toml"), tmp_path)
+    frame = ModelEyeFrame(tmp_path / "raw.tiff", tmp_path / "psf.tiff", None, EXPOSURE_S / 5)
+    found = check_model_eye(tmp_path / "head.toml", frame)
+    assert found.ok
+    field = next(row for row in found.rows if row.name == "field")
+    assert field.measured is not None
+    assert field.measured > 1.05 * 33.4
+    assert field.promised == pytest.approx(37.3, abs=0.1)
+
+
 def test_another_scale_fails_on_scale_only(tmp_path: Path) -> None:
     """The head has an angular magnification of 0.70, and its file says 0.75."""
     short = simulated(tmp_path, "angular_magnification = 0.75", "angular_magnification = 0.70")

@@ -33,6 +33,7 @@ from device.calibration.procedure.step_exposures import SHORTEST_S, StepExposure
 from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationRefused
+from device.optics.lit_field import picture_field_deg
 from device.ports import Camera, Thermometer
 from device.values import Calibration, Colour, Frame, Geometry, Psf, Sensor
 
@@ -298,7 +299,7 @@ class CalibrationSequence:
             psfs=psfs,
             sensor=sensor,
             geometry=geometry,
-            field_deg=spec.optics.field_deg if spec.optics else None,
+            field_deg=picture_field_deg(spec),
             dark_dn=darks.map_dn,
             flat=flats.response,
             bad=darks.hot | flats.dead,

@@ -5,6 +5,7 @@ from device.sim.effects.effect import Effect
 
 EFFECTS: tuple[Effect, ...] = (
     eye.Tint(),
+    illumination.Penumbra(),
     illumination.Falloff(),
     illumination.Leds(),
     eye.Reflex(),

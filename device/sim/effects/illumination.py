@@ -1,4 +1,4 @@
-"""Effects of the illumination: falloff, single LEDs of the ring, stray light, ambient light.
+"""Effects of the illumination: penumbra, falloff, single LEDs of the ring, stray light, ambient light.
 
 Ring that is not conjugate to the eye's pupil (`Leds`). With f1 and f2 the lenses, a = f1 / f2, the relay is afocal: a
 ray that leaves an LED at rho (mm off the axis) under the slope psi enters the eye under theta = -psi / a, whatever its
@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from device.errors import SpecError
 from device.optics.eye import iris_overlap
 from device.optics.illumination import LEDS
+from device.optics.led_cap import relative_intensity
 from device.optics.matrix import EMITTER_MM, geometry_of, led_positions_mm, ring
 from device.sim.optical_setup import OpticalSetup, Place, Scene, Size
+from device.values import Image
 
 STRAY_ETA_PER_SHARE = 320.0  # of the mean signal, where no constant is fitted; a solver that fits one sees less
 _FALLOFF_ETA = 7.0  # at 33.4 degrees on a sensor that the field fills, where the edge keeps 0.84 of the light
@@ -31,6 +33,35 @@ _FALLOFF_TABLE_LOSS = 1 - cos(radians(16.7)) ** 4
 _LEDS_ETA_PER_SHARE = 180.0  # of the standard deviation over the field, relative to the mean
 _RADII, _TURNS = 48, 48  # polar grid on which the light over the field is evaluated for the size
 _EDGE_STEPS = 65  # of the soft edge's table
+
+
+class Penumbra:
+    """Soft edge of the field: the dies behind the holes of the LEDs' cap, as far as it is seen; OPTICS.md 4.9."""
+
+    name = "penumbra"
+
+    def size(self, scene: Scene) -> Size:
+        """Return the effect's size eta, in proportion to the share of the axis's light that the field's edge loses."""
+        if scene.cap is None:
+            return Size(0.0, "the field has a sharp edge")
+        left = float(relative_intensity(scene.cap, scene.optics.angular_magnification, scene.half_field_deg, 0.0))
+        why = f"a die of {scene.cap.emitter_mm:g} mm: the field's edge gets {left:.2f} of the middle's light"
+        return Size(_FALLOFF_ETA * (1 - left) / _FALLOFF_TABLE_LOSS * scene.weight, why)
+
+    def apply(self, setup: OpticalSetup) -> None:
+        """Multiply the object, which is as wide as the light, by the intensity relative to that of the axis."""
+        setup.object = setup.object * light_of_cap(setup.scene, setup.object.shape)
+
+
+def light_of_cap(scene: Scene, shape: tuple[int, ...]) -> Image:
+    """Return the intensity over that on the axis in the middle of `shape` (rows, cols), float32; 1 without a cap."""
+    cap, magnification = scene.cap, scene.optics.angular_magnification
+    if cap is None:
+        return np.ones(shape, np.float32)
+    places = ((np.arange(n) - (n - 1) / 2) / scene.geometry.px_per_deg for n in shape)
+    (down, row), (right, col) = (np.unique(np.abs(one), return_inverse=True) for one in places)  # a quadrant
+    light = np.vstack([relative_intensity(cap, magnification, right, one) for one in down])
+    return light[np.ix_(row, col)].astype(np.float32)
 
 
 class Falloff:

@@ -1,0 +1,36 @@
+"""Field that a head lights in fact: wider than its cap's cone where the dies of its LEDs are no points (OPTICS.md 4.9).
+
+Only a constant-current ring states the width of its dies; the matrix's are small, and its field keeps a sharp edge.
+"""
+
+from functools import cache
+
+from device.config.head_file import InstrumentSpec
+from device.config.shipped_heads import LIGHT_PATH
+from device.optics.led_cap import LedCap, field_to_share_deg
+from device.optics.light_path import LightPath, led_cap, load_light_path
+from device.optics.matrix import lamps_of
+from device.values import Colour
+
+EDGE_SHARE = 0.1  # of the axis's irradiance, at the edge of a picture's field: little light comes from beyond
+
+
+def cap_of(spec: InstrumentSpec, colour: Colour | None = None) -> LedCap | None:
+    """Return the hole before each LED of a head in `colour`, by default the picture's; None without dies of a width."""
+    lamp = (lamps_of(spec) or {}).get(colour or spec.light.colour)
+    if spec.light.sinks is None or spec.optics is None or lamp is None:
+        return None
+    return led_cap(_light_path(), spec.optics, lamp.emitter_mm)
+
+
+def picture_field_deg(spec: InstrumentSpec) -> float | None:
+    """Return the full angle of the field from which light has to be reconstructed, degrees; None without [optics]."""
+    cap = cap_of(spec)
+    if spec.optics is None or cap is None:
+        return None if spec.optics is None else spec.optics.field_deg
+    return max(spec.optics.field_deg, field_to_share_deg(cap, spec.optics.angular_magnification, EDGE_SHARE))
+
+
+@cache
+def _light_path() -> LightPath:
+    return load_light_path(LIGHT_PATH)
