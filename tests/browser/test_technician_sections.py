@@ -159,13 +159,15 @@ def test_event_log_lists_events(technician_page: Page) -> None:
 
 def test_event_log_is_filtered_and_exported(technician_page: Page) -> None:
     stick = {"id": "0123456789abcdef", "name": "BLUE", "free_bytes": 10**9, "is_writable": True}
-    technician_page.route("**/api/exports", lambda route: route.fulfill(json={"folders": [stick]}))
+    locked = {**stick, "id": "fedcba9876543210", "name": "LOCKED", "is_writable": False}
+    technician_page.route("**/api/exports", lambda route: route.fulfill(json={"folders": [locked, stick]}))
     technician_page.route("**/diary/export", lambda route: route.fulfill(json={"folder": "diary-2026-11-22"}))
     open_section(technician_page, "diary")
     with technician_page.expect_download() as saved:
         technician_page.get_by_role("link", name="Save as a file").tap()
     assert "a picture was kept after" in Path(saved.value.path()).read_text()
     technician_page.get_by_role("button", name="Copy to USB").tap()
+    expect(technician_page.get_by_role("button", name="LOCKED (read-only)")).to_be_disabled()
     with technician_page.expect_request("**/diary/export") as asked:
         technician_page.get_by_role("button", name="BLUE").tap()
     assert asked.value.post_data_json == {"folder": stick["id"]}
