@@ -16,7 +16,7 @@ from device.drivers.ring import Apa102Ring, lit_frame
 from device.errors import LightFault
 from device.values import Illumination
 from tests.ports.conftest import ring_rig
-from tests.ports.emulators.kills import LitProcess, Sleeper, dark_limit_s
+from tests.ports.emulators.kills import DARK_S, LitProcess, Sleeper, dark_limit_s
 from tests.ports.emulators.wires import emulated_buses
 
 LEASE_S = 0.4
@@ -42,11 +42,11 @@ def test_a_stopped_process_is_dark_when_its_lease_expires(seed):
     assert result.dark_after_s <= LEASE_S + result.limit_s
 
 
-@pytest.mark.parametrize(("end", "lease_s"), [("hang", LEASE_S), ("raise", 0.0), ("exit", 0.0)])
-def test_a_process_that_fails_with_the_lamp_on_leaves_no_light(end, lease_s):
+@pytest.mark.parametrize(("end", "limit_s"), [("hang", LEASE_S + DARK_S), ("raise", DARK_S), ("exit", DARK_S)])
+def test_a_process_that_fails_with_the_lamp_on_leaves_no_light(end, limit_s):
     result = LitProcess(emulated_buses(), LEASE_S, end).await_end(end)
     assert result.was_lit
-    assert result.dark_after_s <= lease_s + result.limit_s
+    assert result.dark_after_s <= limit_s + result.limit_s - DARK_S
 
 
 @pytest.fixture
