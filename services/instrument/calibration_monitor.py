@@ -24,6 +24,7 @@ from device.clock import Clock
 from device.config.head_file import InstrumentSpec
 from device.errors import CalibrationError, DiffuscopeError, FrameError, StoreError
 from device.head import Head
+from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchTest
 from device.recon.estimation.refraction import RefractionEstimator
 from services.errors import Busy
@@ -160,15 +161,24 @@ def captures_with_calibration(store: CaptureStore, calibration_id: str, since: d
 
 
 def reported_refractions(captures: Iterable[Capture]) -> list[ReportedRefraction]:
-    """Return the refraction of each capture whose report has one with numbers."""
+    """Return the refraction of each capture that shows an eye, and whose report has one with numbers."""
     found = []
-    for one in captures:
+    for one in filter(has_eye, captures):
         report = one.report.reconstruction.refraction_dpt or {}
         sphere, *edge = (report.get(name) for name in ("sphere", "field_deg", "field_deg_sd"))
         if isinstance(sphere, int | float):
             diameter_deg, sd_deg = (float(value) if isinstance(value, int | float) else 0.0 for value in edge)
             found.append(ReportedRefraction(one.taken_at, -float(sphere), diameter_deg, sd_deg))
     return found
+
+
+def has_eye(capture: Capture) -> bool:
+    """Return whether a capture shows an eye through its whole pupil, by the figures of its verdict; True without one.
+
+    The code of a last try is `shot.poor`, whatever the cause.
+    """
+    verdict = capture.report.verdict
+    return verdict is None or shows_eye(verdict.numbers)
 
 
 def exposures(store: CaptureStore, capture: Capture, between: Callable[[], None] = lambda: None) -> ExposurePair:
@@ -182,4 +192,4 @@ def exposures(store: CaptureStore, capture: Capture, between: Callable[[], None]
     between()
     if metadata.exposure_s is None:
         raise FrameError(f"the raw frame of {capture.id} has no exposure time")
-    return ExposurePair(capture.taken_at, lit, dark, float(metadata.exposure_s))
+    return ExposurePair(capture.taken_at, lit, dark, float(metadata.exposure_s), has_eye(capture))

@@ -24,6 +24,7 @@ from services.imaging.raw_metadata import RawMetadata
 from services.instrument.calibration_monitor import exposures
 from services.lab.check_head import check_calibration, table
 from tests.journey.conftest import Diffuscope
+from tests.journey.faults import simulated_light
 
 WEEK_S = 7 * 86400.0
 CODES = {"age", "psf", "shift", "width", "hot pixels", "black level"}
@@ -101,6 +102,26 @@ def test_a_stale_calibration_is_refused_after_two_pictures_and_after_a_restart(
     repaired = make_rig(head=with_another_psf)
     assert not repaired.exam.calibration_monitor.has_pending
     assert repaired.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
+
+
+@pytest.mark.parametrize(
+    ("times", "eye"),
+    [(1.0, {"pupil_um": 1500.0}), (1.0, {"pupil_um": 4000.0, "decentred_um": 2500.0}), (0.01, {"pupil_um": 1500.0})],
+    ids=["small pupil", "half a picture", "dark"],
+)
+def test_pictures_without_a_whole_eye_say_nothing_about_the_head(
+    rig: Any, wait_until: Callable[..., None], times: float, eye: dict[str, float]
+) -> None:
+    """A pupil that cuts the beam has another PSF: it scores 0.1 to 0.2 where a whole one scores 1.1."""
+    with simulated_light(rig, times, eye=eye):
+        for _ in range(3):
+            assert rig.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
+            wait_until(lambda: not rig.exam.calibration_monitor.has_pending)
+    assert all(not one.report.verdict.is_good for one in rig.store.captures())
+    found = health(rig)
+    assert found["ok"]
+    assert set(found) - {"ok"} == {"hot pixels", "black level"}, "the dark frames are judged, and nothing else"
+    assert rig.request("POST", "/api/captures", json={"eye": "OD"}).status_code == 201
 
 
 def test_an_ageing_calibration_gives_a_notice_then_an_error(make_rig: Any) -> None:

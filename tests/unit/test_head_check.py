@@ -21,6 +21,7 @@ from device.calibration.monitoring.head_check import (
 from device.clock import VirtualClock
 from device.config.head_file import CameraSpec, load_head
 from device.errors import CalibrationExpired, CalibrationModeMismatch, CalibrationStale
+from device.recon.assessment.frame_quality import shows_eye
 from device.recon.assessment.psf_match_any_refraction import PsfMatchResult, PsfMatchTest
 from device.recon.estimation.refraction import RefractionEstimator
 from device.sim.simulated_calibration import simulated_calibration
@@ -329,3 +330,29 @@ def test_a_calibration_of_another_sensor_mode_is_refused_with_both_values(
 def test_unknown_values_of_an_imported_psf_are_not_compared() -> None:
     imported = Calibration((Psf(np.ones((20, 30), np.float32)),), Sensor())
     calibration_validity.refuse_other_mode(imported, KNOWN, CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("figures", "expected"),
+    [
+        ({}, True),
+        ({"saturated": 0.0, "through": 1.0, "coverage": 1.0, "wide": 0.99}, True),
+        ({"saturated": 0.0, "through": 1.0, "coverage": 1.0, "wide": 0.79}, False),  # a pupil of 1500 um
+        ({"saturated": 0.0, "through": 1.0, "coverage": 0.58, "off_x": 0.4}, False),  # a half of the field
+        ({"saturated": 0.0, "through": 0.3}, False),  # a closed lid
+        ({"saturated": 0.5}, False),
+        ({"saturated": 0.0, "light_e_per_um2": 0.1}, False),
+        ({"saturated": 0.0, "coverage": 1.0, "smear": 0.4}, True),  # motion, within which the score stays near 1
+        ({"saturated": 0.0, "coverage": 1.0, "wide": 1.03}, True),  # a sensor that is 600 um too far away
+    ],
+)
+def test_a_frame_is_evidence_about_the_head_if_it_shows_an_eye(figures: dict[str, float], expected: bool) -> None:
+    assert shows_eye(figures) is expected
+
+
+def test_a_frame_without_an_eye_is_not_compared_with_the_psf() -> None:
+    cut = ExposurePair(NOW, frame_through(caustic_of_eye(diffuser=5)), dark(), 0.1, shows_eye=False)
+    assert assess_capture(calibrated(), KNOWN, witness(), cut).statement is None
+    assert found(assess_capture(calibrated(), KNOWN, witness(), cut)).keys() == {
+        "age", "hot pixels", "black level", "dark noise",
+    }  # fmt: skip

@@ -4,8 +4,9 @@
     check              turns the recent captures into findings
     raise_on_failure   raises the error of a failed finding, with which a new capture is refused
 
-One capture may show a blink or a moving eye; so two of the last three must agree before pictures are refused. The
-sources of the limits are in device/calibration/decisions/.
+Only a frame that shows an eye through its whole pupil is compared with the PSF: a small or decentred pupil cuts the
+beam, and scores like another diffuser. One capture may show a blink or a moving eye; so two of the last three must
+agree before pictures are refused. The sources of the limits are in device/calibration/decisions/.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,7 +51,7 @@ REPEAT_REMEDY = "Take another picture. If that says so too, none is taken any mo
 
 @dataclass(frozen=True)
 class CaptureAssessment:
-    """Assessment of one capture; `statement` is its PSF match, None if not tested or if the lit frame has no light."""
+    """Assessment of one capture; `statement` is its PSF match, None if not tested or if the lit frame shows no eye."""
 
     taken_at: datetime
     dark: DarkFrameAssessment
@@ -59,12 +60,16 @@ class CaptureAssessment:
 
 @dataclass(frozen=True)
 class ExposurePair:
-    """Lit frame and dark frame, counts (rows, cols), with their date and time and their exposure, s."""
+    """Lit frame and dark frame, counts (rows, cols), with their date and time and their exposure, s.
+
+    `shows_eye`: the lit frame shows a retina through the whole pupil, so that it is evidence about the head.
+    """
 
     taken_at: datetime
     lit: Counts
     dark: Counts
     exposure_s: float
+    shows_eye: bool = True
 
 
 @dataclass(frozen=True)
@@ -90,9 +95,9 @@ def assess_capture(
     """
     seen = assess_dark_frame(calibration, provenance, exposures.dark, exposures.exposure_s, between)
     between()
-    return CaptureAssessment(
-        exposures.taken_at, seen, witness(exposures.lit, exposures.dark, between) if witness is not None else None
-    )
+    if witness is None or not exposures.shows_eye:
+        return CaptureAssessment(exposures.taken_at, seen, None)
+    return CaptureAssessment(exposures.taken_at, seen, witness(exposures.lit, exposures.dark, between))
 
 
 def check(

@@ -6,7 +6,8 @@ detail along one direction. Causes that one frame cannot show are not reported: 
 leaves no directional detail, and a closed lid gives the same frame as a wall.
 """
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from math import hypot, isfinite
 from typing import Any, Literal
 
@@ -91,6 +92,19 @@ def assess_picture(first: Verdict, residual: float | None, coverage: float | Non
     if code is not None and tries >= retakes:
         code = "shot.poor"
     return Verdict("good" if code is None else "again", code, numbers)
+
+
+def shows_eye(numbers: Mapping[str, Any]) -> bool:
+    """Return whether a frame with the figures of its verdict shows a retina through the whole pupil, still or moving.
+
+    Such a frame is evidence about the head. A pupil that cuts the beam lets a part of the diffuser form the image: the
+    frame has another PSF and another field than the calibration. Light that is wider than the field is the head's.
+    """
+    known = {one.name: float(numbers[one.name]) for one in fields(FrameFigures) if one.name in numbers}
+    if "wide" in known:
+        known["wide"] = min(known["wide"], 1.0)
+    seen = FrameFigures(**{"saturated": 0.0} | known)
+    return _cause(seen, False) in (None, "shot.moved")
 
 
 def _cause(seen: FrameFigures, eye_before: bool) -> Code | None:
