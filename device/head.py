@@ -147,6 +147,12 @@ def open_head(spec: InstrumentSpec, clock: Clock, ledger: Ledger, allocator: Any
             f"{spec.name} has no lamp, so it takes no pictures of eyes",
             "Take frames in the light that is there: diffuscope frame --head HEAD -o raw.tiff (hardware/bench.md).",
         )
+    if spec.camera.bayer:
+        raise SpecError(
+            f"{spec.name} has a sensor with colour filters: its counts are not grey, and no picture of an eye",
+            "Fit the monochrome version and write bayer = false. For frames only: diffuscope frame --head HEAD -o "
+            "raw.tiff, then diffuscope reconstruct with --bayer.",
+        )
     if (spec.camera.backend == "replay") != (spec.light.backend == "replay"):
         raise SpecError(f"a {spec.camera.backend} camera cannot see a {spec.light.backend} lamp")
     with HeadOpener(spec, clock, allocator) as opening:

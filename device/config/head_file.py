@@ -18,7 +18,8 @@ class CameraSpec(Table):
     """Sensor: driver backend, pixels, and conversion of counts.
 
     `sensor` names a preset of `device/config/sensor_presets`, or a TOML file beside the head file, which supplies the
-    keys that this table omits; the value is then the file's name without `.toml`. `row_us` is the row time; `black_dn`
+    keys that this table omits, but for `bayer`, which the file of a real camera states itself where the sensor is usual
+    with colour filters; the value is then the file's name without `.toml`. `row_us` is the row time; `black_dn`
     the count of a pixel without light.
     """
 
@@ -35,7 +36,7 @@ class CameraSpec(Table):
     preview_exposure_s: float = Field(default=0.05, gt=0, le=10)
     device: str = Field(default="/dev/video0", min_length=1)  # for v4l2 only
     row_us: float = Field(default=30.0, gt=0, le=1000)
-    bayer: bool = False  # colour filters before the pixels; the driver refuses a sensor with filters otherwise
+    bayer: bool = False  # colour filters before the pixels: frames only; never taken from `sensor`
     upright: bool = False  # checked by hand: pictures are upright and not mirrored (hardware/assembly.md)
 
     @model_validator(mode="before")
@@ -49,8 +50,15 @@ class CameraSpec(Table):
         if name is None:
             return values
         folder = Path() if info.context is None else Path(info.context["folder"])
-        profile = sensor_profile(str(name), folder).model_dump()
-        supplied = {key: value for key, value in profile.items() if key in cls.model_fields}
+        profile = sensor_profile(str(name), folder)
+        if profile.bayer and "bayer" not in values and values.get("backend") in ("picamera2", "v4l2"):
+            raise ValueError(
+                f"{name} is usual with colour filters: write bayer = false for its monochrome version, or bayer = true "
+                "for a bench whose frames are reconstructed with --bayer"
+            )
+        supplied = {
+            key: value for key, value in profile.model_dump(exclude={"bayer"}).items() if key in cls.model_fields
+        }
         return {**supplied, **values, "sensor": Path(str(name)).name.removesuffix(".toml")}
 
     @property

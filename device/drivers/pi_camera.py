@@ -87,7 +87,7 @@ class PiCamera(RetryingCamera):
     def _start(self, exposure_s: float) -> None:
         device = self._device = self._library(self._camera_index(), allocator=self._allocator)
         spec, size = self._spec, (self._spec.cols, self._spec.rows)
-        mosaic = self._mosaic = MOSAICS.get(int(device.camera_properties.get("ColorFilterArrangement", 5)), "R")
+        mosaic = self._mosaic = self._reported_mosaic(int(device.camera_properties.get("ColorFilterArrangement", 5)))
         self._refuse_unexpected_mosaic(mosaic)
         asked = device.create_video_configuration(
             main={"size": (min(MAIN[0], size[0] & ~1), min(MAIN[1], size[1] & ~1))},
@@ -100,6 +100,15 @@ class PiCamera(RetryingCamera):
         self._layout = self._granted_layout(device.camera_configuration())
         device.start()
         log.info("%s: raw %s", spec.sensor, device.camera_configuration()["raw"])
+
+    def _reported_mosaic(self, arrangement: int) -> str:
+        """Return the letters of libcamera's raw format; CameraMismatch for filters of an unknown arrangement."""
+        if arrangement not in MOSAICS:
+            raise CameraMismatch(
+                f"the {self._spec.sensor} has colour filters of an unknown arrangement ({arrangement})",
+                "Fit the monochrome version.",
+            )
+        return MOSAICS[arrangement]
 
     def _refuse_unexpected_mosaic(self, mosaic: str) -> None:
         """Raise CameraMismatch for colour filters that the head file does not expect: counts would not be grey."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from device.clock import Clock
+from device.config.bayer import looks_like_mosaic
 from device.config.head_file import CameraSpec, InstrumentSpec, LightSpec, ReplaySpec
 from device.config.image_files import (
     SUFFIXES,
@@ -104,6 +105,12 @@ class ReplayCamera:
         raws = [as_raw(read_counts(path)) for path in recording.raws]
         if len({raw.pixels.shape for raw in raws}) > 1:
             raise SpecError("the raws of one recording must all have the same rows and columns")
+        for path, raw in zip(recording.raws, raws, strict=True):
+            if looks_like_mosaic(raw.pixels):
+                raise SpecError(
+                    f"{path} is a mosaic of colour filters, so its counts are not grey",
+                    "Reconstruct it with diffuscope reconstruct and --bayer, such as --bayer rggb.",
+                )
         self._simulated = any(is_marked_simulated(path) for path in recording.raws)
         self.bad: Mask = np.logical_or.reduce([raw.bad for raw in raws])
         on_counts = _scale(raws)

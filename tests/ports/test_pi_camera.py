@@ -140,6 +140,12 @@ def test_a_colour_sensor_where_a_monochrome_one_is_expected_is_refused(bench):
     assert "bayer = true" in caught.value.remedy
 
 
+def test_colour_filters_of_an_unknown_arrangement_are_refused(bench):
+    bench.sensor.arrangement = 4  # libcamera: RGB, three values per pixel
+    with pytest.raises(CameraMismatch, match=r"unknown arrangement"):
+        bench.open()
+
+
 def test_an_expected_mosaic_is_read_as_the_sensor_gives_it(bench):
     """The raw counts stay those of the sensor; `reconstruct --bayer` takes them apart."""
     bench.sensor.arrangement = 0

@@ -4,18 +4,21 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from device.clock import VirtualClock
-from device.config.head_file import load_head
+from device.config.head_file import ReplaySpec, load_head
 from device.config.sensors import PRESETS
 from device.config.toml_file import line_of
 from device.errors import SpecError
 from device.head import open_head
 from device.light_safety.dose_ledger import MemoryLedger
+from device.sim.replay import ReplayCamera, ReplayLight
 
-HEAD = Path(__file__).parents[2] / "hardware" / "heads" / "sim.toml"
+HEADS = Path(__file__).parents[2] / "hardware" / "heads"
+HEAD = HEADS / "sim.toml"
 TEXT = HEAD.read_text()
 Refused = Callable[[str], SpecError]
 
@@ -184,3 +187,43 @@ def test_a_sensor_preset_of_ones_own_is_read_beside_the_head_file(tmp_path: Path
     (tmp_path / "my_sensor.toml").unlink()
     with pytest.raises(SpecError, match=r"my_sensor.toml cannot be read"):
         load_head(tmp_path / "head.toml")
+
+
+@pytest.mark.parametrize("backend", ["picamera2", "v4l2"])
+def test_a_head_says_which_version_of_a_sensor_with_colour_filters_it_has(tmp_path: Path, backend: str) -> None:
+    """A preset, or a sensor's own file, does not make a head of grey pixels accept a mosaic."""
+    text = (HEADS / "imx477.toml").read_text(encoding="utf-8").replace('"picamera2"', f'"{backend}"')
+    (file := tmp_path / "head.toml").write_text(text)
+    assert load_head(file).camera.bayer is False
+    silent = "\n".join(line for line in text.splitlines() if not line.startswith("bayer"))
+    file.write_text(silent)
+    with pytest.raises(SpecError, match=r"imx477 is usual with colour filters: write bayer = false"):
+        load_head(file)
+    (tmp_path / "own.toml").write_text((PRESETS / "imx477.toml").read_text(encoding="utf-8"))
+    file.write_text(silent.replace('sensor = "imx477"', 'sensor = "own.toml"'))
+    with pytest.raises(SpecError, match=r"own.toml is usual with colour filters"):
+        load_head(file)
+
+
+def test_a_head_with_colour_filters_takes_no_pictures_of_eyes(tmp_path: Path) -> None:
+    """Refused before any part is opened, so before the first frame."""
+    text = (HEADS / "imx477.toml").read_text(encoding="utf-8").replace("bayer = false", "bayer = true")
+    (file := tmp_path / "head.toml").write_text(text)
+    with pytest.raises(SpecError, match="colour filters") as caught:
+        open_head(load_head(file), VirtualClock(), MemoryLedger(VirtualClock()))
+    assert "--bayer" in caught.value.remedy
+
+
+def test_a_recorded_mosaic_is_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    grey = rng.poisson(1000, (64, 96)).astype(np.uint16)
+    mosaic = grey.copy()
+    mosaic[::2, ::2] //= 4
+    mosaic[1::2, 1::2] //= 2
+    for name, pixels in {"psf": grey, "grey": grey, "mosaic": mosaic}.items():
+        np.save(tmp_path / f"{name}.npy", pixels)
+    psfs = (tmp_path / "psf.npy",)
+    ReplayCamera(ReplaySpec(raws=(tmp_path / "grey.npy",), psfs=psfs), ReplayLight(), VirtualClock()).close()
+    with pytest.raises(SpecError, match=r"mosaic.npy is a mosaic of colour filters") as caught:
+        ReplayCamera(ReplaySpec(raws=(tmp_path / "mosaic.npy",), psfs=psfs), ReplayLight(), VirtualClock())
+    assert "--bayer" in caught.value.remedy

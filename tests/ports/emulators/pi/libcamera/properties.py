@@ -8,6 +8,7 @@ from libcamera._libcamera import ControlId
 
 class _ColorFilterArrangement(IntEnum):
     RGGB = 0
+    RGB = 4
     MONO = 5
 
 
