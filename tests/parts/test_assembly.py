@@ -10,6 +10,7 @@ from manifold3d import OpType
 from numpy.typing import NDArray
 
 from device.optics import field_extent
+from device.optics.led_cap import LedCap, seen_share
 from device.optics.light_path import relay_of
 from device.optics.matrix import ring
 from device.optics.retina_chart import RINGS
@@ -191,6 +192,18 @@ def test_cap_passes_light_of_the_ring_only(d: Dimensions, head: Solids) -> None:
     assert {i for i, part in enumerate(inside) if part == 1} == set(ring(d.path.ring))
     assert max(part for i, part in enumerate(inside) if i not in ring(d.path.ring)) == 0
     assert max(outside) == 0
+
+
+def test_dies_light_the_penumbra_of_the_optics_through_the_cap(d: Dimensions, head: Solids) -> None:
+    """Rays from 8 x 8 places of a die of 1 mm pass the printed hole as `seen_share` says; a point has no penumbra."""
+    cap = LedCap(d.led_hole_mm, d.led_y_mm - d.cap_end_y_mm, 1.0)
+    (x, z), steps = d.ring_places_mm[0], (np.arange(8) + 0.5) / 8 - 0.5
+    for half_deg, turn in ((0.0, 0.0), (7.5, 0.4), (10.5, 0.0), (12.5, pi / 4), (15.0, 0.0), (21.0, pi / 4)):
+        right, up = (tan(radians(half_deg)) * way for way in (cos(turn), sin(turn)))
+        way = np.array([[right, -1.0, up]])
+        starts = [(x + i * cap.emitter_mm, d.led_y_mm - 1e-4, z + j * cap.emitter_mm) for i in steps for j in steps]
+        passed = sum(len(free(head["LED cap"], start, way)) for start in starts) / len(starts)
+        assert passed == pytest.approx(float(seen_share(cap, right, up)), abs=0.06)  # four places; a hole of many sides
 
 
 def test_light_reaches_the_sensor_only_along_the_axis(d: Dimensions, head: Solids) -> None:
