@@ -182,7 +182,8 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ),
     ("services/lab/reconstruct_file.py", "made.picture), made.simulated)", "made.picture), False)", "reconstruct"),
     ("services/lab/reconstruct_file.py", "{KEY: self.simulated}", "{KEY: False}", "reconstruct"),
-    ("services/lab/reconstruct_inputs.py", "isinstance(source, SimulatedCounts)", "False", "python"),
+    ("services/lab/reconstruct_inputs.py", "if isinstance(source, Raw) else source, SimulatedCounts)",
+     "if isinstance(source, Raw) else source, type(None))", "python"),
     ("services/lab/take_frames.py", "simulated=frame.simulated", "simulated=False", "simulate_and_frame"),
 )  # fmt: skip
 MUTANTS: tuple[Mutant, ...] = (
