@@ -49,7 +49,7 @@ _DECODER_ERRORS = (  # exceptions of the decoders on truncated or damaged files
 class ImageFile:
     """Content of an image file: its frames, each (rows, cols) or (rows, cols, 3), in the stored type.
 
-    `levels` are those that a DNG states, `encoding` the chunk of a PNG with values that are not linear in the light.
+    `levels` are those that a DNG states, `encoding` the tag or chunk of values that are not linear in the light.
     """
 
     frames: tuple[Pixels, ...]
@@ -77,7 +77,7 @@ def read_counts_file(path: Path) -> ImageFile:
     if file.encoding is not None:
         raise FrameError(
             f"{path} states that its values are not linear in the light ({file.encoding})",
-            "Give the linear counts of the sensor. If these are, save them as tiff or npy.",
+            "Give the linear counts of the sensor. If these are, save them as npy, or as tiff without a profile.",
         )
     return file
 
@@ -163,7 +163,7 @@ def _decoded(path: Path, data: bytes, name: str | None) -> ImageFile:
                 pixels, encoding = read_png(data, str(path))
             case _:
                 tiff = read_tiff(data, str(path), dng=suffix == ".dng")
-                pixels, levels = tiff.pixels, tiff.levels
+                pixels, levels, encoding = tiff.pixels, tiff.levels, tiff.encoding
     except FrameError:
         raise
     except _DECODER_ERRORS as error:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL.PngImagePlugin import PngImageFile
 
+from device.config.icc_profile import is_linear
 from device.config.orientation import ORIENTATION, upright
 from device.config.tiff_file import looked_up
 from device.errors import FrameError
@@ -36,6 +37,7 @@ def read_png(data: bytes, name: str) -> tuple[Pixels, str | None]:
         assert isinstance(picture, PngImageFile)
         picture.load()
         orientation = int(picture.getexif().get(ORIENTATION, 1))
+        profile = picture.info.get("icc_profile")
         pixels = np.asarray(picture)
     if depth == 16 and colour == _RGB:
         pixels = _decode_16_bit_colour(data)
@@ -45,7 +47,7 @@ def read_png(data: bytes, name: str) -> tuple[Pixels, str | None]:
     if colour == _PALETTE:
         table = np.frombuffer(chunks["PLTE"], np.uint8).reshape(-1, 3)
         pixels = looked_up(pixels, table * np.uint16(257))
-    return upright(_unscaled(chunks, pixels, depth, colour), orientation, name), _encoding(chunks)
+    return upright(_unscaled(chunks, pixels, depth, colour), orientation, name), _encoding(chunks, profile)
 
 
 def _chunks(data: bytes) -> dict[str, bytes]:
@@ -75,11 +77,13 @@ def _refuse_chunks(chunks: dict[str, bytes], depth: int, colour: int, name: str)
         raise FrameError(f"{name} is an animation (acTL)", "Save the frame that is meant as a file of its own.")
 
 
-def _encoding(chunks: dict[str, bytes]) -> str | None:
+def _encoding(chunks: dict[str, bytes], profile: bytes | None) -> str | None:
     """Return the chunk that states values not linear in the light; None if there is none."""
     gamma = struct.unpack(">I", chunks["gAMA"])[0] if "gAMA" in chunks else _LINEAR
     if "sRGB" in chunks:
         return "sRGB"
+    if profile is not None and not is_linear(profile):
+        return "iCCP"
     return None if gamma == _LINEAR else f"gAMA {gamma / _LINEAR:g}"
 
 

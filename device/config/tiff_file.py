@@ -12,6 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from device.config.dng_levels import NOT_STATED, Levels, tag_values, with_dng_levels
+from device.config.icc_profile import is_linear
 from device.config.orientation import upright
 from device.config.tiff_segments import stored_values
 from device.errors import FrameError
@@ -32,14 +33,19 @@ _NOT_APPLIED: dict[int, tuple[str, tuple[float, ...] | None]] = {
 }  # fmt: skip
 _OPERATIONS = {51008: "OpcodeList1", 51009: "OpcodeList2", 51022: "OpcodeList3"}
 _MISSING_VALUE = 42113  # GDAL_NODATA
+_PROFILE = 34675  # InterColorProfile
 
 
 @dataclass(frozen=True)
 class TiffContent:
-    """Pixels of a TIFF in one of the layouts of image_files.py, upright; `levels` are stated by a DNG."""
+    """Pixels of a TIFF in one of the layouts of image_files.py, upright.
+
+    `levels` are stated by a DNG, `encoding` is the tag that states values not linear in the light.
+    """
 
     pixels: Pixels
     levels: Levels = NOT_STATED
+    encoding: str | None = None
 
 
 def read_tiff(data: bytes, name: str, dng: bool = False) -> TiffContent:
@@ -57,7 +63,7 @@ def read_tiff(data: bytes, name: str, dng: bool = False) -> TiffContent:
         raise FrameError(f"{name} holds raw images of different levels or patterns", "Save each as a file of its own.")
     if len(contents) == 1:
         return contents[0]
-    return TiffContent(np.stack([content.pixels for content in contents]), contents[0].levels)
+    return TiffContent(np.stack([content.pixels for content in contents]), contents[0].levels, contents[0].encoding)
 
 
 def _meant_pages(tiff: tifffile.TiffFile, name: str, dng: bool) -> list[tifffile.TiffPage]:
@@ -111,7 +117,9 @@ def _content(page: tifffile.TiffPage, first: tifffile.TiffPage, name: str) -> Ti
     orientation = 1 if turned is None else int(turned.value)
     if page.photometric in _RAW:
         return TiffContent(*with_dng_levels(page, pixels, orientation, name))
-    return TiffContent(upright(pixels, orientation, name))
+    profile = page.tags.get(_PROFILE)
+    encoded = profile is not None and not is_linear(bytes(profile.value))
+    return TiffContent(upright(pixels, orientation, name), encoding="ICC profile" if encoded else None)
 
 
 def _refuse_tags(page: tifffile.TiffPage, name: str) -> None:

@@ -98,8 +98,8 @@ def take_settings(boot: Path, kept: Path, release: Path, zones: Path) -> Diffusc
         for name, text in beside.items():
             atomic_io.write_atomically(kept / name, text)
         atomic_io.write_atomically(kept / FILE, content)
-        _forget(kept, {FILE, UPDATES, *beside})
         _overwrite_password(source)
+        _forget(kept, {FILE, UPDATES, *beside})
     except DiffuscopeError as error:
         return error
     except OSError as error:
@@ -179,7 +179,7 @@ def _forget(kept: Path, names: set[str]) -> None:
     """Remove every other TOML file that is kept, also a hidden one, durably."""
     for path in kept.glob("*.toml"):
         if path.name not in names:
-            path.unlink()
+            atomic_io.remove(path)
     atomic_io.fsync_folder(kept)
 
 

@@ -239,8 +239,8 @@ MUTANTS: tuple[Mutant, ...] = (
     Mutant(STORE, "if hashlib.sha256(content).hexdigest() != files[name]:", "if False:", T_RECORDS),
     Mutant(STORE, "            self._refuse_duplicate(part, kept)\n", "", T_RECORDS),
     Mutant(
-        "services/records/store_space.py", "free := self._free_bytes(self._folder), self._reserve_bytes):",
-        "free := self._free_bytes(self._folder), 0):", T_RECORDS,
+        "services/records/store_space.py", "has_room(need_bytes, free, self._reserve_bytes):",
+        "has_room(need_bytes, free, 0):", T_RECORDS,
     ),
     Mutant(STORE, "if limit < 1:", "if limit < 0:", T_RECORDS),
     Mutant(STORE, "before).kept)", "before).kept - 1)", T_RECORDS),
@@ -249,7 +249,7 @@ MUTANTS: tuple[Mutant, ...] = (
         'stray.name.startswith(".")', T_RECORDS,
     ),
     Mutant(QUARANTINE, 'stray.name.startswith(".") or not _is_complete(stray)', "not _is_complete(stray)", T_RECORDS),
-    Mutant(STORE, "if missing and any(", "if False and any(", T_RECORDS),
+    Mutant(STORE, "if missing and files_in(", "if False and files_in(", T_RECORDS),
     Mutant(STORE, "        if not (self._captures / capture.id).is_dir():", "        if False:", T_RECORDS),
     Mutant(
         STORE, "atomic_io.replace_durably(part, kept)",

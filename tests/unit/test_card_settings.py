@@ -189,6 +189,7 @@ def test_what_the_settings_no_longer_name_is_forgotten(card: CardBoot) -> None:
     assert card.run() is None
     (card.kept / "update.toml").write_text('channel = "https://updates.example.org/diffuscope"\n')
     (card.kept / "._old.toml").write_bytes(apple_double())
+    (card.kept / "folder.toml").mkdir()
     write(card, GOOD)
     volatile(card)
     assert card.run() is None

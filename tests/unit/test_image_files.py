@@ -363,6 +363,32 @@ def test_picture_with_an_srgb_chunk_is_no_raw_frame(tmp_path: Path) -> None:
         read_psf(path)
 
 
+def profile(curve: bytes) -> bytes:
+    """Return an ICC profile of grey with a tone curve."""
+    return bytes(128) + struct.pack(">I4sII", 1, b"kTRC", 144, len(curve)) + curve
+
+
+CURVES: dict[bytes, str | None] = {
+    b"curv" + bytes(8): None, struct.pack(">4sIIH", b"curv", 0, 1, 256): None,
+    struct.pack(">4sII3H", b"curv", 0, 3, 0, 32768, 65535): None, struct.pack(">4sIHHi", b"para", 0, 0, 0, 65536): None,
+    struct.pack(">4sIIH", b"curv", 0, 1, 563): "gamma 2.2",
+    struct.pack(">4sII3H", b"curv", 0, 3, 0, 14000, 65535): "bent",
+    struct.pack(">4sIHHi", b"para", 0, 0, 0, 144180): "power 2.2", b"curv": "cut short",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_profile_decides_whether_values_are_linear_in_the_light(tmp_path: Path, curve: bytes) -> None:
+    for name in ("a.png", "a.tiff"):
+        Image.fromarray(GOOD["grey.png"]).save(tmp_path / name, icc_profile=profile(curve))
+        assert np.array_equal(read_image(tmp_path / name), GOOD["grey.png"])
+        if CURVES[curve] is None:
+            assert np.array_equal(read_counts(tmp_path / name), GOOD["grey.png"])
+        else:
+            with pytest.raises(FrameError, match=r"not linear in the light \((iCCP|ICC profile)\)"):
+                read_counts(tmp_path / name)
+
+
 @pytest.mark.parametrize("compression", ["tiff_lzw", "packbits", "tiff_adobe_deflate", "zstd", "lzma"])
 def test_tiff_that_pillow_compressed_is_read(tmp_path: Path, compression: str) -> None:
     for name, pixels in (("a.tiff", twelve_bit(3)), ("b.tiff", np.stack([GOOD["grey.png"]] * 3, axis=2))):

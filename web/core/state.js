@@ -60,7 +60,7 @@ const settings = Object.freeze({
  *   shots: readonly Shot[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
  *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: boolean, zoom: number, note: string,
  *   picked: readonly string[], compared: readonly Capture[], montages: Readonly<Record<string, any>>,
- *   folders: {id: string, name: string}[] | null, zipped: boolean, copied: string | null, outbox: any,
+ *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, outbox: any,
  *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
  *   voice: string, sound: boolean, theme: string, letters: boolean, auto: boolean, language: string, timer: number,
  *   blink: boolean, front: number, code: {size: number, path: string} | undefined}} State
