@@ -37,6 +37,7 @@ from device.light_safety.hazard import NO_LIGHT, Hazard, light_limits, radiometr
 from device.optics.matrix import chain_of, lamps_of
 from device.optics.trial_lens import TrialLens
 from device.ports import NO_CHIPS, Button, Camera, Chips, HeadMemory, Light
+from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.sim import calibration_targets, fault_injection
 from device.sim.camera import SimCamera
 from device.sim.chips import SimBattery, SimButton, SimHeadMemory, SimThermometer
@@ -443,7 +444,9 @@ def _replayed(opening: HeadOpener, ledger: Ledger) -> Head:
     camera = ReplayCamera(spec.replay, lamp, clock)
     opening.resources.callback(camera.close)
     light = GuardedLight(lamp, clock, spec.light.max_on_s, hazard_of(spec), ledger)
-    return Head(spec, camera, light, recorded_calibration(camera, spec))
+    recorded = recorded_calibration(camera, spec)
+    psfs = tuple(map(without_hot_pixels, recorded.psfs))
+    return Head(spec, camera, light, replace(recorded, psfs=psfs))
 
 
 def _opened(opening: HeadOpener, ledger: Ledger) -> Head:

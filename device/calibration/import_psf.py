@@ -16,6 +16,7 @@ from device.config.image_files import (
 )
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
+from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.values import Calibration, Image, Psf, Sensor
 
 MAX_SATURATED_SHARE = 0.01  # share of the light
@@ -67,7 +68,7 @@ def read_imported_psf(paths: tuple[Path, ...], info: ImportedPsfInfo) -> Importe
 def _read(path: Path, known: ImportedPsfInfo) -> tuple[Psf, float]:
     try:
         array = read_counts(path)
-        psf = as_psf(array, path.name)
+        psf = without_hot_pixels(as_psf(array, path.name))
         raw = as_raw(array)
         dark = None if known.dark is None else as_companion(read_counts(known.dark), known.dark.name)
     except FrameError as error:
@@ -88,4 +89,4 @@ def _subtract_dark(dark: Image, raw: Raw, name: str) -> Psf:
         raise PsfError(f"the dark frame has the shape {dark.shape}, {name} {pixels.shape}", "Give the PSF's own dark.")
     lit = pixels - dark / np.float32(2**raw.shift)
     lit[raw.bad | np.isnan(lit)] = np.nanmedian(lit)
-    return as_psf(lit, name)
+    return without_hot_pixels(as_psf(lit, name))

@@ -17,6 +17,7 @@ from PIL import Image as Pillow
 from device.config.image_files import Raw, as_psf, as_raw, read_counts, read_image
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError
+from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.values import Image, Psf, SimulatedCounts
 
 Stored = Literal["upright", "upside down", "rotated by 180 degrees"]
@@ -177,7 +178,7 @@ def _upright_psf(array: Pixels, stored: Stored, bgr: bool) -> Pixels:
 def _read_psfs(files: tuple[Path, ...], stored: Stored, bgr: bool, shape: tuple[int, int]) -> tuple[Psf, ...]:
     """Return the PSFs of the files on the pixels of a frame of `shape`; the pairs of a data set share them."""
     return tuple(
-        as_psf(_upright_psf(_on_grid(array, shape, name), stored, bgr), name)
+        without_hot_pixels(as_psf(_upright_psf(_on_grid(array, shape, name), stored, bgr), name))
         for path in files
         for name, array in _psf_arrays(path)
     )

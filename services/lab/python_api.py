@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from device.config.head_file import InstrumentSpec, load_head
 from device.config.image_files import Raw, as_psf, read_psf
 from device.errors import FrameError, SettingError
+from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.recon.estimation.parameter_selection import FrequencySample
 from device.recon.installed_methods import available_methods
 from device.recon.methods import Method
@@ -109,7 +110,7 @@ class ForwardModel:
         field_radius_px: float | None = None,
     ) -> None:  # fmt: skip
         source = _source(psf)
-        kernel = read_psf(source) if isinstance(source, Path) else as_psf(source, "the PSF")
+        kernel = without_hot_pixels(read_psf(source) if isinstance(source, Path) else as_psf(source, "the PSF"))
         sensor = shape or kernel.shape
         if not 1 <= bin <= min(sensor):
             raise SettingError(f"a bin of {bin} does not fit {sensor[0]} x {sensor[1]} pixels", "Give a bin from 1.")

@@ -31,6 +31,7 @@ from device.config.image_files import (
 from device.config.marked_files import is_marked_simulated
 from device.errors import FrameError, PsfError, SettingError, SpecError
 from device.optics.lit_field import picture_field_deg
+from device.recon.estimation.defective_pixels import without_hot_pixels
 from device.recon.method_settings import Settings
 from device.recon.model.kernels import Pixels
 from device.recon.model.preprocessing import MOST_BAD
@@ -218,7 +219,7 @@ def load_psfs(options: ReconstructOptions, loaded: LoadedRaw, per_channel: bool 
         counts = [(_split_psf(raw, name, loaded, loaded.bayer), name) for raw, name in counts]
     for raw, name in counts:
         require_raw_shape(name, (raw.pixels.shape[0], raw.pixels.shape[1]), loaded.solved_shape)
-    cleaned = [clean_channels(raw, name) for raw, name in counts]
+    cleaned = [tuple(map(without_hot_pixels, clean_channels(raw, name))) for raw, name in counts]
     notes = _saturation_notes(counts, cleaned)
     colour = any(len(psfs) == 3 for psfs in cleaned)
     if colour and not (per_channel and loaded.channels == 3):

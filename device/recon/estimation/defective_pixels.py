@@ -13,6 +13,8 @@ the noise is not an image of light: it is a defect.
 * the halo of a reflex: light around a saturated area beyond the fitted smooth field (HALO, HALO_BEGINS, HALO_SD).
 
 A frame without a candidate pixel costs one pass over its pixels.
+
+`without_hot_pixels` applies the outlier test to the image of a PSF, which has no other PSF to be compared with.
 """
 
 from dataclasses import dataclass, replace
@@ -53,6 +55,11 @@ HALO_SAMPLES = 135  # of the shorter side of the sensor, on which halos are meas
 LEAST_AREA = 2  # samples of a saturated area that may have a halo
 RANGE_SHARE = 0.999  # of the PSF's pixels; a frame is a mean of many PSFs, in which no single pixel of one stands out
 PSF_NOISE_SD = 1.0  # subtracted from the PSF's ring excess; the measured noise includes the PSF's own fine lines
+# Excess of a hot pixel of a PSF over its rings, in their ranges: recorded PSFs have up to 8 and 25, hot pixels hundreds
+HOT_RANGES = (10.0, 30.0)
+HOT_SHARE = 0.05  # of the PSF's brightest light (its quantile RANGE_SHARE): a dimmer excess does no harm
+CORE_SHARE = 0.02  # of the light: a pixel with more is the focus of a sharp PSF, and not hot
+MOST_HOT_LIGHT = 0.5  # share of the light: candidates with more are the points of a sharp PSF
 LOW_SHARE = 0.5  # of the black level: the lowest value of a working pixel is so far below it, plus the noise limit
 BLACK_PER_LIMIT = 4  # least black level over the noise limit; with a lower one, values below black are not tested
 FEW = 200  # candidates; with fewer the calibrated noise is kept
@@ -394,3 +401,37 @@ def ring_ranges(psf: Psf) -> tuple[float, float]:
     excess = kernels.ring_excess(pixels, zero_row, no_mask, least, limit * noise.per_dn, limit * noise.floor_dn2)
     near, far = np.quantile(excess, RANGE_SHARE, axis=0, method="higher") if len(excess) else (0.0, 0.0)
     return float(near), float(far)
+
+
+def without_hot_pixels(psf: Psf) -> Psf:
+    """Return the PSF with the median of 3 x 3 pixels in the place of each hot pixel; the PSF itself without any."""
+    pixels = psf.pixels
+    for _ in range(PASSES):
+        found = _hot_pixels(pixels)
+        if not found.size:
+            break
+        pixels, median = pixels.copy(), ndimage.median_filter(pixels, 3)
+        pixels.ravel()[found] = median.ravel()[found]
+    return psf if pixels is psf.pixels else replace(psf, pixels=pixels)
+
+
+def _hot_pixels(pixels: Image) -> Places:
+    """Return the flat indices of the hot pixels in the image of a PSF (rows, cols), of sum 1."""
+    none = np.empty(0, np.int64)
+    if min(pixels.shape) < 5:
+        return none
+    least = HOT_SHARE * float(np.quantile(pixels, RANGE_SHARE))
+    around = np.pad(pixels, 1, constant_values=-np.inf)
+    beside = np.maximum(
+        np.maximum(around[:-2, 1:-1], around[2:, 1:-1]), np.maximum(around[1:-1, :-2], around[1:-1, 2:])
+    )
+    places = np.flatnonzero((pixels > beside + np.float32(least)) & (pixels < CORE_SHARE))
+    if not places.size:
+        return none
+    zero_row, known = np.zeros((1, pixels.shape[1]), np.float32), np.zeros(pixels.shape, np.bool_)
+    noise = PixelNoise.measured(pixels, zero_row)
+    is_hot, limit = np.zeros(places.size, np.bool_), NOISE_SD**2
+    kernels.outliers(pixels, zero_row, known, places, limit * noise.per_dn, limit * noise.floor_dn2, HOT_RANGES, is_hot)
+    found = places[is_hot]
+    are_points = float(pixels.ravel()[found].sum(dtype=np.float64)) > MOST_HOT_LIGHT
+    return none if are_points or found.size > MOST_OUTLIERS * pixels.size else found
