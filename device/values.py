@@ -336,7 +336,8 @@ class Report:
     """Parameters of the solver, most of them chosen from the frame; the keys depend on the method."""
 
     noise_dn: float | None = None
-    """Standard deviation of the noise of one sensor pixel, in DN, at the mean light of the frame."""
+    """Standard deviation of the noise of one sensor pixel, in DN, at the mean light of the frame; of a burst: of the
+    average of its frames, in DN of one exposure."""
 
     residual: float | None = None
     """Rms of frame minus forward model in units of the noise; 1: only noise is left. Null if not computed."""
@@ -356,7 +357,10 @@ class Report:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Reconstructed picture of the retina: linear float32, rows x cols (x 3) of the sensor, with its report."""
+    """Reconstructed picture of the retina: linear float32, rows x cols (x 3) of the sensor, with its report.
+
+    It is in DN of one exposure; of a burst, in DN of its first used frame.
+    """
 
     picture: Image
     report: Report

@@ -127,7 +127,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
     ] = None,
     channel: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME RAW PSF", help="One colour: red, green, blue or amber; again for each frame."),
+        typer.Option(metavar="NAME RAW [PSF]", help="One colour: red, green, blue or amber; again for each frame."),
     ] = None,
     calibration: Annotated[
         str | None,
@@ -177,7 +177,7 @@ def reconstruct(  # size: each option of the command is one declared parameter
 
     With --each one picture of every frame of a recording; with --channel one colour picture.
     """
-    channels, raws = parse_channels(channel or []), raw or []
+    channels, raws = parse_channels(channel or [], calibration is not None), raw or []
     common_dark, darks = parse_darks(dark or [])
     options = ReconstructOptions(
         raws[0] if raws else Path(), psf_stack(psf or ()), None if each else output, method, budget_s, common_dark,

@@ -1,11 +1,13 @@
 """Reconstruction of the bursts of an instrument: quick look of the first frame, joined frame, one picture.
 
 The joined frame is solved as the sum of its N frames: a sum has the gain of the sensor, so that one planned solver
-serves any N. Its read noise is taken as that of one frame: the missing factor sqrt(N) is small beside shot noise.
+serves any N. Its read noise is taken as that of one frame: the missing factor sqrt(N) is small beside shot noise. The
+picture and its report are in DN of one exposure, that of the reference (`in_one_exposure`, NUMERICS.md 9.2).
 """
 
 from collections.abc import Container, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import log
 
 import numpy as np
 
@@ -35,15 +37,17 @@ class PreparedFrame:
 class BurstReconstructor:
     """Reconstruction of bursts by `single`, which also makes quick looks and pictures of one frame.
 
-    One burst at a time; between two of its steps `single` may make quick looks of other frames. Not thread-safe.
+    `timed`: the costs of the steps are measured on noise, for deadlines. One burst at a time; between two of its steps
+    `single` may make quick looks of other frames. Not thread-safe.
     """
 
-    def __init__(self, single: Reconstructor, planner: Planner) -> None:
+    def __init__(self, single: Reconstructor, planner: Planner, *, timed: bool = True) -> None:
         calibration, shape, index = single.calibration, single.shape, single.psf_index
         self.single, self.clock = single, single.clock
         self.joiner = BurstJoiner(calibration, shape, planner, single.clock, index, single)
         self.see_cost, self.join_cost = DurationEstimate(), DurationEstimate()  # of one frame
-        self._warm_up()
+        if timed:
+            self._warm_up()
 
     def _warm_up(self) -> None:
         """Make a picture of two frames of noise, to compile the kernels and to measure the cost."""
@@ -174,12 +178,13 @@ class _Run:
                 yield step
             elif isinstance(step, Reconstruction) and is_solved:
                 quality = step.report.quality | {"saturated": saturated}
-                yield self._reported(replace(step, report=replace(step.report, quality=quality)), joined.frames)
+                made = replace(step, report=replace(step.report, quality=quality))
+                yield self._reported(in_one_exposure(made, joined.light), joined.frames)
             elif isinstance(step, Reconstruction):  # no time for the last stage: this is the picture of one frame
                 yield self._reported(step, only(next(one.index for one in joined.frames if one.used), joined.frames))
             elif step.last:  # the quick look was that of the first frame
                 is_solved = True
-                yield step
+                yield replace(step, picture=step.picture / np.float32(joined.light))
 
     def solve_one(
         self, counts: Pixels, dark: Pixels | None, uses: Sequence[FrameUse], index: int, simulated: bool,
@@ -200,6 +205,21 @@ class _Run:
     def _reported(self, made: Reconstruction, frames: tuple[FrameUse, ...]) -> Reconstruction:
         seconds = {"join": self._join_s} | made.report.seconds
         return replace(made, report=replace(made.report, seconds=seconds, frames=frames))
+
+
+def in_one_exposure(made: Reconstruction, light: float) -> Reconstruction:
+    """Return the picture of a sum, `light` times the light of one exposure, with picture and report in DN of that one.
+
+    Its noise is that of the average. Weights of the solver (tau, mu) stay those of the sum.
+    """
+    report = made.report
+    quality = report.quality | {"mean_dn": report.quality["mean_dn"] / light}
+    figures = {name: value / light if name.endswith("_dn") else value for name, value in report.regularisation.items()}
+    if "prior_log_power" in figures:
+        figures["prior_log_power"] -= 2 * log(light)
+    noise_dn = None if report.noise_dn is None else report.noise_dn / light
+    report = replace(report, quality=quality, regularisation=figures, noise_dn=noise_dn)
+    return replace(made, picture=made.picture / np.float32(light), report=report)
 
 
 def only(index: int, uses: Sequence[FrameUse]) -> tuple[FrameUse, ...]:

@@ -1,14 +1,20 @@
-"""Checks of the raws of a burst: frames that are the same exposure, PSFs given as frames, a first frame of no use."""
+"""Raws of a burst: their common levels, which are unusable, and refusals of what is no burst.
+
+Refused are frames that are the same exposure, PSFs given as frames, and a first frame of no use.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from hashlib import sha256
 
 import numpy as np
 from scipy import fft
 
-from device.errors import FrameError
+from device.config.image_files import Raw, common_white_dn
+from device.errors import FrameError, SettingError
+from device.recon.model.kernels import Pixels
 from device.values import FrameUse, Image, Psf
-from services.lab.reconstruct_inputs import LoadedRaw
+from services.lab.reconstruct_inputs import LoadedRaw, refuse_without_signal
 
 LOW, HIGH = (2, 5), (10, 30)  # cycles per shorter side of a frame
 # Power at HIGH over that at LOW, of a frame over that of its PSF: a point has 1 and PSFs of other depths 0.4 to 2.4, an
@@ -52,11 +58,11 @@ def _fall(image: Image) -> float:
     return high / max(low, 1e-30)
 
 
-def refuse_without_first(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> None:
-    """Raise FrameError if the first raw was left out: the picture would be on the grid of another one."""
-    if not frames[0].used:
+def refuse_without_first(loaded: Sequence[LoadedRaw], reason: str | None) -> None:
+    """Raise FrameError with the reason, if the first raw was left out: the picture would be on another grid."""
+    if reason is not None:
         raise FrameError(
-            f"the first frame of the burst, {loaded[0].name}, was left out: {frames[0].reason}",
+            f"the first frame of the burst, {loaded[0].name}, was left out: {reason}",
             f"Begin with a good frame: the picture is on its grid. {STACK_REMEDY}",
         )
 
@@ -67,3 +73,62 @@ def _grey(loaded: LoadedRaw) -> Image:
     grey = np.asarray(pixels, np.float32).copy()
     grey[loaded.raw.bad] = np.median(grey[~loaded.raw.bad])
     return grey
+
+
+def unusable_raws(loaded: Sequence[LoadedRaw]) -> dict[int, str]:
+    """Return the reason of each raw that holds no usable signal, by its place in the burst."""
+    reasons = {}
+    for k, one in enumerate(loaded):
+        try:
+            refuse_without_signal(one.raw, one.name)
+        except FrameError as error:
+            reasons[k] = error.message
+    return reasons
+
+
+def common_raw(usable: Sequence[LoadedRaw]) -> LoadedRaw:
+    """Return the first usable raw with the levels of all; the bits of a file follow from its brightest pixel.
+
+    FrameError for raws of different shapes, colour patterns or levels, SettingError for colour raws.
+    """
+    first = usable[0]
+    if first.channels != 1:
+        raise SettingError(
+            "the raws of a burst have one channel, and these have three",
+            "Give the raws of each colour with its PSF: --channel NAME RAW PSF.",
+        )
+    for one in usable[1:]:
+        if (one.shape, one.channels) != (first.shape, first.channels):
+            raise FrameError(
+                f"{one.name} has {_size(one)}, {first.name} {_size(first)}",
+                "Give the raws of one burst, in one and the same camera mode.",
+            )
+        if _storage(one) != _storage(first):
+            raise FrameError(
+                f"{one.name} is stored in another way than {first.name}: other levels, or other types of numbers",
+                "Give the raws of one burst, saved in one format.",
+            )
+    white_dn = common_white_dn([one.raw for one in usable])
+    return replace(first, raw=replace(first.raw, white_dn=white_dn, bad=np.zeros(first.solved_shape, np.bool_)))
+
+
+def _storage(raw: LoadedRaw) -> tuple[object, ...]:
+    return raw.raw.shift, raw.raw.pixels.dtype, raw.black_dn
+
+
+def without_bad(raw: Raw) -> Pixels:
+    """Return the counts, with NaN for bad pixels if there are any."""
+    if not raw.bad.any():
+        return raw.pixels
+    return np.where(raw.bad, np.float32(np.nan), raw.pixels.astype(np.float32))
+
+
+def rejections(loaded: Sequence[LoadedRaw], frames: Sequence[FrameUse]) -> tuple[str, ...]:
+    """Return a note for each raw that is not used."""
+    return tuple(
+        f"{one.name} was left out: {use.reason}." for one, use in zip(loaded, frames, strict=True) if not use.used
+    )
+
+
+def _size(raw: LoadedRaw) -> str:
+    return f"{raw.shape[0]} x {raw.shape[1]} pixels" + (" in three channels" if raw.channels == 3 else "")

@@ -1,4 +1,7 @@
-"""Options of `diffuscope reconstruct` that take a channel: `--channel NAME RAW PSF`, and `--dark NAME=FILE`."""
+"""Options of `diffuscope reconstruct` that take a channel: `--channel NAME RAW PSF`, and `--dark NAME=FILE`.
+
+With `--calibration` it is `--channel NAME RAW`.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
@@ -16,10 +19,10 @@ CHANNEL_REMEDY = "Give --channel NAME RAW PSF, as in --channel green raw.npy psf
 
 
 class ReconstructCommand(TyperCommand):
-    """Command with the repeatable option `--channel NAME RAW PSF`: typer declares no lists of several values."""
+    """Command with the repeatable option `--channel NAME RAW [PSF]`: typer declares no lists of several values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Join the three values of each `--channel` to one, then parse as every command does."""
+        """Join the values of each `--channel` to one, then parse as every command does."""
         joined = _joined(args)
         refuse_stray(joined, {name for one in self.params if _takes_value(one) for name in one.opts})
         return super().parse_args(ctx, joined)
@@ -53,25 +56,29 @@ def refuse_stray(words: Sequence[str], with_value: Collection[str]) -> None:
 
 
 def _joined(args: Sequence[str]) -> list[str]:
-    words, joined = iter(args), []
+    stored = any(word.partition("=")[0] == "--calibration" for word in args)
+    words, joined, count = iter(args), [], 2 if stored else 3
     for word in words:
         joined.append(word)
         if word == "--channel":
-            joined.append(SEPARATOR.join(islice(words, 3)))
+            joined.append(SEPARATOR.join(islice(words, count)))
     return joined
 
 
-def parse_channels(words: Sequence[str]) -> list[ChannelSource]:
-    """Return the values of `--channel`, in their order; SettingError for an unknown name or fewer than three values."""
+def parse_channels(words: Sequence[str], stored: bool) -> list[ChannelSource]:
+    """Return the values of `--channel`, in their order; SettingError for an unknown name or too few values.
+
+    `stored`: the PSFs are those of a stored calibration, and a channel has a name and a raw.
+    """
     found = []
     for word in words:
         values = word.split(SEPARATOR)
-        if len(values) != 3:
+        if len(values) < (2 if stored else 3):
             raise SettingError("a channel has a name, a raw and a PSF", CHANNEL_REMEDY)
-        name, raw, psf = values
+        name, raw, *psf = values
         if name not in CHANNELS:
             raise SettingError(f"'{name}' is no channel", f"Choose from {', '.join(CHANNELS)}.")
-        found.append(ChannelSource(name, Path(raw), Path(psf)))
+        found.append(ChannelSource(name, Path(raw), Path(psf[0]) if psf else None))
     return found
 
 

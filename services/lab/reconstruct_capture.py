@@ -1,16 +1,21 @@
 """Reconstruction of all frames of one capture as the instrument makes it: burst, other colours of light, dark frame.
 
+The one path from files to the picture of a burst, for `diffuscope reconstruct` and `diffuscope archive`.
+
 The solvers are those of a press (`device.recon.burst_reconstructor`, `colour_reconstructor`). They are planned once for
 each calibration, frame shape and set of levels, so that many captures of one head follow each other at little cost.
 """
 
 from collections import OrderedDict, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from device.clock import Deadline, SystemClock
 from device.errors import FrameError
+from device.recon.assessment.exposure_split import dark_fits
 from device.recon.assessment.image_quality import NO_SIGNAL
 from device.recon.burst_reconstructor import BurstReconstructor
 from device.recon.colour_reconstructor import ColourReconstruction, ColourReconstructor
@@ -20,11 +25,14 @@ from device.recon.model.field_of_view import field_box
 from device.recon.model.kernels import Pixels
 from device.recon.reconstructor import Reconstructor
 from device.recon.white_balance import light_dn_per_s
-from device.values import Calibration, Colour, FrameUse, Image, Reconstruction, Report
-from services.lab.reconstruct_burst import common_raw, rejections, unusable_raws, without_bad
+from device.values import Calibration, Colour, FrameUse, Image, Psf, Reconstruction, Report
+from services.imaging.picture_files import read_raw_tiff
+from services.imaging.raw_metadata import RawMetadata
+from services.lab.burst_frames import common_raw, rejections, unusable_raws, without_bad
 from services.lab.reconstruct_file import (
     FileReconstruction,
     FileReconstructor,
+    doubts,
     file_report,
     plan_reconstructor,
     refuse_invalid,
@@ -33,10 +41,13 @@ from services.lab.reconstruct_inputs import (
     LoadedPsfs,
     LoadedRaw,
     ReconstructOptions,
+    Source,
     companion,
+    companion_notes,
     load_calibrations,
     load_psfs,
     load_raw,
+    without_unknown,
 )
 
 KEPT_PLANS = 2  # each has the solvers of a burst and of the other colours
@@ -54,13 +65,45 @@ class CaptureFrames:
     `full_drive_s`: exposure of the first frame in each light, seconds times the level of the lamp, where it is known.
     """
 
-    lit: tuple[Path, ...]
-    colours: Mapping[Colour, Path] = field(default_factory=dict)
-    dark: Path | None = None
+    lit: tuple[Source, ...]
+    colours: Mapping[Colour, Source] = field(default_factory=dict)
+    dark: Source | None = None
     dark_fits_colours: bool = True
     light: Colour | None = None
     unusable: Mapping[int, str] = field(default_factory=dict)
     full_drive_s: Mapping[Colour, float] = field(default_factory=dict)
+
+
+def frames_of_capture(
+    lit: Sequence[Source], colours: Mapping[Colour, Source], dark: Source | None = None,
+    unusable: Mapping[int, str] | None = None,
+) -> CaptureFrames:  # fmt: skip
+    """Return the frames of a capture with the light and the exposures that its raw files state."""
+    stated = stated_by(lit[0])
+    light = None if stated is None or stated.illumination is None else stated.illumination.colour
+    full_drive_s = {
+        one.illumination.colour: one.exposure_s * one.illumination.level
+        for one in map(stated_by, (lit[0], *colours.values()))
+        if one is not None and one.illumination is not None and one.exposure_s is not None
+    }
+    fits = _dark_fits(lit[0] if dark is None else dark, colours.values())
+    return CaptureFrames(tuple(lit), colours, dark, fits, light, unusable or {}, full_drive_s)
+
+
+def _dark_fits(dark: Source, others: Iterable[Source]) -> bool:
+    """Return True if the dark frame fits the frames in other colours of light, as far as they state an exposure."""
+    dark_s, *others_s = (None if one is None else one.exposure_s for one in map(stated_by, (dark, *others)))
+    return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
+
+
+def stated_by(raw: Source) -> RawMetadata | None:
+    """Return what a raw frame of the instrument states about itself; None for another file, or an array."""
+    if not isinstance(raw, Path) or raw.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    try:
+        return read_raw_tiff(raw.read_bytes())[1]
+    except (FrameError, OSError):
+        return None
 
 
 @dataclass(frozen=True)
@@ -73,6 +116,32 @@ class CaptureReconstruction:
     made: FileReconstruction
     box: Box
     colour: Image | None = None
+
+
+@dataclass(frozen=True)
+class LoadedCapture:
+    """Frames of a capture as they are solved, with the reason of each unusable one by its index in `lit`.
+
+    `common` has the levels of all usable frames; `notes` are sentences about the files of the PSFs.
+    """
+
+    frames: CaptureFrames
+    lit: tuple[LoadedRaw, ...]
+    others: Mapping[Colour, LoadedRaw]
+    unusable: Mapping[int, str]
+    common: LoadedRaw
+    plan: "_Plan"
+    notes: tuple[str, ...]
+
+    @property
+    def usable(self) -> tuple[LoadedRaw, ...]:
+        """Frames of the burst that may enter the picture."""
+        return tuple(one for k, one in enumerate(self.lit) if k not in self.unusable)
+
+    @property
+    def psfs(self) -> tuple[Psf, ...]:
+        """PSFs of the burst."""
+        return self.plan.single.calibration.psfs
 
 
 class CaptureReconstructor:
@@ -96,19 +165,31 @@ class CaptureReconstructor:
         """Return the picture of a capture; FrameError or PsfError for frames that cannot be solved."""
         if len(frames.lit) == 1 and not frames.colours:
             return self._single(frames)
-        lit = [load_raw(path, self._options.bayer, checked=False) for path in frames.lit]
+        return self.solve(self.load(frames))
+
+    def load(self, frames: CaptureFrames) -> LoadedCapture:
+        """Return the frames of a capture with planned solvers; FrameError if none can be used, or for colour raws."""
+        lit = tuple(load_raw(source, self._options.bayer, checked=False) for source in frames.lit)
         unusable = {**unusable_raws(lit), **frames.unusable}
         if len(unusable) == len(lit):
-            raise FrameError(f"no frame of the capture can be used; the first: {unusable[0]}", "Take it again.")
+            raise FrameError(f"no frame of the burst can be used; the first: {unusable[0]}", "Take it again.")
         common = common_raw([one for k, one in enumerate(lit) if k not in unusable])
-        others = {name: load_raw(path) for name, path in frames.colours.items()}
+        others = {name: load_raw(source) for name, source in frames.colours.items()}
         _refuse_different(common, others)
         plan, notes = self._plan(common, frames)
+        return LoadedCapture(frames, lit, others, unusable, common, plan, notes)
+
+    def solve(self, loaded: LoadedCapture) -> CaptureReconstruction:
+        """Return the picture of a loaded capture; FrameError for frames that cannot be solved."""
+        frames, common = loaded.frames, loaded.common
         dark = None if frames.dark is None else companion(frames.dark, "the dark frame", common)
-        made = plan.solve([without_bad(one.raw) for one in lit], unusable, dark, {
-            name: without_bad(one.raw) for name, one in others.items()
-        }, dark if frames.dark_fits_colours else None, frames.full_drive_s)  # fmt: skip
-        return self._reported(made, plan, [*lit, *others.values()], notes)
+        lit = [without_unknown(without_bad(one.raw), dark)[0] for one in loaded.lit]
+        others = {name: without_unknown(without_bad(one.raw), dark)[0] for name, one in loaded.others.items()}
+        dark = None if dark is None else np.nan_to_num(dark)
+        made = loaded.plan.solve(
+            lit, loaded.unusable, dark, others, dark if frames.dark_fits_colours else None, frames.full_drive_s
+        )
+        return self._reported(made, loaded.plan, [*loaded.lit, *loaded.others.values()], loaded.notes)
 
     def _single(self, frames: CaptureFrames) -> CaptureReconstruction:
         """Return the picture of one frame, with the solver of one frame."""
@@ -166,7 +247,12 @@ class CaptureReconstructor:
         if NO_SIGNAL in made.report.warnings:
             raise FrameError(f"{loaded[0].name} holds no signal above the black level", "Give frames taken with light.")
         count = len(made.report.frames)
-        texts = (*rejections(loaded[:count], made.report.frames), *notes, *(n for one in loaded for n in one.notes))
+        of_raws = [note for one in loaded for note in one.notes]
+        of_companions = companion_notes(self._options, plan.single.calibration)
+        texts = (
+            *doubts(made.report, plan.single, of_raws), *rejections(loaded[:count], made.report.frames), *notes,
+            *of_companions, *of_raws,
+        )  # fmt: skip
         report = file_report(made.report, plan.single, self._options)
         report = replace(report, warnings=tuple(dict.fromkeys((*report.warnings, *texts))))
         simulated = made.simulated or plan.single.calibration.simulated or any(one.simulated for one in loaded)
@@ -194,7 +280,7 @@ class _Plan:
     ) -> None:  # fmt: skip
         self._budget_s, self._clock = options.budget_s, SystemClock()
         self.single = plan_reconstructor(options, green, shape, planner, index, quick=True)
-        self._bursts = BurstReconstructor(self.single, planner)
+        self._bursts = BurstReconstructor(self.single, planner, timed=self._budget_s is not None)
         like_green = replace(options, bin=self.single.stages[-1].recipe.bin)
         self._missing = {name: why for name, why in others.items() if isinstance(why, str)}
         solvers: dict[Colour, Reconstructor] = {}

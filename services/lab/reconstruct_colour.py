@@ -1,4 +1,4 @@
-"""`diffuscope reconstruct --channel NAME RAW PSF ...`: one colour picture of frames in several colours of light."""
+"""`diffuscope reconstruct --channel NAME RAW [PSF] ...`: one colour picture of frames in several colours of light."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from device.recon.model.field_of_view import field_radius_px, lit_field
 from device.recon.model.grid import Grid
 from device.values import Colour, FrameUse, Image
 from services.lab.psf_stack import psf_stack
-from services.lab.reconstruct_burst import load_burst, solve_burst
+from services.lab.reconstruct_burst import solve_burst
 from services.lab.reconstruct_file import (
     FileReconstruction,
     FileReconstructor,
@@ -29,11 +29,11 @@ from services.lab.reconstruct_inputs import ReconstructOptions, Source, load_cal
 
 @dataclass(frozen=True)
 class ChannelSource:
-    """Raw and PSF of one frame in one colour of light; files or arrays."""
+    """Raw and PSF of one frame in one colour of light; files or arrays. `psf` None: that of a stored calibration."""
 
     name: Colour
     raw: Source
-    psf: Source
+    psf: Source | None = None
 
 
 def reconstruct_colours(
@@ -46,6 +46,8 @@ def reconstruct_colours(
     of single channels. SettingError for options that do not fit, FrameError for frames of different shapes.
     """
     channels, darks = _by_name(sources), darks or {}
+    if options.calibration is not None:
+        return _press(channels, options, darks)
     _refuse_invalid(channels, options, darks)
     planner = Planner(options.plans)
     share_s = None if options.budget_s is None else options.budget_s / len(channels)
@@ -60,12 +62,48 @@ def reconstruct_colours(
     return _joined(sources, channels, made, options)
 
 
+def _press(
+    channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
+) -> FileReconstruction:
+    """Reconstruct the frames of a press with a stored calibration, write its colour picture and return it.
+
+    As the instrument does: a burst in green light, and one frame in each other colour. The picture has the size of the
+    raws and is 0 outside the lit field.
+    """
+    raws = [one.raw for one in channels.get("green", ())]
+    others: dict[Colour, Source] = {name: given[0].raw for name, given in channels.items() if name != "green"}
+    if not raws or not others or len(raws) + len(others) != sum(map(len, channels.values())):
+        raise SettingError(
+            "with a calibration a colour picture needs frames in green light and one in each other colour",
+            "Give --channel green RAW, and --channel NAME RAW once for each other colour.",
+        )
+    if darks or any(one.psf is not None for given in channels.values() for one in given):
+        raise SettingError(
+            "with a calibration a channel has no PSF and no dark frame of its own",
+            "Give --channel NAME RAW, and --dark FILE.",
+        )
+    refuse_overwriting((options.output, options.report), [*raws, *others.values()])
+    solved = solve_burst(raws, replace(options, raw=raws[0]), Planner(options.plans), others)
+    made = solved.made
+    if solved.colour is None:
+        reasons = "; ".join(f"{one.name}: {one.reason}" for one in made.report.channels if one.reason)
+        raise FrameError(f"no other colour can be joined to green: {reasons}", "Look at these frames.")
+    picture = np.zeros((*made.picture.shape, 3), np.float32)
+    picture[solved.box] = solved.colour
+    if options.output is not None:
+        write_picture(options.output, picture, made.simulated)
+    return replace(made, picture=picture)
+
+
 def _refuse_invalid(
     channels: Mapping[Colour, list[ChannelSource]], options: ReconstructOptions, darks: Mapping[str, Source]
 ) -> None:
     """Raise SettingError for options that a colour picture does not have, or an output that is an input."""
-    if options.calibration is not None or options.psfs or options.bayer is not None:
-        raise SettingError("each channel has a PSF of its own", "Leave --psf, --calibration and --bayer out.")
+    given = [source for one in channels.values() for source in one]
+    if options.psfs or options.bayer is not None or any(one.psf is None for one in given):
+        raise SettingError(
+            "each channel has a PSF of its own", "Give --channel NAME RAW PSF, without --psf and --bayer."
+        )
     if options.even or options.sweep is not None:
         raise SettingError("a colour picture is not evened out, and has no sweep", "Leave --even and --sweep out.")
     for name in darks:
@@ -73,7 +111,6 @@ def _refuse_invalid(
             raise SettingError(f"a dark frame is given for {name}, which is no channel", "Give the channel, too.")
     if options.output is not None:
         refuse_output(options.output)
-    given = [source for one in channels.values() for source in one]
     inputs = [*(one.raw for one in given), *(one.psf for one in given), *darks.values()]
     refuse_overwriting((options.output, options.report), [*inputs, options.dark, options.flat, options.head])
 
@@ -93,8 +130,12 @@ def _by_name(sources: Sequence[ChannelSource]) -> dict[Colour, list[ChannelSourc
     return channels
 
 
-def _same(one: Source, other: Source) -> bool:
-    if isinstance(one, Path) or isinstance(other, Path):
+def _psfs(source: ChannelSource) -> tuple[Source, ...]:
+    return () if source.psf is None else psf_stack([source.psf])
+
+
+def _same(one: Source | None, other: Source | None) -> bool:
+    if one is None or other is None or isinstance(one, Path) or isinstance(other, Path):
         return one is other or (isinstance(one, Path) and isinstance(other, Path) and one.resolve() == other.resolve())
     return np.array_equal(one, other)
 
@@ -102,10 +143,10 @@ def _same(one: Source, other: Source) -> bool:
 def _channel(given: Sequence[ChannelSource], options: ReconstructOptions, planner: Planner) -> FileReconstruction:
     """Reconstruct the frames of one channel: one frame, or a burst."""
     raws = [one.raw for one in given]
-    options = replace(options, raw=raws[0], psfs=psf_stack([given[0].psf]), output=None, report=None)
+    options = replace(options, raw=raws[0], psfs=_psfs(given[0]), output=None, report=None)
     try:
         if len(raws) > 1:
-            return solve_burst(load_burst(raws, options), options, planner)
+            return solve_burst(raws, options, planner).made
         made = FileReconstructor(options)(raws[0])
     except FrameError as error:
         raise FrameError(f"{given[0].name}: {error.message}", error.remedy) from error
@@ -139,9 +180,7 @@ def _joined(
 
 def _field(source: ChannelSource, picture: Image, options: ReconstructOptions) -> Image:
     """Return the lit field on the picture's pixels, 0 to 1: of the head, else the lit area of the picture."""
-    calibration = load_calibration(
-        replace(options, raw=source.raw, psfs=psf_stack([source.psf])), load_raw(source.raw, "none")
-    )
+    calibration = load_calibration(replace(options, raw=source.raw, psfs=_psfs(source)), load_raw(source.raw, "none"))
     shape = picture.shape[0], picture.shape[1]
     if np.isfinite(field_radius_px(calibration)):
         return field_mask(calibration, shape)

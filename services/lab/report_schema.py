@@ -70,7 +70,7 @@ REGULARISATION: Mapping[str, str] = {
 QUALITY: Mapping[str, str] = {
     "saturated": "Share of the pixels at or above the white level, 0 to 1.",
     "missing": "Share of the frame that was left out (saturated, defective, not a number), 0 to 1.",
-    "mean_dn": "Mean of the pixels that are not missing, above dark, in DN; of an instrument's burst: of its sum.",
+    "mean_dn": "Mean of the pixels that are not missing, above dark, in DN.",
     "through": "Share of the light that came through the eye: one minus stray light over mean. Eyes have 0.9 and more.",
     "coverage": "Share of the field that is lit, 0 to 1; null if the field is not known.",
     "cutoff_per_px": "Lowest frequency where the signal is below the noise, in cycles per sensor pixel.",

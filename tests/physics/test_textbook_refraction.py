@@ -1,6 +1,5 @@
 """Refraction of textbook frames (`tests/textbook`), which share no code with simulator and estimator."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,10 +7,9 @@ import pytest
 
 from device.recon.estimation.psf_warp import transform, warped
 from device.recon.estimation.refraction import NoRefraction, Refraction, RefractionEstimator
-from device.recon.estimation.refraction_notation import report_of, scatter_of
+from device.recon.estimation.refraction_notation import report_of
 from device.recon.model.fft_plans import Planner
-from device.values import Calibration, Geometry, Psf, Report, Sensor
-from services.lab.reconstruct_burst import with_scatter
+from device.values import Calibration, Geometry, Psf, Sensor
 from tests.textbook.fundus_frame import Camera, Counts, FieldEdge, blurred, degrees
 from tests.textbook.propagation import Optics, Plane, Prescription, caustic, diffuser
 
@@ -146,11 +144,6 @@ def test_an_eye_that_accommodates_between_the_frames_has_the_sd_of_its_scatter(
     assert whole.sd_dpt == whole.scatter.sd_dpt == pytest.approx(float(np.std(spheres_dpt, ddof=1)), rel=0.2)
     assert whole.sphere_dpt == pytest.approx(-np.mean(spheres_dpt), abs=0.1)
     assert abs(first.sphere_dpt - whole.sphere_dpt) > 0.1
-    made = Report("variation", refraction_dpt=report_of(replace(first, sd_dpt=0.03)))  # that of a joined frame
-    files = with_scatter(made, estimator, burst)
-    assert files.refraction_scatter == scatter_of(whole)
-    assert files.refraction_dpt is not None
-    assert files.refraction_dpt["sd"] == pytest.approx(whole.scatter.sd_dpt)
 
 
 def test_frames_with_too_different_refractions_are_refused(estimator: RefractionEstimator, first: Refraction) -> None:

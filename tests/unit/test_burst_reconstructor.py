@@ -58,6 +58,15 @@ def test_a_burst_gives_one_quick_look_pauses_and_one_better_picture(bursts: Burs
     assert made.report.seconds["join"] > 0
 
 
+def test_a_burst_is_in_dn_of_one_exposure(bursts: BurstReconstructor, frames: list) -> None:
+    one, made = picture(bursts, frames[:1]), picture(bursts, frames)
+    assert made.picture.mean() == pytest.approx(one.picture.mean(), rel=0.02)  # the noise of one frame
+    figures, of_one = made.report, one.report
+    assert figures.quality["mean_dn"] == pytest.approx(of_one.quality["mean_dn"], rel=0.01)
+    assert figures.noise_dn == pytest.approx(of_one.noise_dn / COUNT**0.5, rel=0.1)
+    assert figures.regularisation["flat_dn"] == pytest.approx(of_one.regularisation["flat_dn"], rel=0.05)
+
+
 def test_frames_prepared_during_the_exposure_give_the_same_picture(bursts: BurstReconstructor, frames: list) -> None:
     ready = {k: bursts.prepare(frames[k], refract=k == 0) for k in range(COUNT - 1)}  # the last one is not prepared
     look, *steps = bursts.steps(frames, simulated=True, prepared=ready)

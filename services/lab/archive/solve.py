@@ -5,7 +5,7 @@ Nothing here needs Dask: a bare process computes the same bytes.
 
 import shutil
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,10 +16,8 @@ from device.clock import Clock, SystemClock
 from device.config.image_files import only_frame, read_image_file
 from device.config.marked_files import tiff_bytes
 from device.errors import CalibrationError, FrameError, PsfError, SettingError, SpecError
-from device.recon.assessment.exposure_split import dark_fits
 from device.recon.model.fft_plans import Planner
 from device.values import Colour, Image
-from services.imaging.picture_files import read_raw_tiff
 from services.imaging.raw_metadata import RawMetadata
 from services.lab.archive.content import different_versions, digest_of, file_digest, software
 from services.lab.archive.plan import COLOUR_ROLES, PlannedCalibration, PlannedCapture, PlanSettings, Role
@@ -34,7 +32,13 @@ from services.lab.archive.result import (
 )
 from services.lab.montage_files import read_picture
 from services.lab.pair_scores import PairScorer
-from services.lab.reconstruct_capture import CaptureFrames, CaptureReconstruction, CaptureReconstructor
+from services.lab.reconstruct_capture import (
+    CaptureFrames,
+    CaptureReconstruction,
+    CaptureReconstructor,
+    frames_of_capture,
+    stated_by,
+)
 from services.lab.reconstruct_inputs import ReconstructOptions
 
 KEPT_SOLVERS = 2  # captures come sorted by calibration; a solver takes up to about 300 MB at full sensor size
@@ -147,10 +151,8 @@ class Solvers:
             return Quarantined(name, "source", f"{error.filename}: {error.strerror}", "Give the source again.", True)
         except FrameError as error:
             return Quarantined(name, "changed", error.message, error.remedy, retry=True)
-        stated = _stated(frames.lit[0])
-        light = None if stated is None or stated.illumination is None else stated.illumination.colour
         try:
-            solved = self._solver(task)(replace(frames, light=light))
+            solved = self._solver(task)(frames)
             scores = _scores(solved.made.picture, capture)
         except REFUSED as error:
             remedy = f"{error.remedy} {AGAIN}".strip()
@@ -158,7 +160,7 @@ class Solvers:
         report = solved.made.report
         warnings = tuple(one.replace(f"{spool}/raw/", "") for one in report.warnings)  # the copies are temporary
         made = replace(solved.made, report=replace(report, warnings=warnings))
-        return _Made(replace(solved, made=made), _facts(stated), scores)
+        return _Made(replace(solved, made=made), _facts(stated_by(frames.lit[0])), scores)
 
     def _solver(self, task: Task) -> CaptureReconstructor:
         key = task.calibration.digest, digest_of(task.settings.model_dump())  # a worker may outlive a plan
@@ -194,27 +196,7 @@ def _copied_frames(capture: PlannedCapture, spool: Path) -> CaptureFrames:
             unusable |= {len(lit): one.unusable} if one.unusable else {}
             lit.append(copy)
     dark = _copied(capture.dark, capture.dark_sha256, spool / "dark") if capture.dark else None
-    full_drive_s = {
-        stated.illumination.colour: stated.exposure_s * stated.illumination.level
-        for stated in map(_stated, (lit[0], *colours.values()))
-        if stated is not None and stated.illumination is not None and stated.exposure_s is not None
-    }
-    return CaptureFrames(
-        tuple(lit), colours, dark, _dark_fits_colours(dark or lit[0], colours.values()), unusable=unusable,
-        full_drive_s=full_drive_s,
-    )  # fmt: skip
-
-
-def _dark_fits_colours(dark: Path, others: Iterable[Path]) -> bool:
-    """Return True if the dark frame fits the frames in other colours of light, as far as they state an exposure."""
-    dark_s, *others_s = (_exposure_s(one) for one in (dark, *others))
-    return dark_s is None or all(one is None or dark_fits(one, dark_s) for one in others_s)
-
-
-def _exposure_s(raw: Path) -> float | None:
-    """Return the exposure that a raw frame states, seconds; None if it states none."""
-    stated = _stated(raw)
-    return None if stated is None else stated.exposure_s
+    return frames_of_capture(lit, colours, dark, unusable)
 
 
 def _copied(path: str, digest: str, folder: Path) -> Path:
@@ -227,16 +209,6 @@ def _copied(path: str, digest: str, folder: Path) -> Path:
             f"{Path(path).name} has another content than when it was planned", "Restore it, or make a new plan."
         )
     return copy
-
-
-def _stated(raw: Path) -> RawMetadata | None:
-    """Return what a raw frame of the instrument states about itself; None for another file."""
-    if raw.suffix.lower() not in (".tif", ".tiff"):
-        return None
-    try:
-        return read_raw_tiff(raw.read_bytes())[1]
-    except FrameError:
-        return None
 
 
 def _facts(stated: RawMetadata | None) -> dict[str, object]:
