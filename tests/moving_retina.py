@@ -114,3 +114,25 @@ def turned_gaze(retina: Image, shift_px: tuple[float, float], turn_deg: float, s
     seen = ndimage.map_coordinates(retina, at, order=3).reshape(GAZE_SIZE, GAZE_SIZE)
     seen = seen + NOISE * np.random.default_rng(seed).normal(size=seen.shape)
     return np.asarray(seen * disc((GAZE_SIZE, GAZE_SIZE), (middle, middle), GAZE_FIELD_PX / 2), np.float32)
+
+
+def sparse_retina(seed: int) -> Image:
+    """Return an even retina with a few vessels of 15 % contrast, as weak as those of a frame with little light."""
+    random, size, t = np.random.default_rng(seed), 520, np.linspace(-0.2, 1.2, 4000)[:, None]
+    vessels = np.zeros((size, size))
+    for _ in range(6):
+        a, b, c, d = random.uniform(0, size, (4, 2))
+        course = a * (1 - t) ** 3 + 3 * b * t * (1 - t) ** 2 + 3 * c * t**2 * (1 - t) + d * t**3
+        places_px = np.round(course).astype(int)
+        vessels[tuple(places_px[((places_px >= 0) & (places_px < size)).all(axis=1)].T)] = 1
+    wide = ndimage.gaussian_filter(vessels, 1.5)
+    return np.asarray(1 - 0.15 * np.minimum(wide / np.quantile(wide[vessels > 0], 0.5), 1), np.float32)
+
+
+def small_field_gaze(retina: Image, shift_px: tuple[float, float], seed: int) -> Image:
+    """Return a picture of 540 x 960 pixels whose field of 33.4 degrees has 260, a tenth of the frame."""
+    size, middle, top = 320, 159.5, (retina.shape[0] - 320) // 2
+    seen = ndimage.shift(retina, shift_px, order=3, mode="nearest")[top : top + size, top : top + size]
+    noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=seen.shape), 1.5)
+    lit = (seen + 0.15 * noise) * disc((size, size), (middle, middle), 130)
+    return np.pad(np.asarray(lit, np.float32), ((110, 110), (320, 320)))

@@ -34,6 +34,7 @@ SMALL_OVERLAP, PEAK_PER_OVERLAP = 0.4, 0.5
 FIELD_SAMPLES = 260  # across the field when registered: vessels stay resolved
 FEATHER_SHARE = 0.25  # of the field's radius over which a picture's weight rises from its edge
 RIM_PX = 3.0  # at the edge of a field, whose light falls off
+EDGE_SIGMA_PX, EDGE_SHARE = 1.0, 0.3  # smoothing against noise; least share of the median light, as in `lit_field`
 MOST_PICTURES, LEAST_PX = 64, 32
 ROUNDING_PX = 1e-6  # of a place that is a whole pixel
 
@@ -206,9 +207,15 @@ def _grey(picture: Image) -> Image:
 
 
 def _field(picture: Image) -> Image:
-    """Return where a picture is lit, (rows, cols), 0 or 1; everywhere if it has no dark border."""
+    """Return where a picture is lit, (rows, cols), 0 or 1; everywhere if it has no dark border.
+
+    The smoothing of `lit_field` moves the edge outwards. A dark rim would stand still in the camera while the retina
+    moves, so that the field is cut to where the picture itself is lit, but for holes.
+    """
     grey = _grey(picture)
-    return lit_field(grey, Grid.periodic((grey.shape[0], grey.shape[1]), 1, float("inf")))
+    field = lit_field(grey, Grid.periodic((grey.shape[0], grey.shape[1]), 1, float("inf"))) > 0.5
+    lit = ndimage.gaussian_filter(np.where(field, grey, 0), EDGE_SIGMA_PX) > EDGE_SHARE * np.median(grey[field])
+    return np.asarray(field & ndimage.binary_fill_holes(lit), np.float32)
 
 
 def _diameter_px(fields: Sequence[Image]) -> float:

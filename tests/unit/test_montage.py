@@ -17,6 +17,8 @@ from tests.moving_retina import (
     eye_turn,
     gaze,
     places,
+    small_field_gaze,
+    sparse_retina,
     turned_gaze,
 )
 
@@ -36,6 +38,34 @@ def test_shift_and_rotation_are_found(shift_px: tuple[float, float], turn_deg: f
     distance = np.hypot(*shift_px) / GAZE_FIELD_PX
     overlap = 2 / np.pi * (np.arccos(distance) - distance * np.sqrt(1 - distance**2))
     assert found.overlap == pytest.approx(overlap, abs=0.05)
+
+
+@pytest.mark.parametrize("shift_px", [(0.0, 62.3), (44.0, -44.0)], ids=str)  # 8 degrees
+def test_a_small_field_is_placed_by_its_retina_and_not_by_its_edge(shift_px: tuple[float, float]) -> None:
+    retina = sparse_retina(0)
+    found = make_montage([small_field_gaze(retina, (0, 0), 1), small_field_gaze(retina, shift_px, 2)]).placed[1]
+    assert found.used, found.reason
+    assert found.shift_px == pytest.approx(shift_px, abs=0.6)  # what a montage may be off by (half a vessel)
+
+
+def test_the_small_fields_of_different_retinas_are_not_joined_by_their_edges() -> None:
+    pictures = [small_field_gaze(sparse_retina(seed), (0, 0), seed) for seed in range(4)]
+    assert [one.used for one in make_montage(pictures).placed] == [True, False, False, False]
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_what_stands_still_at_the_edge_places_no_picture(same: bool) -> None:
+    """A ring of reflexes inside the edge, which no mask leaves out; the retina below it is the same one or another."""
+    rows, cols = np.indices((540, 960))
+    angle = np.arctan2(rows - 269.5, cols - 479.5)
+    ring = (
+        0.3
+        * np.exp(-((np.hypot(rows - 269.5, cols - 479.5) - 118) ** 2) / 18)
+        * (np.cos(24 * angle) + np.cos(5 * angle))
+    )
+    pictures = [small_field_gaze(sparse_retina(seed), (0, 0), k) for k, seed in enumerate((0, 0 if same else 1))]
+    found = make_montage([np.asarray(one * (1 + ring), np.float32) for one in pictures]).placed[1]
+    assert found.used is same, found
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, -3.0])

@@ -18,6 +18,7 @@ FLATTEN_SAMPLES, SHARPEN_SAMPLES = 10.0, 1.2  # sigma of the local mean, and of 
 MOST_CONTRAST = 0.3  # of flat pictures: a lesion or a reflex must not outweigh all vessels
 LEAST_OVERLAP = 0.12  # of a field: with less the highest of all correlations is one of chance
 SECOND_SAMPLES = 8  # distance from the peak at which another one begins
+OUTER_SHARE = 0.2  # of the radius of the common part: a match without shift must hold without it
 SECOND_OVERLAP = 0.2  # of another place, as much as a picture needs to be placed
 ANGLES_DEG = tuple(float(angle) for angle in range(-8, 9, 2))  # coarse search: at most 1 degree off (NUMERICS.md 11)
 REFINEMENTS = 8  # of shift and rotation; they converge in three or four
@@ -75,12 +76,33 @@ class MaskedCorrelator:
         self._spectra = self._of(reference)
 
     def find(self, picture: FlatPicture) -> Match:
-        """Return the best match over all shifts and rotations within ANGLES_DEG."""
+        """Return the best match over all shifts and rotations within ANGLES_DEG.
+
+        The peak of a match without shift is that of the inner part of the field, if that is lower: a pattern that
+        stands still in the camera is no match.
+        """
         found = max((self._at(picture, angle) for angle in ANGLES_DEG), key=lambda one: one.peak)
         turn_deg = refined(self._reference, picture, found, self._projection).rotation_deg
         found = self._at(picture, turn_deg)  # with the rotation taken out, peak and shift are those of the whole field
         better = refined(self._reference, picture, found, self._projection)
-        return better if better.peak > found.peak else found
+        best = better if better.peak > found.peak else found
+        stands_still = max(map(abs, best.shift)) < SECOND_SAMPLES
+        return replace(best, peak=min(best.peak, self._inner_peak(picture, best))) if stands_still else best
+
+    def _inner_peak(self, picture: FlatPicture, match: Match) -> float:
+        """Return the correlation at a match without the outer part of the field; -1 where nothing is left.
+
+        What stands still in the camera lies at the edge: the rim of the field, its shade, a reflex. Where the retina
+        stands still, its middle agrees as well.
+        """
+        back = turned(picture, -match.rotation_deg)
+        moved = ndimage.shift(back.detail, [-one for one in match.shift], order=1)
+        lit = ndimage.shift(back.field, [-one for one in match.shift], order=1) > 0.99
+        depth = ndimage.distance_transform_edt(np.pad((self._reference.field > 0) & lit, 1))[1:-1, 1:-1]
+        inner = depth > OUTER_SHARE * depth.max()
+        if not inner.any():
+            return -1.0
+        return float(_normalised(self._reference.detail[inner]) @ _normalised(moved[inner]))
 
     def _at(self, picture: FlatPicture, rotation_deg: float) -> Match:
         """Return the best shift of a picture that was turned by `rotation_deg`."""
