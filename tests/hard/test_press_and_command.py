@@ -12,6 +12,7 @@ import pytest
 from device.calibration.archive import Archive, Provenance
 from device.clock import VirtualClock
 from device.config.head_file import load_head
+from device.config.marked_files import stated_mark
 from device.sim.render import crop_or_pad
 from device.values import Colour, Psf
 from services.imaging.picture_files import read_png
@@ -78,6 +79,7 @@ def test_a_colour_press_is_repeated_with_its_calibration(pressed: tuple[Path, Ca
     channels = [word for name in burst_of(capture) for word in ("--channel", "green", name)]
     picture, report = reconstructed(root, capture, *channels, "--channel", "red", "raw-red.tiff")
     assert report["residual"] == pytest.approx(stored.residual, rel=0.02)
+    assert stated_mark(root / "again" / "picture.npy") is True
     of_press = {one.name: one for one in stored.channels}
     assert {one["name"] for one in report["channels"]} == of_press.keys() == {"green", "red", "blue"}
     for one in report["channels"]:

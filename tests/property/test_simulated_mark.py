@@ -469,6 +469,7 @@ WRITERS = {
     "services/lab/paper/pictures.py _png": "test_pictures_of_the_paper",
     "services/lab/reconstruct_burst.py reconstruct_burst": "test_reconstruct_burst",
     "services/lab/reconstruct_colour.py _joined": "test_reconstruct_channels",
+    "services/lab/reconstruct_colour.py _press": "tests/hard/test_press_and_command.py::test_a_colour_press_is_repeated_with_its_calibration",
     "services/lab/reconstruct_each.py _reconstruct_one": EACH,
     "services/lab/reconstruct_file.py reconstruct_file": "test_reconstruct",
     "services/lab/reconstruct_file.py save": "test_python",
