@@ -97,6 +97,7 @@ def test_killing_the_instrument_in_use_leaves_no_light(tmp_path, sound_wires, se
         seen = len(sound_wires.messages)
         user = Thread(target=instrument.use)
         user.start()
+        instrument.wait_until(lambda: any(one["lit"] for one in sound_wires.messages[seen:]))  # slow on a busy machine
         time.sleep(random.Random(seed).uniform(0.2, 1.2))
         process.kill()
         died_s = time.monotonic()
