@@ -12,7 +12,7 @@ from services.records.protocol import VISIONS, Protocol, Vision
 
 EYE_WORDS = {"OD": "right", "OS": "left"}
 URGENT_COMPLAINTS = {"sudden_loss": "sudden loss of vision", "pain": "pain"}
-OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "send"]
+OutcomeCode = Literal["refer_today", "refer_vision", "refer_picture", "declined", "send"]
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,9 @@ def decision_after(slot: SlotState, new: SlotCapture) -> SlotDecision | None:
 def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: Mapping[str, SlotState]) -> Outcome:
     """Return the outcome of a visit by the rules of the programme: the first that applies, most urgent first.
 
-    Order: urgent complaint (`refer_today`), vision below the programme's limit (`refer_vision`), an eye without a
-    picture or with a required one not possible (`refer_picture`), else `send`. The sentence names no disease.
+    Order: urgent complaint (`refer_today`), vision below the programme's limit (`refer_vision`), no consent to pictures
+    (`declined`, no referral), an eye without a picture or with a required one not possible (`refer_picture`),
+    else `send`. The sentence names no disease.
     """
     complaints = fields.get("complaints")
     named = complaints if isinstance(complaints, list) else ()
@@ -121,6 +122,10 @@ def decide_outcome(protocol: Protocol, fields: Mapping[str, FormValue], slots: M
     low_vision = [eye for eye in EYE_WORDS if _is_below(fields.get(f"vision_{eye.lower()}"), limit)]
     if low_vision:
         return Outcome("refer_vision", f"Refer: vision of {_eyes(low_vision)} below {limit}.")
+    if fields.get("consent") == "declined":
+        taken = any(slot.captures for slot in slots.values())
+        kept = " to more. Those taken before are kept." if taken else " to pictures. None were taken."
+        return Outcome("declined", f"The patient did not agree{kept}")
     if missing_phrases := _missing_pictures(protocol, slots):
         return Outcome("refer_picture", f"Refer: {'; '.join(missing_phrases)}.")
     empty = sum(slot.required and slots[slot.id].state == "empty" for slot in protocol.slots)

@@ -76,13 +76,19 @@ def find_rows(session: Session, limit: int, day: str | None, open: bool | None, 
 
 
 def counts(session: Session, day: str | None) -> dict[str, int]:
-    """Return the numbers of finished (`done`), unfinished (`to_finish`) and `referred` visits of a day (None: all)."""
+    """Return the numbers of finished (`done`), unfinished (`to_finish`), `referred` and `declined` visits of a day.
+
+    `day`: None for all days. `done` includes the last two.
+    """
     code = row_validation.json_extract_or_null(VisitRow.outcome, "$.code")
     query = select(
-        func.count(VisitRow.finished_at), func.count(), func.count(case((code.like("refer%"), 1)))
+        func.count(VisitRow.finished_at),
+        func.count(),
+        func.count(case((code.like("refer%"), 1))),
+        func.count(case((code == "declined", 1))),
     ).select_from(VisitRow)
-    done, every, referred = session.execute(query if day is None else query.where(VisitRow.day == day)).one()
-    return {"done": done, "to_finish": every - done, "referred": referred}
+    done, every, referred, declined = session.execute(query if day is None else query.where(VisitRow.day == day)).one()
+    return {"done": done, "to_finish": every - done, "referred": referred, "declined": declined}
 
 
 def read_visits(session: Session, protocol: Protocol, rows: Sequence[VisitRow]) -> list[Visit]:

@@ -82,7 +82,7 @@ class VisitRepository:
             return visit_queries.damaged(session, self.protocol)
 
     def counts(self, day: str | None = None) -> dict[str, int]:
-        """Return the numbers of visits of a day (None: all): finished (`done`), `to_finish` and `referred`."""
+        """Return the numbers of visits of a day (None: all): finished (`done`), `to_finish`, `referred`, `declined`."""
         with storage_errors(), Session(self._engine) as session:
             return visit_queries.counts(session, day)
 

@@ -10,6 +10,7 @@ import pytest
 
 from device.sim import calibration_targets
 from services.instrument.exam_requests import WANTED_S
+from tests.journey.asking import record_answer
 from tests.journey.conftest import until
 
 SLOTS = ["R-centre", "R-nerve", "L-centre", "L-nerve"]
@@ -309,7 +310,11 @@ def test_the_list_is_filtered_by_day_state_and_digits(make_rig: Any) -> None:
     assert listed("?open=false") == [first["number"]]
     assert listed(f"?q={third['number'][1:]}") == [third["number"]]
     counts = rig.request("GET", f"/api/visits?day={first['day']}").json()["counts"]
-    assert counts == {"done": 1, "to_finish": 1, "referred": 1}  # no picture of either eye
+    assert counts == {"done": 1, "to_finish": 1, "referred": 1, "declined": 0}  # no picture of either eye
+    record_answer(rig, second["id"], "consent", "declined")
+    post(rig, f"/api/visits/{second['id']}/finish")
+    counts = rig.request("GET", f"/api/visits?day={first['day']}").json()["counts"]
+    assert counts == {"done": 2, "to_finish": 0, "referred": 1, "declined": 1}  # a refusal is no referral
 
 
 def test_one_screen_at_a_time_takes_pictures(old_rig: Any) -> None:

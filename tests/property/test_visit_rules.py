@@ -90,6 +90,7 @@ slot_states = st.lists(taken, max_size=4, unique_by=lambda one: one.capture).fla
 )  # fmt: skip
 visits = st.fixed_dictionaries({slot.id: slot_states for slot in PROTOCOL.slots})
 fields = st.fixed_dictionaries({}, optional={
+    "consent": st.sampled_from(["agreed", "declined"]),
     "complaints": st.none() | st.lists(st.sampled_from(["sudden_loss", "flashes", "pain", "red"]), unique=True),
     "vision_od": st.none() | st.sampled_from(VISIONS), "vision_os": st.none() | st.sampled_from(VISIONS),
 })  # fmt: skip
@@ -104,6 +105,7 @@ def test_the_outcome_follows_the_rules_in_order(answers: dict[str, Any], slots: 
     is_missing = any({states[f"{side}-centre"], states[f"{side}-nerve"]} == {"empty"} for side in "RL")
     expected = (
         "refer_today" if urgent else "refer_vision" if is_low
+        else "declined" if answers.get("consent") == "declined"
         else "refer_picture" if is_missing or "could_not" in states.values() else "send"
     )  # fmt: skip
     assert result.code == expected

@@ -132,7 +132,7 @@ def assert_all_queries_work(store: CaptureStore, change_made: str) -> None:
         [report_as_json(capture.report) for capture in captures],
     )
     json.dumps(written, allow_nan=False, ensure_ascii=False).encode()
-    assert set(people.counts()) == {"done", "to_finish", "referred"}
+    assert set(people.counts()) == {"done", "to_finish", "referred", "declined"}
     people.pictures.laterality_question()
     queue = UploadQueue(store.engine, clock)
     assert queue.status().waiting <= 2

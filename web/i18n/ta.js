@@ -36,6 +36,7 @@ export const WORDS = {
   "home.done": "{n} முடிந்தது",
   "home.open": "{n} முடிக்க வேண்டும்",
   "home.referred": "{n} பரிந்துரை",
+  "home.declined": "{n} சம்மதிக்கவில்லை",
   "home.sent": "{n} அனுப்பியவை",
   "home.waiting": "{n} காத்திருப்பவை",
   "home.history": "முந்தைய நபர்கள்",
@@ -49,6 +50,7 @@ export const WORDS = {
   "find.scan": "குறியீட்டு வாசிப்பான் எண்ணை இங்கே தானே எழுதும்.",
   "find.none": "இன்று இன்னும் யாரும் இல்லை.",
   "find.nomatch": "{number} இல்லை.",
+  "find.choose": "பட்டியலில் நபரைத் தேர்ந்தெடுக்கவும்.",
   "find.open": "முடிக்க வேண்டும்",
 
   "sex.woman": "பெண்",
@@ -122,6 +124,8 @@ export const WORDS = {
   "take.already": "இந்தப் படம் இன்னும் உருவாகிறது. காத்திருக்கவும்.",
   "aim.keep": "பழைய படத்தை வைக்கவும்",
   "finish.now": "இருப்பதுடன் முடிக்கவும்",
+  "finish.missing": { one: "{n} படம் இல்லை. அது இல்லாமல் முடிக்கலாமா?", other: "{n} படங்கள் இல்லை. அவை இல்லாமல் முடிக்கலாமா?" },
+  "finish.take": "விடுபட்ட படத்தை எடுக்கவும்",
 
   "tile.empty": "இன்னும் எடுக்கவில்லை",
   "tile.good": "நன்று",
@@ -140,6 +144,7 @@ export const WORDS = {
 
   "mark.quick": "முதல் பார்வை மட்டும்",
   "mark.final": "இறுதிப் படம் உள்ளது",
+  "mark.final.again": "இறுதிப் படம், போதுமானதல்ல",
   "mark.opening": "படம் திறக்கிறது…",
   "pic.none": "இன்னும் படம் இல்லை",
   "verdict.good": "நன்று",
@@ -187,6 +192,7 @@ export const WORDS = {
   "outcome.refer_today": "இன்றே அனுப்பவும்",
   "outcome.refer_vision": "அனுப்பவும்: பார்வை",
   "outcome.refer_picture": "அனுப்பவும்: ஒரு படம் இல்லை",
+  "outcome.declined": "படங்களுக்குச் சம்மதிக்கவில்லை",
   "outcome.send": "கண் நிபுணருக்கு",
   "outcome.copy": "படங்களை நிபுணருக்காக நகலெடுக்கவும் அல்லது சேமிக்கவும்.",
   "outcome.byitself": "இது தானே அனுப்பப்படும்.",
@@ -207,6 +213,7 @@ export const WORDS = {
   "show.all": "அனைத்தும்",
   "show.open": "முடிக்க வேண்டும்",
   "show.referred": "பரிந்துரை",
+  "show.declined": "சம்மதிக்கவில்லை",
   "show.waiting": "அனுப்பக் காத்திருப்பவர்",
   "history.none": "இந்த நாளில் யாரும் இல்லை.",
   "film.title": "{number} படங்கள்",
@@ -259,6 +266,7 @@ export const WORDS = {
   "fault.elsewhere": "இது வேறொருவரின் படம்.",
   "fault.picture": "படம் திறக்கவில்லை.",
   "fault.picture.remedy": "அது சேமிப்பில் உள்ளது. மீண்டும் திறக்கவும்.",
+  "fault.picture.retry": "படம் திறக்கவில்லை. மீண்டும் முயல்கிறது…",
   "fault.removed": "நகல் எடுத்த அல்லது அனுப்பிய பின் படம் அகற்றப்பட்டது.",
   "fault.removed.remedy": "அந்த நகலைப் பார்க்கவும், அல்லது தொழில்நுட்பரை அழைக்கவும்.",
 

@@ -100,11 +100,12 @@ class VisitAnswer(ResponseBody):
 
 
 class VisitCounts(ResponseBody):
-    """Numbers of finished (`done`), unfinished (`to_finish`) and `referred` visits."""
+    """Numbers of finished (`done`) and unfinished (`to_finish`) visits; of `done`, those `referred` and `declined`."""
 
     done: int
     to_finish: int
     referred: int
+    declined: int
 
 
 class VisitList(ResponseBody):
