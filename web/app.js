@@ -7,7 +7,8 @@ import { page } from "./screens/page_layout.js";
 import { bindKeys } from "./core/keyboard.js";
 import "./components/live_preview.js";
 import { get, set, store } from "./core/state.js";
-import { playCue, resetPictureTools, captureEventHandlers, ignoreTaps, openPicture, rejectForeignCapture, resolveCutShots, takePicture } from "./core/capture.js";
+import { playCue, resetPictureTools, captureEventHandlers, openPicture, rejectForeignCapture, resolveCutShots, takePicture } from "./core/capture.js";
+import { buttonsChanged } from "./core/taps.js";
 import { startRouter, navigate } from "./core/router.js";
 import { lowerAlerts, endNotice, raiseAlert, syncNotices } from "./core/alerts.js";
 import { render } from "./vendor/lit-html.js";
@@ -20,7 +21,7 @@ const STATUS_BEATS = 10; // request the status at every tenth heartbeat
 const LEASE_BEATS = 4; // renewal period; the server's control lease lasts ten seconds
 const PROMPT_MIN_MS = 700; // minimum display time of a prompt
 const AUTO_CAPTURE_MS = 500;
-const LATE_S = 2;
+const LATE_S = 4; // the server answers within 2 s, with a frame or without one
 
 const $ = (selector) => document.querySelector(selector);
 
@@ -35,11 +36,12 @@ async function showRoute(route) {
   if (!same) lowerAlerts(({ from }) => from === "press");
   if (route.visit !== before.visit) lowerAlerts("shot.crossed");
   if (route.screen !== "outcome") set({ finishing: null });
-  set({ route: Object.freeze(route), asking: false, picked, prompt: null, typed: "", timer: 0, code: undefined });
-  ignoreTaps(); // debounce: the second half of a double tap must not press a control of the new screen
+  set({ route: Object.freeze(route), asking: "", picked, prompt: null, typed: "", timer: 0, code: undefined });
+  buttonsChanged();
   lowerAlerts("link.slow");
   if (route.screen !== "film" || route.visit !== before.visit) set({ montages: Object.freeze({}) });
   if (!same) set({ visits: null, folders: null, copied: null, zipped: false, blink: false });
+  renewControl();
   await loadRoute(route);
   if (!same) requestAnimationFrame(() => focusScreen(route.screen));
 }
@@ -198,7 +200,25 @@ function raiseInterrupted(swept) {
   raiseAlert({ code: "power.lost", message: t("swept", { n: swept.length }), ...known, from: "page" });
 }
 
+// Screens that show what was taken. A page on one of them never takes the camera, and releases it.
+const READING = ["outcome", "film", "compare", "history", "send"];
+
+/**
+ * Return whether this page needs the control lease: it aims, or a picture of its own is being taken.
+ * @param {State} state
+ */
+const needsControl = ({ route, shots }) => route.screen === "aim" || shots.some((shot) => !shot.over && !shot.reloaded);
+
+/** @param {State} state */
+const isReading = ({ route, visit }) => READING.includes(route.screen) || (route.screen === "picture" && Boolean(visit?.finished_at));
+
+// Request or renew the control lease where this page needs it; between two pictures renew it where it is held.
 async function renewControl() {
+  if (!needsControl(get()) && (isReading(get()) || !get().hasControl)) {
+    if (get().hasControl) releaseControl();
+    set({ hasControl: false });
+    return lowerAlerts(({ code, from }) => code === "link.other" && from === "page");
+  }
   try {
     setControl(await requestControl(false));
   } catch (problem) {
@@ -209,7 +229,7 @@ async function renewControl() {
 function setControl({ mine }) {
   set({ hasControl: mine });
   if (mine) lowerAlerts("link.other");
-  else raiseAlert({ code: "link.other", from: "page" });
+  else if (needsControl(get())) raiseAlert({ code: "link.other", from: "page" });
 }
 
 Object.assign(pageHooks, { refreshStatus, setControl });
@@ -251,10 +271,10 @@ Object.assign(actions, {
     if (code.startsWith("consent.")) refreshVisit(get().route.visit);
     else if (code === "link.other") renewControl();
   },
-  previewLate({ detail: seconds }) {
-    if (seconds && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
-    if (seconds >= LATE_S && get().link === "live") {
-      raiseAlert({ code: "link.slow", n: seconds, from: "page" });
+  previewLate({ detail: { frame_s, link_s } }) {
+    if (frame_s && get().prompt) set({ prompt: null }); // an outdated frame must not show "ready"
+    if (link_s >= LATE_S && get().link === "live") {
+      raiseAlert({ code: "link.slow", n: frame_s, from: "page" });
     } else lowerAlerts("link.slow");
   },
 });

@@ -55,7 +55,7 @@ def photograph(page: Page, real: Real, standing: StandingAlerts, folder: Path) -
     at("find", ".people", "find")
     for digit in "0013":
         page.locator(f"[data-key='{digit}']").tap()
-    camera.take("find-match", "#start:not([hidden])")
+    camera.take("find-choose", "#start:not([hidden])")
     page.locator("[data-key='9']").tap()
     page.locator(".people").wait_for(state="detached")
     camera.take("find-no-match", "#start:not([hidden])")
@@ -144,6 +144,8 @@ def after(camera: Camera, real: Real, visit: str, at: Callable[[str, str, str], 
         camera.tap("#shutter")
         page.wait_for_selector("[data-phase=assessed]" if hold else "[data-phase=kept] .stage[data-mark=final]")
     camera.tap("#finish")
+    camera.take("finish-question", "#finish-without")
+    camera.tap("#finish-without")
     camera.take("finishing", "#finishing progress")
     real.hold = None
     camera.take("outcome", "#done")

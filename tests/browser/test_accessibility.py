@@ -62,6 +62,7 @@ def test_visit_by_keyboard_only(open_page: Open, real: Real) -> None:
     strike(page, SHUTTER)
     page.wait_for_selector("[data-phase=kept] [data-verdict=good]")
     strike(page, "#finish")
+    strike(page, "#finish-without")
     strike(page, "#done")
     expect(page.locator(".day")).to_contain_text("1 done")
     states = [slot["state"] for slot in real.visit()["slots"].values()]

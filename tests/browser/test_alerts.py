@@ -154,7 +154,9 @@ def test_poor_verdict_shows_cause_and_action(open_page: Open, real: Real) -> Non
         assert words is not None
         expect(page.locator(".card")).to_contain_text(words[1])
         assert (page.locator("[data-do=timer]").count() == 1) == (cause == "pupil")
-        page.wait_for_selector("[data-phase=kept]")
+        page.wait_for_selector("[data-phase=kept] .stage[data-mark=final]")
+        expect(page.locator(".prompt")).to_have_text("Right eye · Centre Final picture, but not good enough")
+        expect(page.locator(".prompt")).to_have_attribute("data-tone", "plain")  # no green tick over "Take again"
     page.locator("[data-do=timer]").tap()
     expect(page.locator(".card .clock")).to_have_text(re.compile(r"1:00|0:5\d"))
 

@@ -7,7 +7,7 @@ from tests.browser.alert_causes import CAUSES, StandingAlerts, alert
 from tests.browser.axe import axe_faults
 from tests.browser.conftest import Complaints
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, aiming, take_picture, tap
+from tests.browser.walk import SHUTTER, Open, aiming, finish_early, take_picture, tap
 
 pytestmark = pytest.mark.browser
 
@@ -59,7 +59,7 @@ def test_no_axe_violation_on_any_screen(open_page: Open, real: Real) -> None:
     axe.open(f"visit/{visit['id']}/compare/{first}/{second}", ".two figure:last-child eye-pic[data-mark=final]")
     axe.open(f"visit/{visit['id']}/outcome", ".outcome")
     axe.open(f"visit/{visit['id']}/aim/R-nerve", "eye-live[data-frame]")
-    tap(page, "#finish")
+    finish_early(page)
     tap(page, "#code")
     axe.check("finished", "figure.code svg path")
     axe.assert_clean(10)

@@ -14,6 +14,7 @@ from tests.browser.walk import (
     Open,
     after_debounce,
     aiming,
+    finish_early,
     new_person,
     take_picture,
     tap,
@@ -135,7 +136,7 @@ def test_finish_waits_for_pending_capture(open_page: Open, real: Real) -> None:
     tap(page, "[data-slot='L-centre']")
     tap(page, SHUTTER)
     wait_for_verdict(page)
-    tap(page, "#finish")
+    finish_early(page)
     expect(page.locator("#finishing h2")).to_have_text("One picture is still being made")
     expect(page.locator("#finishing progress")).to_be_visible()
     assert look_for_faults(page) == []
@@ -151,7 +152,7 @@ def test_picture_lost_during_finish_is_requested_again(open_page: Open, real: Re
     page = aiming(open_page, real)
     tap(page, SHUTTER)
     wait_for_verdict(page)
-    tap(page, "#finish")
+    finish_early(page)
     page.wait_for_selector("#finishing")
     real.hold = None
     expect(page.locator("[data-code='shot.lost']")).to_be_visible()
@@ -211,7 +212,7 @@ def finished(open_page: Open, real: Real, size: tuple[int, int] = (1280, 800)) -
     """Open a finished visit with one picture."""
     page = aiming(open_page, real, size)
     take_picture(page)
-    tap(page, "#finish")
+    finish_early(page)
     page.wait_for_selector("#done")
     return page
 

@@ -141,6 +141,20 @@ def test_daily_light_limit_is_per_eye(open_page: Open, real: Real, complaints: C
     light.ledger.settle(given, 0.0)
 
 
+def test_a_page_that_only_shows_pictures_leaves_the_camera(open_page: Open, real: Real) -> None:
+    visit = real.begin_visit(consent="agreed")["id"]
+    capture = real.press(visit)["id"]
+    reader = open_page(f"{real.url}/#/visit/{visit}/picture/R-centre/{capture}")
+    reader.wait_for_selector(".stage[data-mark=final]")
+    expect(reader.locator(".state")).to_have_text("Ready")
+    reader.wait_for_timeout(2500)  # two heartbeats
+    assert real.request("GET", "/api/status")["controller"] is None
+    aiming(open_page, real)
+    expect(reader.locator(".prompt .title")).to_have_text("Right eye · Centre")
+    reader.wait_for_timeout(2500)  # the monitor publishes the holder once per second
+    expect(reader.locator(".state-bar")).to_have_count(0)
+
+
 def test_control_is_released_when_page_closes(open_page: Open, real: Real) -> None:
     first = aiming(open_page, real)
     second = open_page(f"{real.url}/#/visit/{visit_of(first)}/aim/R-centre")

@@ -3,9 +3,10 @@
 import pytest
 from playwright.sync_api import Page, Route, expect
 
+from tests.browser.alert_causes import CAUSES
 from tests.browser.looks import SIZES, look_for_faults
 from tests.browser.real import Real
-from tests.browser.walk import SHUTTER, Open, aiming, set_language, take_picture, tap
+from tests.browser.walk import SHUTTER, Open, aiming, set_language, take_picture, tap, visit_of
 
 pytestmark = pytest.mark.browser
 
@@ -43,6 +44,37 @@ def test_no_layout_shift_during_capture(open_page: Open, real: Real, size: tuple
     assert look_for_faults(page) == []
 
 
+@pytest.mark.parametrize(
+    "size", [SIZES["tablet"], SIZES["portrait"], SIZES["phone"]], ids=["tablet", "portrait", "phone"]
+)
+def test_a_message_moves_no_button(open_page: Open, real: Real, size: tuple[int, int]) -> None:
+    """A tap meant for Next ended a visit: a message had moved Finish there."""
+    page = aiming(open_page, real, size)
+
+    def assert_still(codes: tuple[str, ...], *buttons: str) -> None:
+        before = boxes(page, *buttons)
+        for code in codes:
+            end = CAUSES[code](real, "")
+            expect(page.locator(f"[data-code='{code}']")).to_be_visible(timeout=15_000)
+            assert boxes(page, *buttons) == before, code
+            if page.locator("[data-screen=picture]").count():
+                expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")  # no alert in its place
+            end()
+            expect(page.locator(f"[data-code='{code}']")).to_have_count(0)
+
+    assert_still(("store.low", "batt.empty"), "[data-slot='R-centre']", ".actions", "#could-not", "#finish")
+    take_picture(page)
+    expect(page.locator("#result-title")).to_have_text("Good")
+    expect(page.locator("[data-code='make.slow']")).to_have_count(0)  # the card says that the worker can go on
+    assert_still(("heat.warm", "batt.empty"), "[data-slot='R-centre']", "#again", "#next", "#finish")
+    page.goto(f"{real.url}/#/visit/{visit_of(page)}/person")
+    page.wait_for_selector(".person .asking")
+    assert_still(("heat.warm", "batt.empty"), "[data-value=agreed]", "#shoot", "#film")
+    page.goto(real.url)
+    page.wait_for_selector("#continue")
+    assert_still(("heat.warm", "batt.empty"), "#new", "#continue", "#find")
+
+
 def test_result_shows_slot_label_and_one_go_on_text(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real, SIZES["phone"])
     take_picture(page)
@@ -69,31 +101,38 @@ def test_previous_picture_is_kept_and_back_leads_home(open_page: Open, real: Rea
     page.wait_for_selector("#new")
 
 
-def test_find_offers_match_first_and_reports_no_match(open_page: Open, real: Real) -> None:
+def test_find_opens_an_exact_match_only_and_reports_no_match(open_page: Open, real: Real) -> None:
     real.begin_visit(consent="agreed")
     page = open_page(f"{real.url}/#/find")
     pad = page.locator(".pad")
     where = pad.bounding_box()
     for digit in "0013":
         page.locator(f"[data-key='{digit}']").tap()
-    expect(page.locator("#open-found")).to_have_text(OPEN_FIRST)
-    expect(page.locator("#open-found")).to_have_class("primary")
-    expect(page.locator("#start")).not_to_have_class("primary")
+    expect(page.get_by_text("Choose the patient in the list.")).to_be_visible()
+    expect(page.locator(".people li")).to_have_count(1)
+    expect(page.locator("#open-found, .find .primary")).to_have_count(0)  # 0013 is a part of the number only
     page.locator("[data-key='9']").tap()
     expect(page.get_by_text("No match for 00139.")).to_be_visible()
     assert pad.bounding_box() == where
-    page.locator("[data-key='erase']").tap()
+    for _ in range(5):
+        page.locator("[data-key='erase']").tap()
+    page.keyboard.type("A00013")
+    expect(page.locator("#open-found")).to_have_text(OPEN_FIRST)
+    expect(page.locator("#open-found")).to_have_class("primary")
+    expect(page.locator("#start")).not_to_have_class("primary")
     page.locator("#open-found").tap()
     page.wait_for_selector("[data-screen=aim]")
     assert len(real.visits()) == 1
 
 
 def test_scanned_number_opens_visit(open_page: Open, real: Real) -> None:
+    """Also the visit of an earlier day, with the Enter of a code reader before the list of its number is there."""
     real.begin_visit(consent="agreed")
-    page = open_page(f"{real.url}/#/find")
-    page.wait_for_selector(".people")
+    page = open_page("about:blank")
+    page.route("**/api/visits?day=*", lambda route: route.fulfill(json={"visits": [], "counts": None}))
+    page.goto(f"{real.url}/#/find")
+    page.wait_for_selector(".find")
     page.keyboard.type(real.visits()[0]["number"])
-    page.wait_for_selector("#open-found")
     page.keyboard.press("Enter")
     page.wait_for_selector("[data-screen=aim]")
     assert len(real.visits()) == 1
@@ -106,9 +145,13 @@ def test_number_with_check_digit_is_found_in_both_forms(open_page: Open, real: R
     expect(page.locator(".people")).to_contain_text(FIRST)
     expect(page.locator(".people")).to_contain_text("SELF-7")
     page.locator("[data-key='1']").tap()
-    expect(page.locator("#open-found")).to_have_text(OPEN_FIRST)
+    expect(page.locator(".people")).not_to_contain_text("SELF-7")
+    expect(page.locator(".people")).to_contain_text(FIRST)
     page.locator("[data-key='3']").tap()
-    expect(page.locator("#open-found")).to_have_text(OPEN_FIRST)
+    expect(page.locator(".people")).to_contain_text(FIRST)
+    page.locator("[data-key='erase']").tap()
+    page.locator("[data-key='erase']").tap()
+    page.keyboard.type(FIRST)
     page.locator("#open-found").tap()
     expect(page.locator("h1")).to_contain_text(FIRST)
 

@@ -12,7 +12,16 @@ from playwright.sync_api import Page, Response, expect
 
 from tests.browser.conftest import Complaints, Server
 from tests.browser.looks import SIZES, look_for_faults
-from tests.browser.walk import SHUTTER, Open, after_debounce, double_tap, new_person, tap, wait_for_preview
+from tests.browser.walk import (
+    SHUTTER,
+    Open,
+    after_debounce,
+    double_tap,
+    finish_early,
+    new_person,
+    tap,
+    wait_for_preview,
+)
 
 pytestmark = pytest.mark.browser
 
@@ -93,7 +102,7 @@ def test_capture_and_viewer_by_touch(page: Page, complaints: Complaints) -> None
 
     thumbnail = page.locator("[data-slot=L-centre] img")
     expect(thumbnail).to_have_attribute("src", re.compile("OS"))
-    tap(page, "#finish")
+    finish_early(page)
     expect(page.locator(".outcome .verdict")).to_contain_text(re.compile("Refer|Send"))
     tap(page, "#done")
     tap(page, "#history")

@@ -24,6 +24,8 @@ from tests.browser.walk import (
     double_tap,
     new_person,
     take_picture,
+    tap,
+    wait_for_preview,
     wait_until_drawn,
 )
 from tests.journey.test_replay import blurred, psf_counts
@@ -165,6 +167,29 @@ def test_a_double_tap_on_next_takes_no_picture(open_page: Open, real: Real) -> N
     assert real.presses == 1
 
 
+def test_first_tap_of_a_page_counts(open_page: Open, real: Real) -> None:
+    """The button is tapped as soon as it is drawn; a second tap at its place within 0.4 s does not count."""
+    page = open_page("about:blank")
+    page.add_init_script("""
+        const tap = (button) => {
+          const { x, y } = button.getBoundingClientRect();
+          const at = { bubbles: true, cancelable: true, detail: 1, clientX: x + 5, clientY: y + 5 };
+          button.dispatchEvent(new MouseEvent("click", at));
+        };
+        addEventListener("DOMContentLoaded", () => new MutationObserver((_, observer) => {
+          const button = document.querySelector("#new");
+          if (!button) return;
+          observer.disconnect();
+          tap(button);
+          tap(button);
+        }).observe(document.querySelector("#app"), { childList: true, subtree: true }));
+    """)
+    page.goto(real.url)
+    page.wait_for_selector(".person")
+    page.wait_for_timeout(300)
+    assert len(real.visits()) == 1
+
+
 def test_double_tap_on_new_patient_begins_one_visit(open_page: Open, real: Real) -> None:
     page = after_debounce(open_page(real.url))
     page.locator("#new").dblclick()
@@ -197,10 +222,30 @@ def test_old_live_frame_shows_its_age(open_page: Open, real: Real) -> None:
     page = aiming(open_page, real)
     real.rig.block_exposures()
     expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[2-9]\.\d s old$"))
-    expect(page.locator("[data-code='link.slow']")).to_contain_text(re.compile(r"\d s late"))
     real.clock.gate.set()
     expect(page.locator("eye-live .age")).to_be_hidden()
+    page.route("**/api/preview?*", lambda route: None)
+    expect(page.locator("[data-code='link.slow']")).to_contain_text(re.compile(r"\d s late"), timeout=10_000)
+    page.unroute("**/api/preview?*")
+    expect(page.locator("[data-code='link.slow']")).to_have_count(0, timeout=10_000)
+
+
+def test_no_old_frame_and_no_lateness_where_there_is_no_live_picture(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    real.rig.block_exposures()  # the camera gives no frame; the server answers in time
+    expect(page.locator("eye-live .age")).to_have_text(re.compile(r"^[4-9]\.\d s old$"), timeout=15_000)
     expect(page.locator("[data-code='link.slow']")).to_have_count(0)
+    tap(page, "#could-not")
+    expect(page.locator(".prompt .title")).to_have_text("Right eye · Centre")
+    expect(page.locator("eye-live")).to_have_css("visibility", "hidden")
+    page.locator("#not-asked").tap()
+    expect(page.locator("eye-live[data-frame]")).to_have_count(0)
+    real.clock.gate.set()
+    wait_for_preview(page)
+    page.route("**/api/preview?*eye=OS*", lambda route: None)
+    page.locator("[data-slot='L-centre']").tap()
+    expect(page.locator(SHUTTER)).to_contain_text("Left eye")
+    expect(page.locator("eye-live[data-frame]")).to_have_count(0)  # the frame of the right eye is gone
 
 
 def test_warnings_about_a_picture_are_shown_with_it(open_page: Open, real: Real) -> None:

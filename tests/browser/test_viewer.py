@@ -464,6 +464,31 @@ def test_details_state_that_the_psf_has_the_cylinder(open_page: Open, real: Real
     expect(page.get_by_role("dialog")).to_contain_text("Corrected for the cylinder, predicted gain 0.4 dB")
 
 
+def test_picture_that_fails_to_load_once_is_fetched_again(open_page: Open, real: Real, complaints: Complaints) -> None:
+    complaints.expect("ERR_FAILED")
+    page = aiming(open_page, real)
+    failed: set[str] = set()
+
+    def fail_once(route: Route) -> None:
+        url = route.request.url
+        if url in failed:
+            route.fallback()
+        else:
+            failed.add(url)
+            route.abort()
+
+    page.route("**/api/captures/*/*.png", fail_once)  # the final picture
+    page.route("**/api/captures/*/quick.jpg", fail_once)  # the quick look and the thumbnail
+    tap(page, SHUTTER)
+    page.wait_for_selector("[data-phase=kept]")
+    expect(page.locator("#picture .age")).to_have_text("The picture did not load. Trying again…")
+    page.wait_for_selector(".stage[data-mark=final]")
+    expect(page.locator("#picture .age")).to_be_hidden()
+    expect(page.get_by_role("button", name="Red-free")).to_be_visible()
+    expect(page.locator("[data-slot='R-centre'] img")).not_to_have_js_property("naturalWidth", 0)
+    assert any(url.endswith(".png") for url in failed)
+
+
 def test_comparison_is_reloaded_and_refuses_another_visit(open_page: Open, real: Real) -> None:
     """A page error fails the test: nothing is found while the visit is loaded, nor in another visit."""
     other, visit = (real.begin_visit(consent="agreed")["id"] for _ in range(2))

@@ -18,6 +18,7 @@ from tests.browser.walk import (
     Open,
     after_debounce,
     aiming,
+    finish_early,
     new_person,
     take_picture,
     tap,
@@ -142,8 +143,26 @@ def test_visit_without_consent_can_only_be_finished(open_page: Open, real: Real)
     tap(page, "[data-do=ask]")
     page.locator("[data-value=declined]").tap()
     tap(page, "#finish")
-    expect(page.locator(".outcome")).to_be_visible()
+    expect(page.locator(".outcome .verdict")).to_have_text("The patient did not agree to pictures. None were taken.")
+    assert real.visit()["outcome"]["code"] == "declined"
     assert real.presses == 0
+    tap(page, "#done")
+    expect(page.locator(".day")).to_contain_text(re.compile("1 done.*0 referred.*1 did not agree", re.DOTALL))
+
+
+def test_finish_asks_when_a_picture_is_missing(open_page: Open, real: Real) -> None:
+    page = aiming(open_page, real)
+    take_picture(page)
+    tap(page, "#finish")
+    expect(page.locator("#finish-question h2")).to_have_text("3 pictures are missing. Finish without them?")
+    assert real.visit()["finished_at"] is None
+    assert look_for_faults(page) == []
+    page.locator("#take-missing").tap()
+    expect(page.locator(SHUTTER)).to_contain_text("Right eye · Nerve")
+    tap(page, "#finish")
+    page.locator("#finish-without").tap()
+    page.wait_for_selector(".outcome .verdict")
+    assert real.visit()["finished_at"] is not None
 
 
 def test_unsaved_fields_are_resent_after_reconnection(open_page: Open, real: Real, complaints: Complaints) -> None:
@@ -228,7 +247,7 @@ def test_finished_visit_is_reopened_and_qr_code_has_no_name(open_page: Open, mak
     for slot in ("R-centre", "R-nerve", "L-centre"):
         real.press(visit["id"], slot)
     page = after_debounce(open_page(f"{real.url}/#/visit/{visit['id']}/aim/L-nerve"))
-    tap(page, "#finish")
+    finish_early(page)
     page.locator("#code").tap()
     page.wait_for_selector("figure.code svg path")
     decoded = qr_text(page)
@@ -272,7 +291,7 @@ def test_reload_restores_every_screen(open_page: Open, real: Real) -> None:
     take_picture(page)
     reloaded("picture", ".stage[data-mark=final]")
     expect(page.locator("#result-title")).to_have_text("Good")
-    tap(page, "#finish")
+    finish_early(page)
     page.wait_for_selector(".outcome .verdict")
     reloaded("outcome", ".outcome .verdict")
     tap(page, "#done")

@@ -4,7 +4,7 @@
 import { captureFileUrl } from "../core/api.js";
 import { displayNumber } from "../core/numbers.js";
 import { icon, target } from "./icons.js";
-import { get, lostShots, slotPlan } from "../core/state.js";
+import { currentShot, get, lostShots, missingPictures, slotPlan } from "../core/state.js";
 import { visibleAlerts, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { calendarDay, has, t } from "../i18n/translate.js";
@@ -89,7 +89,7 @@ function tile(state, actions, { id, eye, field }) {
 }
 
 export const thumb = (capture, actions) =>
-  html`<img src=${captureFileUrl(capture, "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} />`;
+  html`<img src=${captureFileUrl(capture, "quick.jpg")} alt="" loading="lazy" @load=${actions.thumbLoaded} @error=${actions.thumbFailed} />`;
 
 const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an exam
 
@@ -101,6 +101,15 @@ const EXAM_BUTTONS = new Set(["otherEye", "finish"]); // only shown during an ex
  */
 export function topAlert(state) {
   return visibleAlerts(state).stop ?? state.alerts.find(({ level }) => level === "refused") ?? null;
+}
+
+/**
+ * The blocking alert in a line of its own, where no prompt line shows it.
+ * @param {State} state
+ */
+export function standing(state, actions) {
+  const stop = topAlert(state);
+  return stop ? html`<div class="standing">${alertBar(stop, actions)}</div>` : nothing;
 }
 
 /** Bar of one alert with its text, countdown and buttons. */
@@ -119,23 +128,35 @@ export function alertBar(one, actions) {
 }
 
 /**
- * List of advisory alerts.
+ * List of advisory alerts, after the question about the picture that is shown.
  * @param {State} state
  */
 export function chips(state, actions) {
-  // The Send screen shows the text of these two alerts itself.
-  const shown = visibleAlerts(state).chips.filter(({ code }) => state.route.screen !== "send" || !code.startsWith("send."));
+  const shot = currentShot(state);
+  const side = shot && state.alerts.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
+  const advisory = visibleAlerts(state).chips.filter(({ code }) => !isSaidElsewhere(state, code));
+  const shown = side ? [side, ...advisory] : advisory;
   if (!shown.length) return nothing;
   return html`
     <ul class="notices" aria-label=${t("part.notices")}>
       ${shown.map(
-        (one) => html`<li data-code=${one.code}>
+        (one) => html`<li class=${one.level} data-code=${one.code}>
           <p role=${one.assertive ? "alert" : nothing}>${alertText(one)}</p>
           ${one.until ? html`<b class="clock">${timeLeft(one.until)}</b>` : nothing} ${one.buttons.map((name) => alertButton(one, name, actions))}
         </li>`,
       )}
     </ul>
   `;
+}
+
+/**
+ * Return whether the screen itself says what an alert says: the Send screen, and a picture that has its verdict and "Next".
+ * @param {State} state
+ * @param {string} code
+ */
+function isSaidElsewhere(state, code) {
+  const shot = currentShot(state);
+  return (state.route.screen === "send" && code.startsWith("send.")) || (code === "make.slow" && Boolean(shot?.verdict || shot?.over));
 }
 
 const ALERT_LINKS = { technician: "/technician", pin: "/technician", setClock: "/technician" };
@@ -171,10 +192,28 @@ export function choice({ label, field, value, options, choose, many = false }) {
 export const versionName = ({ number, at }) => t("version.n", { n: number, day: at ? calendarDay(at) : "" });
 
 /**
+ * The question in place of the controls: why a picture is not possible, or whether to finish without all pictures.
+ * @param {State} state
+ */
+export const question = (state, actions) => (state.asking === "finish" ? finishQuestion(state, actions) : reasons(state, actions));
+
+/** @param {State} state */
+function finishQuestion(state, actions) {
+  return html`
+    <div class="reasons" id="finish-question" role="group" aria-labelledby="missing">
+      <h2 id="missing">${t("finish.missing", { n: missingPictures(state) })}</h2>
+      <button class="primary" type="button" id="take-missing" @click=${actions.takeMissing}>${icon("camera")} ${t("finish.take")}</button>
+      <button type="button" id="finish-without" @click=${actions.finishWithout}>${t("finish.now")}</button>
+      <button class="quiet" type="button" id="not-asked" @click=${actions.stopAsking}>${t("back")}</button>
+    </div>
+  `;
+}
+
+/**
  * Reasons of the programme why a picture could not be taken, as buttons.
  * @param {State} state
  */
-export function reasons({ protocol, route }, actions) {
+function reasons({ protocol, route }, actions) {
   return html`
     <div class="reasons" role="group" aria-labelledby="why">
       <h2 id="why">${t("result.why")}</h2>
@@ -183,7 +222,7 @@ export function reasons({ protocol, route }, actions) {
           ${has(`reason.${reason}`) ? t(`reason.${reason}`) : reason}
         </button>`,
       )}
-      <button class="quiet" type="button" id="not-asked" @click=${actions.closeReasons}>${t("back")}</button>
+      <button class="quiet" type="button" id="not-asked" @click=${actions.stopAsking}>${t("back")}</button>
     </div>
   `;
 }
@@ -192,7 +231,7 @@ export function reasons({ protocol, route }, actions) {
 export function numberPad(press) {
   const key = (value, word = value) =>
     html`<button type="button" data-key=${value} @click=${() => press(value)}>${word}</button>`;
-  return html`<div class="pad">
+  return html`<div class="pad" data-repeat>
     ${["1", "2", "3", "4", "5", "6", "7", "8", "9"].map((digit) => key(digit))} ${key("erase", t("find.erase"))} ${key("0")}
   </div>`;
 }

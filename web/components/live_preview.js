@@ -17,7 +17,7 @@ export class LivePreview extends HTMLElement {
   #active = false;
   #running = false;
   #head = null;
-  #eye = "OD"; // the eye that gets the light
+  #eye = "OD";
   /** @type {string | null} */
   #visit = null; // the visit for which light is allowed
   #link = "opening";
@@ -25,9 +25,10 @@ export class LivePreview extends HTMLElement {
   #bitmap = null;
   #number = 0;
   #takenMs = 0; // on this page's clock: when the drawn frame was exposed
+  #answeredMs = 0; // when the server last answered, with a frame or without one
   /** @type {{code: string} | null} */
   #hint = null; // aiming hint
-  #reportedLate_s = 0;
+  #reported = { frame_s: 0, link_s: 0 };
   #abort = new AbortController();
   #canvas = document.createElement("canvas");
   #age = document.createElement("p");
@@ -63,8 +64,14 @@ export class LivePreview extends HTMLElement {
     this.#draw();
   }
 
+  /** The eye that gets the light; a change discards the frame of the other one. */
   set eye(eye) {
+    if (eye === this.#eye) return;
     this.#eye = eye;
+    this.#number = 0;
+    this.#abort.abort();
+    this.#clearFrame();
+    this.#draw();
   }
 
   /** The visit for which light is allowed, or null; a change discards the shown frame. */
@@ -112,7 +119,9 @@ export class LivePreview extends HTMLElement {
     this.#abort = abort;
     try {
       const frame = await getPreview(this.#number, this.#eye, this.#visit, abort.signal);
+      this.#answeredMs = performance.now();
       if (!frame) this.#number = 0; // a restarted server counts from the beginning
+      if (abort.signal.aborted) return frame?.bitmap.close(); // of the other eye, or of a dead connection
       if (!frame || !this.#active) return;
       this.#bitmap?.close();
       this.#bitmap = frame.bitmap;
@@ -139,9 +148,12 @@ export class LivePreview extends HTMLElement {
     this.#age.hidden = !late;
     this.toggleAttribute("late", late);
     if (late) this.#age.textContent = t("aim.late", { s: number(age_ms / 1000, age_ms < 10000 ? 1 : 0) });
-    const late_s = late ? Math.floor(age_ms / 1000) : 0;
-    if (late_s !== this.#reportedLate_s) this.dispatchEvent(new CustomEvent("late", { detail: late_s }));
-    this.#reportedLate_s = late_s;
+    // Without new frames from the camera the server answers in time: then the connection is not late.
+    const unanswered_ms = performance.now() - Math.max(this.#takenMs, this.#answeredMs);
+    const [frame_s, link_s] = [age_ms, unanswered_ms].map((ms) => (late ? Math.floor(ms / 1000) : 0));
+    const before = this.#reported;
+    this.#reported = { frame_s, link_s };
+    if (frame_s !== before.frame_s || link_s !== before.link_s) this.dispatchEvent(new CustomEvent("late", { detail: this.#reported }));
   }
 
   #draw() {

@@ -3,7 +3,7 @@
 import { icon } from "./icons.js";
 import { finalPicture, pictureLinks } from "../core/api.js";
 import { allowsLight, consentOf, eyeOf, currentShot } from "../core/state.js";
-import { slotLabel, topAlert, alertBar, versionName } from "./components.js";
+import { chips, slotLabel, standing, topAlert, alertBar, versionName } from "./components.js";
 import { html } from "../vendor/lit-html.js";
 import { clockTime, has, t } from "../i18n/translate.js";
 
@@ -28,13 +28,13 @@ export function pictureArea(state, actions) {
     <section class="stage-area" aria-label=${t("part.live")} ?hidden=${!isExamScreen(state)}>
       <div class="stage" data-mark=${none ? "none" : state.picture}>
         <eye-live
-          class=${none ? "" : "behind"}
+          class=${none && !state.asking ? "" : "behind"}
           .head=${state.status}
           .link=${state.link}
           .eye=${eyeOf(state, state.route.slot)}
           .visit=${litVisit(state)}
           .hint=${topAlert(state) ? null : state.prompt}
-          .active=${state.route.screen === "aim" && litVisit(state) !== null}
+          .active=${state.route.screen === "aim" && !state.asking && litVisit(state) !== null}
           @refused=${actions.previewRefused}
           @aim=${actions.previewAim}
           @late=${actions.previewLate}
@@ -57,7 +57,7 @@ export function pictureArea(state, actions) {
           @loupe=${actions.loupeChanged}
         ></eye-pic>
       </div>
-      ${isExamScreen(state) ? prompt(state, actions) : ""}
+      ${isExamScreen(state) ? [prompt(state, actions), isAiming(state) ? "" : standing(state, actions), chips(state, actions)] : ""}
     </section>
   `;
 }
@@ -67,14 +67,17 @@ function sourceOf(shot, { redfree, version }) {
   return shot?.quick ? { url: shot.quick, mark: "quick" } : null;
 }
 
-// ---- prompt line: a blocking alert, the mark of the picture, or the aiming hint
+// ---- prompt line: while aiming a blocking alert or the hint; else eye and field, which no alert replaces, and the mark
+
+/** @param {State} state */
+const isAiming = ({ route, asking }) => route.screen === "aim" && !asking;
 
 /** @param {State} state */
 function prompt(state, actions) {
-  const stop = topAlert(state);
+  const stop = isAiming(state) ? topAlert(state) : null;
   const [tone, name, text] = stop ? ["stop"] : promptOf(state);
   const { eye, part } = slotLabel(state, state.route.slot);
-  const title = state.route.screen === "picture" && eye ? html`<b class="title">${eye} · ${part}</b> ` : "";
+  const title = !isAiming(state) && eye ? html`<b class="title">${eye} · ${part}</b> ` : "";
   return html`<div class="prompt" role="status" data-tone=${tone}>
     ${stop ? alertBar(stop, actions) : html`${icon(name)} <span>${title}${text}</span>`}
   </div>`;
@@ -97,6 +100,7 @@ const HINT_ICONS = {
 function promptOf(state) {
   const { route, note, activity, prompt: hint } = state;
   if (note) return ["wait", "wait", note];
+  if (state.asking) return ["plain", "camera", ""];
   if (route.screen === "picture") return markPrompt(state);
   if (state.visit && consentOf(state.visit) === "saving") return ["wait", "wait", t("save.waiting")];
   if (activity === "starting") return ["wait", "wait", t("aim.starting")];
@@ -110,6 +114,7 @@ function markPrompt(state) {
   const shot = currentShot(state);
   if (shot?.stage.name === "expose" && !shot.verdict && !shot.capture) return ["hold", "hand", t("make.expose")];
   if (state.picture === "quick") return ["quick", "wait", t("mark.quick")];
+  if (state.picture === "final" && shot?.verdict?.word === "again" && !state.version) return ["plain", "pen", t("mark.final.again")];
   if (state.picture === "final") return ["done", "check", t(state.version ? "version.note" : "mark.final")];
   if (!shot || shot.capture) return ["wait", "wait", t("mark.opening")];
   return ["wait", "wait", t("make.refine")];

@@ -3,8 +3,8 @@
 import { fileStatus, getFolders, REMOVED, requestControl } from "./api.js";
 import { clamp, homeBox } from "./viewport.js";
 import { get, otherEyeSlot, saveSetting, set, currentShot } from "./state.js";
-import { displayNumber, applyKey } from "./numbers.js";
-import { playCue, resetPictureTools, takePicture, acceptTap } from "./capture.js";
+import { applyKey, isNumber } from "./numbers.js";
+import { playCue, resetPictureTools, takePicture } from "./capture.js";
 import { qrCode } from "./qr_code.js";
 import { navigate } from "./router.js";
 import { dismissAlert, lowerAlerts, raiseAlert } from "./alerts.js";
@@ -14,18 +14,20 @@ import { loadLanguage, t, today } from "../i18n/translate.js";
 const $ = (selector) => document.querySelector(selector);
 const currentRoute = () => get().route;
 const PUPIL_REST_MS = 60_000;
+const THUMB_RETRY_MS = 1000;
+const THUMB_RETRY_MAX_MS = 64_000;
 const TOOL_STEPS = 5; // largest step of brightness and contrast, in either direction
 
 const goToAim = (slot) => navigate({ screen: "aim", visit: currentRoute().visit, slot });
 
 const navigationActions = {
   go: navigate,
-  begin: (number) => acceptTap() && visits.begin(number),
+  begin: (number) => visits.begin(number),
   resume: visits.resume,
   retryUploads: visits.retryUploads,
   startAiming() {
     const { visit } = get();
-    if (visit && acceptTap()) navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot ?? get().protocol?.slots[0].id });
+    if (visit) navigate({ screen: "aim", visit: visit.id, slot: visit.next_slot ?? get().protocol?.slots[0].id });
   },
   setField: visits.setField,
   typeNumber(key) {
@@ -33,11 +35,14 @@ const navigationActions = {
     set({ typed });
     visits.refreshList(typed ? { q: typed, limit: "20" } : { day: today(), limit: "20" });
   },
-  /** Resume the visit with exactly this number; otherwise begin a new visit. */
-  enterNumber() {
-    const same = (get().visits ?? []).find(({ number }) => [number, displayNumber(number)].includes(get().typed));
+  /** Resume the visit with exactly this number; otherwise begin a new visit. Nothing, if the visits cannot be listed. */
+  async enterNumber() {
+    const { typed } = get();
+    const listed = await visits.refreshList({ q: typed, limit: "20" });
+    if (!listed || get().typed !== typed || currentRoute().screen !== "find") return;
+    const same = listed.visits.find((visit) => isNumber(visit, typed));
     if (same) visits.resume(same);
-    else navigationActions.begin(get().typed);
+    else visits.begin(typed);
   },
   setListFilter: (listFilter) => set({ listFilter }),
 
@@ -45,7 +50,7 @@ const navigationActions = {
   back() {
     const { screen, visit, capture } = currentRoute();
     const fromExam = screen === "aim" || (screen === "picture" && !capture && !get().visit?.finished_at);
-    if (get().asking) set({ asking: false });
+    if (get().asking) set({ asking: "" });
     else if (fromExam) navigate({ screen: "person", visit });
     else if (history.state?.depth && screen !== "person" && screen !== "outcome") history.back();
     else navigate({ screen: "home" }, { replace: !history.state?.depth });
@@ -64,18 +69,24 @@ const navigationActions = {
 
 const examActions = {
   take: takePicture,
-  again: () => acceptTap() && goToAim(currentRoute().slot),
-  keepPrevious: () => acceptTap() && navigate({ screen: "picture", visit: currentRoute().visit, slot: currentRoute().slot }),
-  next: () => acceptTap() && visits.goToNextSlot(currentRoute().slot),
-  keepThis: () => acceptTap() && visits.keepPoor(currentShot(get())?.id, currentRoute().slot),
-  useThis: () => acceptTap() && visits.useInSlot(currentRoute().slot, currentRoute().capture),
-  ask: () => acceptTap() && set({ asking: true }),
-  closeReasons: () => set({ asking: false }),
-  couldNot: (slot, reason) => acceptTap() && visits.couldNot(slot, reason),
-  finish: () => acceptTap() && visits.finish(),
-  reopen: () => acceptTap() && visits.reopen(),
+  again: () => goToAim(currentRoute().slot),
+  keepPrevious: () => navigate({ screen: "picture", visit: currentRoute().visit, slot: currentRoute().slot }),
+  next: () => visits.goToNextSlot(currentRoute().slot),
+  keepThis: () => visits.keepPoor(currentShot(get())?.id, currentRoute().slot),
+  useThis: () => visits.useInSlot(currentRoute().slot, currentRoute().capture),
+  ask: () => set({ asking: "reason" }),
+  stopAsking: () => set({ asking: "" }),
+  couldNot: (slot, reason) => visits.couldNot(slot, reason),
+  finish: () => visits.finish(),
+  finishWithout: () => visits.finish({ isSure: true }),
+  takeMissing() {
+    const slot = get().visit?.next_slot ?? visits.nextSlot(currentRoute().slot);
+    set({ asking: "" });
+    if (slot) goToAim(slot);
+  },
+  reopen: () => visits.reopen(),
   backToOutcome: () => navigate({ screen: "outcome", visit: currentRoute().visit }),
-  moveToOtherEye: (slot, capture) => acceptTap() && visits.moveToOtherEye(slot, capture),
+  moveToOtherEye: (slot, capture) => visits.moveToOtherEye(slot, capture),
   print: () => window.print(),
 
   async toggleQrCode() {
@@ -130,6 +141,14 @@ const pictureActions = {
   reset() {
     set({ brightness: 0, contrast: 0, loupe: false });
     $("#picture").showAll();
+  },
+
+  // Request a thumbnail again, each time after twice the wait.
+  thumbFailed({ target }) {
+    const wait_ms = Number(target.dataset.waitMs ?? THUMB_RETRY_MS);
+    if (wait_ms > THUMB_RETRY_MAX_MS) return;
+    target.dataset.waitMs = 2 * wait_ms;
+    setTimeout(() => target.setAttribute("src", target.getAttribute("src")), wait_ms);
   },
 
   // Scale a thumbnail to its illuminated disc, without the dark frame around it.

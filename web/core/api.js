@@ -14,10 +14,27 @@ export class ApiError extends Error {
   }
 }
 
-async function requestJson(path, options) {
+const RETRY_MS = [300, 1200]; // a reading request that got no answer is repeated after these times
+
+async function answerTo(path, options, waits) {
+  try {
+    return await fetch(path, { cache: "no-store", ...options });
+  } catch (problem) {
+    const [wait, ...rest] = waits;
+    if (wait === undefined) throw problem;
+    await new Promise((resolve) => setTimeout(resolve, wait));
+    return answerTo(path, options, rest);
+  }
+}
+
+/**
+ * @param {string} path
+ * @param {RequestInit} [options]
+ */
+async function requestJson(path, options = {}) {
   let response;
   try {
-    response = await fetch(path, { cache: "no-store", ...options });
+    response = await answerTo(path, options, options.method ? [] : RETRY_MS);
   } catch {
     throw new ApiError({ code: "link.cut", message: t("link.cut"), remedy: t("link.cut.remedy") });
   }
@@ -132,11 +149,12 @@ export function finalPicture(capture, redfree, version = 0) {
   return colour && !redfree ? { url: colour, mark: "final" } : { url: picture, mark: "final", redfree: Boolean(colour) };
 }
 
-/** Fetch a picture and decode it. */
-export async function getBitmap(url, signal) {
+/** Fetch a picture; TypeError where a later request may get it: no answer, or an error of the server. */
+export async function getPicture(url, signal) {
   const response = await fetch(url, { signal });
+  if (response.status >= 500) throw new TypeError(`picture ${response.status}`);
   if (!response.ok) throw new Error(`picture ${response.status}`);
-  return createImageBitmap(await response.blob());
+  return response.blob();
 }
 
 const HEARTBEAT_TIMEOUT_MS = 3500; // heartbeat timeout; the server sends one event per second

@@ -5,28 +5,15 @@
 import { newIdempotencyKey, getCapture, ApiError, send } from "./api.js";
 import { allowsLight, eyeOf, PICTURE_DEFAULTS, get, set, currentShot } from "./state.js";
 import { navigate } from "./router.js";
+import { buttonsChanged } from "./taps.js";
 import { lowerAlerts, raiseAlert, visibleAlerts } from "./alerts.js";
 import { alertOnError, refreshVisit } from "./visit.js";
 import { t } from "../i18n/translate.js";
 
-const DEBOUNCE_MS = 400; // debounce: ignores the second half of a double tap
 const SHOTS_MAX = 12;
 const FIRST_STAGE = Object.freeze({ name: "expose", fraction: 0, left: 0 });
 
-let ignoreTapsUntil = 0;
 const finishedIds = new Set(); // finished captures; their late events are ignored
-
-/** Restart the debounce time: taps are ignored until it ends. */
-export function ignoreTaps() {
-  ignoreTapsUntil = performance.now() + DEBOUNCE_MS;
-}
-
-/** Return true and restart the debounce time if a tap may act now. */
-export function acceptTap() {
-  if (performance.now() < ignoreTapsUntil) return false;
-  ignoreTaps();
-  return true;
-}
 
 const VIBRATIONS = { ready: 15, taken: 30, good: 15, poor: [30, 60, 30] };
 
@@ -44,7 +31,6 @@ const shotById = (id) => get().shots.find((shot) => shot.id === id);
 
 /** Take a picture of the current slot, unless an alert or a missing consent blocks it. */
 export function takePicture() {
-  if (!acceptTap()) return;
   const { route } = get();
   if (route.screen === "picture") showPendingNote();
   if (route.screen !== "aim" || !allowsLight(get())) return;
@@ -111,7 +97,7 @@ function completeShot(capture, key = shotById(capture.id)?.key) {
   const shot = get().shots.find((one) => one.key === key);
   if (!shot || shot.capture) return;
   const verdict = capture.verdict ?? shot.verdict;
-  if (verdict?.word !== "good" || shot.verdict?.word !== "good") ignoreTaps(); // debounce: the buttons have just changed
+  if (verdict?.word !== "good" || shot.verdict?.word !== "good") buttonsChanged();
   updateShot(key, { id: capture.id, capture: Object.freeze(capture), verdict, over: true, stage: { ...shot.stage, fraction: 1 } });
   updateSlot(shot, capture.id, verdict);
   refreshVisit(shot.visit);
@@ -149,7 +135,7 @@ export const captureEventHandlers = {
     if (!shot || shot.over) return;
     updateShot(shot.key, { verdict: Object.freeze(verdict) });
     if (shot.verdict?.word === verdict.word) return;
-    ignoreTaps();
+    buttonsChanged();
     playCue(verdict.word === "again" ? "poor" : "good");
   },
 

@@ -2,6 +2,7 @@
 // 2.1.4).
 
 import { get, currentShot } from "./state.js";
+import { acceptKey } from "./taps.js";
 
 const SHUTTER_KEYS = new Set([" ", "Enter", "AudioVolumeUp"]);
 
@@ -18,7 +19,7 @@ export function bindKeys(actions) {
     if (SHUTTER_KEYS.has(event.key)) {
       if (route.screen !== "aim" || target.closest("button, a, summary, eye-pic")) return;
       event.preventDefault();
-      actions.take();
+      if (acceptKey(event)) actions.take();
       return;
     }
     if (get().letters && !target.closest("eye-pic")) onLetter(event, actions);
@@ -33,14 +34,16 @@ function onFind({ key, target }, actions) {
   return true;
 }
 
-function onLetter({ key }, actions) {
+function onLetter(event, actions) {
+  const { key } = event;
   const { route, redfree, loupe, protocol } = get();
   const shot = currentShot(get());
   const hasVerdict = route.screen === "picture" && shot && (shot.over || shot.verdict);
+  const once = (action) => acceptKey(event) && action();
   const keys = {
-    ArrowLeft: () => route.screen !== "home" && actions.back(),
+    ArrowLeft: () => route.screen !== "home" && once(actions.back),
     "?": actions.openMenu,
-    ...(hasVerdict ? { r: actions.again, n: actions.next, ArrowRight: actions.next, ...viewerKeys(actions, redfree, loupe) } : {}),
+    ...(hasVerdict ? { r: () => once(actions.again), n: () => once(actions.next), ArrowRight: () => once(actions.next), ...viewerKeys(actions, redfree, loupe) } : {}),
   };
   const exam = route.screen === "aim" || route.screen === "picture";
   if (exam && /^[1-9]$/.test(key) && protocol?.slots[key - 1]) actions.chooseTile(protocol.slots[key - 1].id);

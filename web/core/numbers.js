@@ -12,5 +12,8 @@ export function displayNumber(number) {
   return automatic ? `${number.slice(0, -1)}-${number.slice(-1)}` : number;
 }
 
+/** Return whether a visit has exactly this number, in either form. */
+export const isNumber = ({ number }, typed) => [number, displayNumber(number)].includes(typed);
+
 /** Return the typed text after a key of the number pad, at most `most` characters long. */
 export const applyKey = (before, key, most) => (key === "erase" ? before.slice(0, -1) : (before + key).slice(0, most));

@@ -27,7 +27,7 @@ export const PICTURE_DEFAULTS = Object.freeze({
   brightness: 0,
   contrast: 0,
   loupe: false,
-  asking: false,
+  asking: "", // question in place of the controls: "reason" why not possible, "finish" without all pictures
 });
 
 const settings = Object.freeze({
@@ -56,9 +56,9 @@ const settings = Object.freeze({
  * @typedef {{slots: SlotPlan[], reasons: string[], retakes: number, programme: Record<string, any>}} Protocol
  * @typedef {{link: string, status: any, activity: string, hasControl: boolean, alerts: readonly Alert[],
  *   route: import("./router.js").Route, protocol: Protocol | null, visit: Visit | null, visits: Visit[] | null,
- *   counts: {done: number, to_finish: number, referred: number} | null, typed: string, listFilter: string,
+ *   counts: {done: number, to_finish: number, referred: number, declined: number} | null, typed: string, listFilter: string,
  *   shots: readonly Shot[], prompt: {code: string} | null, picture: string, grey: boolean, version: number,
- *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: boolean, zoom: number, note: string,
+ *   redfree: boolean, brightness: number, contrast: number, loupe: boolean, asking: string, zoom: number, note: string,
  *   picked: readonly string[], compared: readonly Capture[], montages: Readonly<Record<string, any>>,
  *   folders: {id: string, name: string, is_writable: boolean}[] | null, zipped: boolean, copied: string | null, outbox: any,
  *   finishing: string | null, now: number, modules: Readonly<Record<string, any>>, speech: any, saying: any,
@@ -126,6 +126,16 @@ export const pendingShots = ({ shots }, visit) => shots.filter((shot) => shot.vi
 /** Move a shot to a slot of the other eye. */
 export const moveShot = (id, { id: slot, eye }) =>
   set({ shots: Object.freeze(get().shots.map((shot) => (shot.id === id ? Object.freeze({ ...shot, slot, eye }) : shot))) });
+
+/**
+ * Return the number of required slots of the visit that have neither a picture, nor one in progress, nor a reason.
+ * @param {State} state
+ */
+export const missingPictures = ({ visit, protocol, shots }) =>
+  (protocol?.slots ?? []).filter(
+    ({ id, required }) =>
+      required && visit?.slots[id]?.state === "empty" && !shots.some((shot) => shot.visit === visit.id && shot.slot === id && !shot.over),
+  ).length;
 
 /**
  * Return the failed shots of the open visit, each until its slot gets another shot or is marked "could not".

@@ -1,7 +1,7 @@
 // Changes of a visit: begin, form fields, next slot, finish, reopen. Each change is sent at once.
 
 import { newIdempotencyKey, getMontage, getOutbox, getVisit, getVisits, ApiError, send } from "./api.js";
-import { eyeOf, get, lostShots, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
+import { eyeOf, get, lostShots, missingPictures, otherEyeSlot, moveShot, set, pendingShots } from "./state.js";
 import { navigate } from "./router.js";
 import { lowerAlerts, raiseAlert } from "./alerts.js";
 
@@ -42,11 +42,15 @@ export async function refreshMontages(visit) {
   if (waits) montagePoll = setTimeout(() => isShown() && refreshMontages(visit), MONTAGE_POLL_MS);
 }
 
-/** Load the visits that match the query, and the counts of the day. */
+let newestQuery = {};
+
+/** Load the visits that match the query, and the counts of the day; return them. An answer to an earlier query is not shown. */
 export async function refreshList(query) {
   const screen = get().route.screen;
+  newestQuery = query;
   const result = await alertOnError(() => getVisits(query));
-  if (result && get().route.screen === screen) set({ visits: result.visits, counts: result.counts });
+  if (result && get().route.screen === screen && query === newestQuery) set({ visits: result.visits, counts: result.counts });
+  return result;
 }
 
 /** Begin a visit with this number, or with an automatic one. */
@@ -120,7 +124,7 @@ const change = (what, body) =>
 
 /** Mark a slot as "could not"; a chip offers undo for ten seconds. */
 export async function couldNot(slot, reason) {
-  set({ asking: false });
+  set({ asking: "" });
   const { visit } = get();
   if (!visit) return;
   const before = visit.slots[slot].capture;
@@ -198,10 +202,14 @@ export async function retryUploads(visit) {
 
 // ---- finishing
 
-/** Finish the visit; while a capture is in progress, show its progress first and finish afterwards. */
-export async function finish() {
+/**
+ * Finish the visit; ask first when a picture is missing, but not a patient who did not agree. While a capture is in
+ * progress, show its progress and finish afterwards.
+ */
+export async function finish({ isSure = false } = {}) {
   const { visit } = get().route;
   if (!visit) return;
+  if (!isSure && missingPictures(get()) && get().visit?.fields.consent !== "declined") return set({ asking: "finish" });
   lowerAlerts("shot.crossed"); // undo would need a reopened visit
   if (pendingShots(get(), visit).length) {
     navigate({ screen: "outcome", visit });
@@ -219,7 +227,7 @@ export function finishWhenComplete() {
   if (route.visit !== finishing || route.screen !== "outcome") return;
   const [lost] = lostShots(get());
   if (lost) navigate({ screen: "aim", visit: finishing, slot: lost.slot }, { replace: true });
-  else finish();
+  else finish({ isSure: true });
 }
 
 /** Reopen the finished visit. */

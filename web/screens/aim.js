@@ -2,7 +2,7 @@
 
 import { icon } from "../components/icons.js";
 import { allowsLight } from "../core/state.js";
-import { chips, reasons, slotLabel, tiles } from "../components/components.js";
+import { question, slotLabel, tiles } from "../components/components.js";
 import { visibleAlerts, timeLeft } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { has, t } from "../i18n/translate.js";
@@ -12,12 +12,12 @@ import { has, t } from "../i18n/translate.js";
 /** @param {State} state */
 export function aim(state, actions) {
   const { eye, part } = slotLabel(state, state.route.slot);
-  if (state.asking) return html`<h2 class="slot-title">${eye} · ${part}</h2> ${reasons(state, actions)} ${tiles(state, actions)}`;
+  if (state.asking) return html`${question(state, actions)} ${tiles(state, actions)}`;
   const answered = Object.values(state.visit?.slots ?? {}).every((slot) => slot.state !== "empty");
   const here = state.visit?.slots[state.route.slot ?? ""];
   return html`
     <h2 class="slot-title">${eye} · ${part}</h2>
-    ${tiles(state, actions)} ${state.modules.speech?.speechButtons(state) ?? nothing} ${chips(state, actions)}
+    ${tiles(state, actions)} ${state.modules.speech?.speechButtons(state) ?? nothing}
     <div class="actions">${shutter(state, actions)}</div>
     <div class="last finish">
       ${here?.capture

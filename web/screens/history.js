@@ -16,6 +16,7 @@ const FILTERS = {
   all: () => true,
   open: ({ finished_at: end }) => !end,
   referred: ({ outcome }) => Boolean(outcome?.code.startsWith("refer")),
+  declined: ({ outcome }) => outcome?.code === "declined",
 };
 
 /** @param {State} state */
@@ -28,7 +29,7 @@ export function history(state, actions) {
   return html`
     <section class="history">
       <h2>${t("history.title")}</h2>
-      <div class="days" role="group" aria-label=${t("history.day")}>
+      <div class="days" data-repeat role="group" aria-label=${t("history.day")}>
         <button type="button" id="before" @click=${step(-1)}>${icon("left")} <span>${t("history.before")}</span></button>
         <p aria-live="polite">${calendarDay(`${day}T12:00`)}</p>
         <button type="button" id="after" ?disabled=${day >= today()} @click=${step(1)}>
@@ -181,7 +182,7 @@ export function compare(state, actions) {
         <button type="button" aria-pressed=${redfree} @click=${() => actions.setRedfree(!redfree)}>${t("tool.redfree")}</button>
         <button type="button" id="loupe" aria-pressed=${loupe} @click=${() => actions.setLoupe(!loupe)}>${t("tool.loupe")}</button>
         ${blink
-          ? html`<button class="primary" type="button" id="swap" @click=${actions.swap}>
+          ? html`<button class="primary" type="button" id="swap" data-repeat @click=${actions.swap}>
               ${t("compare.swap", { name: captureLabel(state, front ? route.capture : route.other) })}
             </button>`
           : nothing}

@@ -3,7 +3,7 @@
 
 import { icon } from "../components/icons.js";
 import { choice, numberPad, patientLabel } from "../components/components.js";
-import { displayNumber } from "../core/numbers.js";
+import { displayNumber, isNumber } from "../core/numbers.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { clockTime, LANGUAGES, t } from "../i18n/translate.js";
 
@@ -30,11 +30,11 @@ export function home(state, actions) {
   `;
 }
 
-function dayCounts({ done, to_finish: open, referred }) {
+function dayCounts({ done, to_finish: open, referred, declined }) {
   return html`
     <p class="day">
       <b>${t("home.today")}</b> <span>${t("home.done", { n: done })}</span> <span>${t("home.open", { n: open })}</span>
-      <span>${t("home.referred", { n: referred })}</span>
+      <span>${t("home.referred", { n: referred })}</span> ${declined ? html`<span>${t("home.declined", { n: declined })}</span>` : nothing}
     </p>
   `;
 }
@@ -60,7 +60,7 @@ function languages({ language }, actions) {
 /** @param {State} state */
 export function find({ typed, visits }, actions) {
   const found = (visits ?? []).filter(({ number }) => number.includes(typed) || displayNumber(number).includes(typed)).slice(0, 20);
-  const [one] = typed ? found : [];
+  const one = visits && typed ? found.find((visit) => isNumber(visit, typed)) : undefined;
   return html`
     <section class="find">
       <div>
@@ -71,8 +71,10 @@ export function find({ typed, visits }, actions) {
           ? html`<button class="primary" type="button" id="open-found" @click=${() => actions.resume(one)}>
               ${t("find.open.one", { number: displayNumber(one.number) })}
             </button>`
-          : html`<p class="no-match" aria-live="polite">${typed && visits ? t("find.nomatch", { number: typed }) : "\u00a0"}</p>`}
-        <button class=${one ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => actions.begin(typed)}>
+          : html`<p class="no-match" aria-live="polite">
+              ${typed && visits ? t(found.length ? "find.choose" : "find.nomatch", { number: typed }) : "\u00a0"}
+            </p>`}
+        <button class=${found.length ? "" : "primary"} type="button" id="start" ?hidden=${!typed} @click=${() => actions.begin(typed)}>
           ${t("find.start", { number: typed })}
         </button>
         <p class="muted">${t("find.scan")}</p>
@@ -86,7 +88,7 @@ export function find({ typed, visits }, actions) {
 }
 
 /** Icon of an outcome: a tick would suggest that nothing remains to be done. */
-export const outcomeIcon = ({ code }) => (code.startsWith("refer") ? "warn" : "next");
+export const outcomeIcon = ({ code }) => (code.startsWith("refer") ? "warn" : code === "declined" ? "cross" : "next");
 
 export function patientList(visits, open) {
   return html`

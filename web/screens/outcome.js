@@ -23,7 +23,7 @@ export function outcome(state, actions) {
       <h2>${t("outcome.title", { number: displayNumber(visit.number) })}</h2>
       <p class="verdict">${icon(outcomeIcon(visit.outcome))} ${headline}</p>
       <p>${sentence} ${state.status?.sending || visit.outcome.code !== "send" ? nothing : t("outcome.copy")}</p>
-      ${state.status?.sending ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, actions)}
+      ${state.status?.sending && visit.outcome.code !== "declined" ? html`<p id="by-itself">${t("outcome.byitself")}</p>` : nothing} ${tiles(state, actions)}
       <div class="ends">
         <button type="button" id="print" @click=${actions.print}>${t("outcome.print")}</button>
         <button type="button" id="code" aria-expanded=${state.code !== undefined} @click=${actions.toggleQrCode}>
@@ -77,7 +77,7 @@ function unfinishedVisit(actions, visit) {
 /** Return the outcome's texts: the server's English sentence, preceded by the translated outcome in other languages. */
 export const outcomeTexts = ({ code, sentence }, language) => {
   if (language === "en") return [sentence, ""];
-  return [t(`outcome.${code}`), code === "send" ? "" : sentence]; // the sentence adds nothing here
+  return [t(`outcome.${code}`), code === "send" || code === "declined" ? "" : sentence]; // the sentence adds nothing here
 };
 
 function qrFigure({ size, path }) {

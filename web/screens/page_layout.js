@@ -4,7 +4,7 @@
 
 import { icon } from "../components/icons.js";
 import { currentShot } from "../core/state.js";
-import { chips, patientLabel, topAlert, alertBar } from "../components/components.js";
+import { chips, patientLabel, standing } from "../components/components.js";
 import { aim } from "./aim.js";
 import { find, home } from "./home.js";
 import { outcome } from "./outcome.js";
@@ -35,8 +35,8 @@ export function page(state, actions) {
         ${pictureArea(state, actions)}
         ${exam
           ? html`<section class="panel" aria-label=${t("part.controls")}>${screen}</section>`
-          : html`<div class="standing" role="status">${topAlertBar(state, actions)}</div>
-              ${chips(state, actions)} ${screen}`}
+          : html`${screen}
+              <div class="messages"><div role="status">${standing(state, actions)}</div> ${chips(state, actions)}</div>`}
       </main>
       ${menu(state, actions)} ${modules.speech?.speechDialog(state) ?? nothing}
     </div>
@@ -51,12 +51,6 @@ function phase(state) {
   const shot = currentShot(state);
   if (!shot) return "";
   return shot.over ? "kept" : shot.verdict ? "assessed" : "making";
-}
-
-/** @param {State} state */
-function topAlertBar(state, actions) {
-  const stop = topAlert(state);
-  return stop ? alertBar(stop, actions) : nothing;
 }
 
 // ---- header

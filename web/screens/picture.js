@@ -4,7 +4,7 @@
 import { icon } from "../components/icons.js";
 import { pictureLinks } from "../core/api.js";
 import { currentShot } from "../core/state.js";
-import { chips, choice, alertButton, reasons, slotLabel, tiles, versionName } from "../components/components.js";
+import { choice, question, slotLabel, tiles, versionName } from "../components/components.js";
 import { ALERTS, timeLeft, alertText } from "../core/alerts.js";
 import { html, nothing } from "../vendor/lit-html.js";
 import { nextSlot } from "../core/visit.js";
@@ -16,14 +16,13 @@ import { number, t } from "../i18n/translate.js";
 export function picture(state, actions) {
   const shot = currentShot(state);
   if (!shot) return html`<div class="card making"><p>${t("mark.opening")}</p></div>`;
-  if (state.asking) return html`${reasons(state, actions)} ${tiles(state, actions)}`;
+  if (state.asking) return html`${question(state, actions)} ${tiles(state, actions)}`;
   return html`
     ${card(state, actions, shot)} ${state.picture === "none" ? nothing : tools(state, actions, shot.capture)} ${tiles(state, actions)}
-    ${chips(state, actions)}
     <div class="actions">${actionButtons(state, actions, shot)}</div>
     ${shot.capture ? (state.modules.details?.detailsDialog(state, actions, shot) ?? nothing) : nothing}
     ${state.visit?.finished_at || complete(state, shot)
-      ? nothing
+      ? html`<div class="finish" aria-hidden="true"></div>`
       : html`<button class="quiet finish" type="button" id="finish" @click=${actions.finish}>${t("finish.now")}</button>`}
   `;
 }
@@ -46,7 +45,6 @@ const exhausted = (state, shot) =>
 /** @param {State} state */
 function card(state, actions, shot) {
   if (!shot.verdict && !shot.over) return makingCard(shot);
-  const side = state.alerts.find(({ level, id }) => level === "ask" && (!id || id === shot.id));
   const [name, word, text] = verdictText(state, shot);
   return html`
     <div class="card" data-verdict=${shot.verdict?.word ?? "none"} data-code=${shot.verdict?.code ?? shot.failed?.code ?? ""}>
@@ -55,7 +53,6 @@ function card(state, actions, shot) {
         ${timer(state, actions, shot) ?? (shot.capture ? detailsButton(actions, shot.capture) : nothing)}
       </div>
       <p>${text}</p>
-      ${side ? html`<p class="ask">${alertText(side)} ${side.buttons.map((one) => alertButton(side, one, actions))}</p>` : nothing}
       ${shot.over ? nothing : progressBar(shot)}
     </div>
   `;
@@ -109,7 +106,7 @@ const progressBar = ({ stage }) => html`<progress max="1" .value=${stage.fractio
 /** @param {State} state */
 function tools({ redfree, version, brightness, contrast, loupe, zoom }, actions, capture) {
   const step = (tool, label, by) => html`
-    <div class="step" role="group" aria-label=${label}>
+    <div class="step" data-repeat role="group" aria-label=${label}>
       <button type="button" aria-label=${t(`${tool}.less`)} @click=${() => by(-1)}>−</button>
       <span aria-hidden="true">${label}</span>
       <button type="button" aria-label=${t(`${tool}.more`)} @click=${() => by(1)}>+</button>

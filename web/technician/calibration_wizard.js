@@ -78,7 +78,7 @@ function loginForm({ hasPin, pin, wait, error, busy }, actions) {
           .value=${pin} @input=${actions.pinTyped}
         />
       </label>
-      <div class="keys">
+      <div class="keys" data-repeat>
         ${[1, 2, 3, 4, 5, 6, 7, 8, 9].map(key)}
         <button type="button" class="wide" @click=${actions.deleteDigit}>${t("pin.delete")}</button>
         ${key(0)}

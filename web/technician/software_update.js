@@ -1,12 +1,12 @@
 // <software-update>: search, upload and installation of an update, and its result. A separate privileged process does
 // the work; this element sends requests and shows the recorded status.
 
+import { buttonsChanged } from "../core/taps.js";
 import { html, nothing, render } from "../vendor/lit-html.js";
 import { number, t } from "../i18n/translate.js";
 import { TECHNICIAN } from "../i18n/en_technician.js";
 
 const POLL_MS = 1000;
-const DEBOUNCE_MS = 600; // debounce: the second half of a double tap must not install an update that has just appeared
 const IN_PROGRESS = ["asked", "looking", "fetching", "installing", "restarting", "trying"];
 const MAY_RESTART = ["installing", "restarting", "trying"]; // states in which a restart may interrupt the connection
 const NEWS_SHOWN = 5;
@@ -17,7 +17,6 @@ class SoftwareUpdate extends HTMLElement {
   #timer = 0;
   /** @type {XMLHttpRequest | null} */
   #uploadRequest = null;
-  #ignoreTapsUntil = 0;
 
   connectedCallback() {
     this.#set({});
@@ -32,7 +31,7 @@ class SoftwareUpdate extends HTMLElement {
   #set(patch) {
     const before = this.#state.status?.state;
     this.#state = { ...this.#state, ...patch };
-    if (this.#state.status?.state !== before) this.#ignoreTapsUntil = performance.now() + DEBOUNCE_MS;
+    if (this.#state.status?.state !== before) buttonsChanged();
     render(view(this.#state, this.#actions), this);
   }
 
@@ -49,12 +48,6 @@ class SoftwareUpdate extends HTMLElement {
   }
 
   async #submit(path, body = {}) {
-    if (performance.now() < this.#ignoreTapsUntil) return;
-    this.#ignoreTapsUntil = performance.now() + DEBOUNCE_MS;
-    await this.#request(path, body);
-  }
-
-  async #request(path, body) {
     const options = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
     try {
       const response = await fetch(`/api/update/${path}`, options);
@@ -90,7 +83,7 @@ class SoftwareUpdate extends HTMLElement {
     request.onload = () => {
       const ok = request.status === 201;
       done(ok ? null : (request.response ?? { code: "fault", message: t("fault.unknown"), remedy: "" }));
-      if (ok) this.#request("check", {});
+      if (ok) this.#submit("check");
     };
     request.open("PUT", "/api/update/file");
     request.responseType = "json";

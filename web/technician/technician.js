@@ -4,13 +4,13 @@
 import { ApiError } from "../core/api.js";
 import "./sensor_preview.js";
 import { createStore } from "../core/store.js";
+import { buttonsChanged } from "../core/taps.js";
 import { render } from "../vendor/lit-html.js";
 import { technicianPage } from "./calibration_wizard.js";
 import { useLanguage, t } from "../i18n/translate.js";
 import { TECHNICIAN } from "../i18n/en_technician.js";
 
 const POLL_MS = 700;
-const DEBOUNCE_MS = 600; // debounce: the second half of a double tap must not press a control of the next view
 const ACTIVITY_MS = 30_000; // at most one activity report in this time
 
 useLanguage("en", TECHNICIAN);
@@ -31,7 +31,6 @@ const store = createStore(/** @type {Record<string, any>} */ ({
   theme: loadSetting("theme", "dim"),
 }));
 const { get, set } = store;
-let ignoreTapsUntil = 0;
 let activityMs = 0;
 let dismissed = readStorage("dismissed");
 let dismissedLenses = readStorage("dismissed.lenses");
@@ -84,7 +83,7 @@ async function refresh() {
 function showCalibration(cal) {
   const before = get().cal;
   const view = viewOf(cal);
-  if (view !== get().view || stepOf(cal) !== stepOf(before)) ignoreTaps();
+  if (view !== get().view || stepOf(cal) !== stepOf(before)) buttonsChanged();
   const measuring = cal.state === "measuring" || cal.lenses?.state === "measuring";
   if (cal.stand !== before?.stand || cal.lenses?.lens !== before?.lenses?.lens || measuring) set({ error: null });
   set({ cal: Object.freeze(cal), view });
@@ -115,7 +114,7 @@ async function showLogin() {
 
 // Send one request per tap; show the server's error.
 async function submit(path, body, then = showCalibration) {
-  if (get().busy || performance.now() < ignoreTapsUntil) return;
+  if (get().busy) return;
   set({ busy: true, error: null });
   try {
     then(await request(path, body));
@@ -128,12 +127,8 @@ async function submit(path, body, then = showCalibration) {
     }
   } finally {
     set({ busy: false });
-    ignoreTaps();
+    buttonsChanged();
   }
-}
-
-function ignoreTaps() {
-  ignoreTapsUntil = performance.now() + DEBOUNCE_MS;
 }
 
 // ---- user actions

@@ -1,17 +1,20 @@
 // <eye-pic>: picture viewer with zoom, pan, loupe, red-free, brightness and contrast. Gestures: gestures.js; tools:
 // renderer.js; drawing: canvas.js. Light DOM, so that style sheet and tests reach its parts. Loaded on demand.
 
-import { getBitmap } from "../../core/api.js";
+import { getPicture } from "../../core/api.js";
 import { clamp, context2d, fitCanvas, homeBox } from "../../core/viewport.js";
 import { Gestures } from "./gestures.js";
 import { drawLoupe, drawPicture } from "./canvas.js";
 import { pictureRenderer } from "./renderer.js";
 import { NEUTRAL } from "./lookup_table.js";
+import { t } from "../../i18n/translate.js";
 
 const ZOOM_MAX = 8;
 const DOUBLE_TAP_ZOOM = 3;
 const STEP = 1.5;
 const FADE_MS = 200;
+const RETRY_MIN_MS = 1000; // a picture that failed to load is requested again, each time after twice the wait
+const RETRY_MAX_MS = 15_000;
 const WHOLE_VIEW = Object.freeze({ zoom: 1, u: 0, v: 0, loupe: null });
 const EARLY_PROPERTIES = ["view", "subject", "src", "head", "redfree", "brightness", "contrast", "loupe"];
 
@@ -36,6 +39,7 @@ export class PictureViewer extends HTMLElement {
   /** @type {{zoom: number, u: number, v: number, loupe: {u: number, v: number, held: boolean} | null}} */
   #view = WHOLE_VIEW; // loupe: {u, v, held} or null; `held` during a long press
   #canvas = document.createElement("canvas");
+  #message = document.createElement("p"); // why there is no picture yet
   #onChange = () => this.#redraw();
 
   constructor() {
@@ -48,7 +52,9 @@ export class PictureViewer extends HTMLElement {
   connectedCallback() {
     this.tabIndex = 0;
     this.setAttribute("role", "img");
-    this.append(this.#canvas);
+    this.#message.className = "age";
+    this.#message.hidden = true;
+    this.append(this.#canvas, this.#message);
     pictureRenderer().addEventListener("changed", this.#onChange);
     document.addEventListener("visibilitychange", this.#onChange);
     for (const name of EARLY_PROPERTIES.filter((one) => Object.hasOwn(this, one))) {
@@ -136,20 +142,32 @@ export class PictureViewer extends HTMLElement {
 
   // ---- picture and tools
 
-  async #load(src) {
+  async #load(src, wait_ms = RETRY_MIN_MS) {
     const { url, blob, mark } = src;
     const { signal } = this.#loading;
     try {
-      const bitmap = await (blob ? createImageBitmap(blob) : getBitmap(url, signal));
+      const bitmap = await createImageBitmap(blob ?? (await getPicture(url, signal)));
       // The quick look is shown only until the final picture is loaded, a final picture only while it is selected.
       const isLate = mark === "quick" ? this.#mark === "final" : src !== this.#src;
       if (signal.aborted || isLate) return;
       this.#show(bitmap, src);
       const grey = pictureRenderer().isGrey(bitmap);
       this.dispatchEvent(new CustomEvent("drawn", { detail: { url, mark, grey } }));
-    } catch {
-      if (!signal.aborted) this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
+    } catch (problem) {
+      if (signal.aborted || src !== this.#src) return;
+      if (problem instanceof TypeError) this.#loadLater(src, wait_ms);
+      else this.dispatchEvent(new CustomEvent("fault", { detail: { url, mark } }));
     }
+  }
+
+  // No answer, or an error of the server: say so and request the picture again, until another one is selected.
+  #loadLater(src, wait_ms) {
+    const { signal } = this.#loading;
+    this.#message.textContent = t("fault.picture.retry");
+    this.#message.hidden = false;
+    setTimeout(() => {
+      if (!signal.aborted && src === this.#src) this.#load(src, Math.min(2 * wait_ms, RETRY_MAX_MS));
+    }, wait_ms);
   }
 
   /**
@@ -162,6 +180,7 @@ export class PictureViewer extends HTMLElement {
     this.#previous = this.#bitmap;
     this.#fadeStartMs = bitmap && !reducedMotion ? performance.now() : -Infinity;
     this.#bitmap = bitmap;
+    this.#message.hidden = true;
     this.#mark = mark;
     this.#takenRedfree = Boolean(redfree);
     this.dataset.drawn = ""; // written after the final draw

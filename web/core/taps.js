@@ -1,0 +1,41 @@
+// Double taps: of two taps at the same place within 0.4 s only the first counts, on every button. So does a tap at that
+// place within 0.4 s after the buttons have changed, because it was meant for the button that was there before. A tap
+// anywhere else, and the first tap of a page, always counts.
+
+const DEBOUNCE_MS = 400;
+const SAME_PLACE_PX = 48; // size of the smallest button
+
+/** @type {Map<string, {x: number, y: number, ms: number}>} the last tap, and the last press of each key */
+const last = new Map();
+let changedMs = -Infinity;
+
+/** The buttons have changed: another screen or another verdict. */
+export function buttonsChanged() {
+  changedMs = performance.now();
+}
+
+/** Return whether a tap or key only repeats the one before it. `mayRepeat`: on a button that is pressed many times. */
+function isRepetition(name, { x, y, ms }, mayRepeat = false) {
+  const before = last.get(name);
+  last.set(name, { x, y, ms });
+  if (!before || Math.hypot(x - before.x, y - before.y) > SAME_PLACE_PX) return false;
+  return ms - (mayRepeat ? changedMs : Math.max(before.ms, changedMs)) < DEBOUNCE_MS;
+}
+
+/** Return whether a key press may act. */
+export const acceptKey = ({ key, timeStamp }) => !isRepetition(`key ${key}`, { x: 0, y: 0, ms: timeStamp });
+
+// A click without coordinates (`detail` 0) comes from a key or from a screen reader.
+addEventListener(
+  "click",
+  (event) => {
+    const button = /** @type {Element} */ (event.target).closest("button, a.button");
+    if (!button) return;
+    const { detail, clientX: x, clientY: y, timeStamp: ms } = event;
+    const mayRepeat = button.closest("[data-repeat]") !== null; // number pad, steps of a tool
+    if (!isRepetition(detail ? "tap" : "click", detail ? { x, y, ms } : { x: 0, y: 0, ms }, mayRepeat)) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+  },
+  { capture: true },
+);
