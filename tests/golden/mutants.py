@@ -168,8 +168,12 @@ MARKS = (  # file, old text, new text, and test of the mark of simulated picture
     ("services/lab/montage_files.py", "KEY: simulated,", "KEY: False,", "montage"),
     ("services/lab/paper/pictures.py", "png_bytes(grey, True)", "png_bytes(grey, False)", "pictures_of_the_paper"),
     (
-        "services/lab/reconstruct_burst.py", "made.picture, report, made.simulated or calibration.simulated)",
-        "made.picture, report, False)", "reconstruct_burst",
+        "services/lab/reconstruct_burst.py", "solved.picture, solved.simulated)", "solved.picture, False)",
+        "reconstruct_burst",
+    ),
+    (
+        "services/lab/reconstruct_capture.py", "FileReconstruction(made.picture, report, simulated)",
+        "FileReconstruction(made.picture, report, False)", "reconstruct_burst",
     ),
     (
         "services/lab/reconstruct_colour.py", "any(one.simulated for one in made.values())",
