@@ -34,7 +34,7 @@ from tests.site import identity
 K = 4  # binning of the paper's sensor, K x K pixels
 WEB = Path(__file__).parents[2] / "web"
 ALERTS = (WEB / "core/alerts.js").read_text()
-STATES = re.findall(r'"(\w+\.\w+)"', ALERTS.split("const TABLE = [")[1].split("].map(")[0])
+STATES = re.findall(r'"(\w+\.\w+)"', ALERTS.split("const TABLE = [")[1].split("\n];")[0])
 SPOKEN = r'"state\.([\w.]+)": (?:\{\s*one: "(?:[^"]+)",\s*other: )?"([^"]+)"'
 WORDS = dict(re.findall(SPOKEN, (WEB / "i18n/en.js").read_text()))
 REFUSALS = {

@@ -44,6 +44,8 @@ def test_a_press_of_a_ring_with_amber_gives_a_picture_in_colour(tmp_path: Path) 
     camera = spec.camera.model_copy(update={"backend": "sim"})
     light = spec.light.model_copy(update={"backend": "sim", "radiometry": measured})
     spec = coarse(spec.model_copy(update={"camera": camera, "light": light, "bus": None, "gpio": None}), 4)
+    assert isinstance(spec.sim.peak_e, float)
+    spec = spec.model_copy(update={"sim": spec.sim.model_copy(update={"peak_e": spec.sim.peak_e / 2})})  # not saturated
     clock = VirtualClock()
     head = open_head(spec, clock, MemoryLedger(clock))
     try:
