@@ -5,7 +5,8 @@
     python3 -I -S blank.py --device /dev/spidev0.0 --guard    when its parent ends, or a lease expires
 
 The chain keeps its last colour while it has power, so a killed process leaves the LEDs on. The guard reads leases from
-standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease); it answers each with `ok`.
+standard input: `lit 1.5` (turn off in 1.5 s unless a new lease arrives), `dark` (no lease), `watch 12 13` (threads
+of its parent, whose end is the parent's); it answers each with `ok`, or `old` to a kernel that cannot watch threads.
 Without --chip the messages of both kinds are sent: that of the TLC5971 first, which then ignores the other one, as no
 word at a packet's place in it begins with the write command. A matrix of APA102 sees the other message last.
 Exit status 1: the device does not exist, or does not accept the frame.
@@ -27,6 +28,7 @@ MOST_SINKS = 4  # a shorter chain of TLC5971 shifts the packets of absent chips 
 TRIES, AGAIN_S = 200, 0.05
 MCL_CURRENT = 1  # <sys/mman.h>
 LEAST_NICE = -20
+PIDFD_THREAD = os.O_EXCL  # <linux/pidfd.h>
 
 
 def dark_frame(leds: int) -> bytes:
@@ -84,11 +86,23 @@ def prioritise() -> None:
         ctypes.CDLL(None).mlockall(MCL_CURRENT)  # without permission -1, and nothing is locked
 
 
+def watch_threads(poller: select.poll, threads: list[str]) -> set[int]:
+    """Register the ends of threads and return their descriptors; none before Linux 6.9."""
+    ears = set()
+    with suppress(OSError):
+        for thread in threads:
+            ears.add(os.pidfd_open(int(thread), PIDFD_THREAD))
+    for ear in ears:
+        poller.register(ear, select.POLLIN)
+    return ears
+
+
 def guard(device: str, leds: int, chip: str) -> None:
     """Turn the LEDs off when a lease expires; also when standard input or the parent process ends, and then return.
 
     The parent is watched too, because a forked process may hold its pipe open. After a lease has expired, the off frame
     is repeated every 50 ms until the next message: the parent may have been stopped between its lease and its light.
+    So it is after the end of a watched thread, which comes first: the parent's other threads may still be writing.
     """
     prioritise()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -96,11 +110,14 @@ def guard(device: str, leds: int, chip: str) -> None:
     poller = select.poll()
     poller.register(0, select.POLLIN)
     poller.register(os.pidfd_open(os.getppid()), select.POLLIN)
+    threads: set[int] = set()
     lease_ms: float | None = None  # poll() counts it from the last message
     with suppress(BrokenPipeError):  # the parent ended before it read the answer
         while True:
             heard = {ear for ear, _ in poller.poll(lease_ms)}
-            if not heard:
+            for ear in heard & threads:
+                poller.unregister(ear)
+            if not heard or heard & threads:
                 with suppress(OSError):
                     blank(device, leds, chip)
                 lease_ms = 1000 * AGAIN_S
@@ -108,9 +125,11 @@ def guard(device: str, leds: int, chip: str) -> None:
             message = os.read(0, 4096).decode("ascii") if heard == {0} else ""
             if not message:
                 break
-            last = message.split("\n")[-2]
-            lease_ms = 1000 * float(last.split()[1]) if last.startswith("lit") else None
-            os.write(1, b"ok\n")
+            word, *values = message.split("\n")[-2].split()
+            lease_ms = 1000 * float(values[0]) if word == "lit" else None
+            if word == "watch":
+                threads = watch_threads(poller, values)
+            os.write(1, b"old\n" if word == "watch" and not threads else b"ok\n")
     (blank if lease_ms is None else blank_with_retries)(device, leds, chip)
 
 

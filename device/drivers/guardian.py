@@ -5,7 +5,9 @@ import os
 import select
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from types import TracebackType
 from typing import Literal
 
@@ -32,7 +34,13 @@ class Guardian:
         self._child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
         )
-        self.end_lease()
+        # The kernel frees the memory of a killed process before it closes its pipes: up to 0.4 s with 600 MB on a busy
+        # computer. Only the last thread to end frees it, so of two threads at least one ends at once.
+        ends = [Thread(target=wait_for_end, args=(self.pid,), name="guardian", daemon=True) for _ in range(2)]
+        for thread in ends:
+            thread.start()
+        if self._send(f"watch {ends[0].native_id} {ends[1].native_id}\n") != b"ok\n":
+            log.info("this kernel is older than Linux 6.9: after a kill the lamp may be dark later on a busy computer")
         if not self.is_real_time:
             log.info("the lamp's guardian has no real-time priority: on a busy computer the lamp may be dark later")
 
@@ -77,7 +85,7 @@ class Guardian:
     ) -> None:
         self.close()
 
-    def _send(self, words: str) -> None:
+    def _send(self, words: str) -> bytes:
         assert self._child.stdin is not None
         assert self._child.stdout is not None
         try:
@@ -88,3 +96,10 @@ class Guardian:
             raise LightFault(f"the lamp's guardian is gone: {error}") from error
         if not answer:
             raise LightFault("the lamp's guardian does not answer")
+        return answer
+
+
+def wait_for_end(child: int) -> None:
+    """Wait until a child process has ended, and leave it to its owner to reap it."""
+    with suppress(ChildProcessError):  # it is reaped already
+        os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)

@@ -120,7 +120,8 @@ def record() -> dict[str, Any]:
 def kills(listener: Listener, is_lit: Callable[[], bool]) -> None:
     """Record the bytes sent by the guardian after its parent process is killed.
 
-    The lamp is lit, dark again, or was never lit.
+    The lamp is lit, dark again, or was never lit. The guardian darkens it at the first end of a thread and again at
+    that of the process, or once if it reads both ends at once: equal messages are written once.
     """
     for name in ("lit", "dark"):
         victim = subprocess.Popen(
@@ -135,6 +136,8 @@ def kills(listener: Listener, is_lit: Callable[[], bool]) -> None:
             victim.stdout.read()  # returns after the end of its guardian
             wait_for(lambda: not is_lit())
             time.sleep(0.3)
+        sent = listener.phases[f"kill while {name}"]
+        sent["spi"] = list(dict.fromkeys(sent["spi"]))
         victim.stdout.close()
     with listener.phase("blank, as systemd calls it"):
         blank = [sys.executable, "-I", "-S", "device/drivers/blank.py", "--device", "/dev/spidev0.0"]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 
@@ -16,10 +17,11 @@ from device.drivers.ring import Apa102Ring, lit_frame
 from device.errors import LightFault
 from device.values import Illumination
 from tests.ports.conftest import ring_rig
-from tests.ports.emulators.kills import DARK_S, LitProcess, Sleeper, dark_limit_s
+from tests.ports.emulators.kills import DARK_S, PATIENCE_S, STEP_S, LitProcess, Sleeper, dark_limit_s
 from tests.ports.emulators.wires import emulated_buses
 
 LEASE_S = 0.4
+WATCHES_THREADS = tuple(map(int, os.uname().release.split(".")[:2])) >= (6, 9)
 
 
 @pytest.fixture(autouse=True)
@@ -137,6 +139,52 @@ def test_a_light_after_the_end_of_its_lease_is_turned_off_again(sound_wires):
         with Sleeper() as sleeper:
             sleeper.wait_for_dark(0.05)
         assert not emulated_buses().lit
+
+
+def test_the_end_of_a_watched_thread_darkens_the_ring_until_its_process_has_ended(sound_wires):
+    """A killed process keeps its pipe until its memory is freed; meanwhile its other threads may still write."""
+    chain, end = ChainSpec(), Event()
+    thread = Thread(target=end.wait)
+    thread.start()
+    command = [sys.executable, "-I", "-S", str(BLANK), "--device", chain.device, "--guard"]
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0) as guard,
+        Sleeper() as sleeper,
+    ):
+        guard.stdin.write(f"watch {thread.native_id}\n".encode("ascii"))
+        assert guard.stdout.read(64) == (b"ok\n" if WATCHES_THREADS else b"old\n")
+        light_up(chain)
+        sleeper.wait_for_dark(0)
+        assert emulated_buses().lit, "the thread has not ended"
+        end.set()
+        thread.join()
+        for _ in range(2 * WATCHES_THREADS):
+            sleeper.wait_for_dark(0.05)
+            assert not emulated_buses().lit
+            light_up(chain)
+    assert not emulated_buses().lit
+
+
+def tasks_and_files() -> tuple[set[str], set[str]]:
+    """Return the threads and open descriptors of this process."""
+    return {task.name for task in Path("/proc/self/task").iterdir()}, set(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.skipif(not WATCHES_THREADS, reason="Linux before 6.9")
+def test_the_guardian_watches_its_process_and_two_threads_that_end_with_it(sound_wires):
+    """One of two threads is not the last of a killed process, which waits until the kernel has freed the memory."""
+    chain = ChainSpec()
+    before = tasks_and_files()
+    with Guardian(chain.device, chain.rows * chain.cols) as guardian:
+        infos = [info.read_text() for info in Path(f"/proc/{guardian.pid}/fdinfo").iterdir()]
+        watched = {info.split("Pid:")[1].split()[0] for info in infos if "Pid:" in info}
+        threads = tasks_and_files()[0] - before[0]
+        assert len(threads) == 2
+        assert watched == {str(os.getpid())} | threads
+    until_s = time.monotonic() + PATIENCE_S
+    while tasks_and_files() != before and time.monotonic() < until_s:
+        time.sleep(STEP_S)
+    assert tasks_and_files() == before
 
 
 def test_a_parent_that_dies_before_reading_the_answer_leaves_no_light(sound_wires):
