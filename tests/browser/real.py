@@ -45,6 +45,7 @@ POOR: dict[str, tuple[float, dict[str, Any]]] = {
     "dark": (0.003, {}),
     "pupil": (1.0, {"eye": {"pupil_um": 1500.0}}),
     "halo": (1.0, {"light": {"polariser_leak": 0.1, "ring_um": 3500.0}}),
+    "diffuser": (1.0, {"seed": 2}),  # another one than the calibration has
 }
 
 

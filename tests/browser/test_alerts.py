@@ -120,7 +120,7 @@ def test_status_problem_is_shown_until_it_ends(open_page: Open, real: Real) -> N
 
 def test_self_check_finding_is_shown_once(open_page: Open, real: Real) -> None:
     visit = real.begin_visit(consent="agreed")["id"]
-    with real.poor_light("pupil"):
+    with real.poor_light("diffuser"):
         for _ in range(2):
             real.press(visit)
             until(lambda: not real.rig.exam.calibration_monitor.has_pending)
