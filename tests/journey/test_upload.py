@@ -90,5 +90,6 @@ def test_invalid_upload_settings_are_refused_at_the_start(
 ) -> None:
     (tmp_path / "send.toml").write_text('address = "http://reader.example.org"\ntoken = "x"\n')
     result = diffuscope("run", "--head", head_file, "--send", tmp_path / "send.toml", "--data", tmp_path / "data")
-    assert (result.returncode, "https:// only" in result.stderr, "--send" in result.stderr) == (2, True, True)
+    named = "send.toml, line 1: address: " in result.stderr
+    assert (result.returncode, "https:// only" in result.stderr, named) == (2, True, True)
     assert not (tmp_path / "data").exists()
