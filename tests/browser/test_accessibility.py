@@ -19,7 +19,8 @@ MAGNIFIED = {"200 %": (640, 512), "400 %": (320, 256), "narrow": (320, 568)}
 
 def reach(page: Page, selector: str, back: bool = False) -> None:
     """Move the focus to a control with the Tab key."""
-    after_debounce(page).locator(selector).wait_for()
+    page.locator(selector).wait_for()
+    after_debounce(page)
     for _ in range(60):
         if page.evaluate("(selector) => document.activeElement.matches(selector)", selector):
             return
